@@ -1,0 +1,176 @@
+"""Every error that FluxVLA raises on purpose, and the exit code that each ends a command with.
+
+    FluxError                     1
+    ├── UsageError                2   the command line asks for something that cannot be
+    ├── ConfigError               2   a config file is missing, unreadable or wrong
+    ├── PluginError               2   a class that a config names cannot be had
+    │   ├── MissingPlugin             nothing installed provides the name
+    │   ├── AmbiguousPlugin           several distributions provide it
+    │   ├── IncompatiblePlugin        written for another core
+    │   └── LoadFailed                its import or its contract fails
+    ├── SpecMismatch              2   dataset, checkpoint, policy and robot disagree
+    ├── DataError                 2   a dataset cannot be read as what it says it is
+    ├── CheckpointError           2   a checkpoint is missing, damaged or of another model
+    ├── RunFailed                 1   work that was under way could not be finished
+    ├── OperatorError             1
+    │   ├── NotReady                  the robot does not answer yet; trying again may help
+    │   ├── Rejected                  the robot or the operator refuses the request
+    │   └── Faulted                   the robot reports a fault
+    └── SafetyStop                1   a safety rule ended the motion
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+class FluxError(Exception):
+    """One clear message: what happened, where, the likely cause, and the next command.
+
+    Args:
+        what: the finding in one sentence, without a trailing full stop.
+        where: ``file:line: dotted.key`` or a path; shown before ``what``.
+        cause: the likely cause, if the finding alone does not say it.
+        next: the command, or the change, that mends it or tells more.
+    """
+
+    exit_code = EXIT_FAILED
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        cause: str | None = None,
+        next: str | None = None,
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.cause = cause
+        self.next = next
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        lines = [f"{self.where}: {self.what}" if self.where else self.what]
+        if self.cause:
+            lines.append(f"  likely cause: {self.cause}")
+        if self.next:
+            lines.append(f"  next: {self.next}")
+        return "\n".join(lines)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Errors cross process borders (evaluation workers); the keywords must survive.
+        return (_rebuild, (type(self), self.what, self.where, self.cause, self.next))
+
+
+def _rebuild(
+    cls: type[FluxError], what: str, where: str | None, cause: str | None, next: str | None
+) -> FluxError:
+    return cls(what, where=where, cause=cause, next=next)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One finding in a config; a ``ConfigError`` carries all of them.
+
+    ``where`` is ``file:line``, ``key`` the dotted path, ``what`` the finding with its did-you-mean.
+    """
+
+    where: str
+    key: str
+    what: str
+
+    def __str__(self) -> str:
+        place = ": ".join(part for part in (self.where, self.key) if part)
+        return f"{place}: {self.what}" if place else self.what
+
+
+class UsageError(FluxError):
+    """The command line asks for something that cannot be."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class ConfigError(FluxError):
+    """A config is missing, unreadable or wrong. ``problems`` holds every finding."""
+
+    exit_code = EXIT_BAD_INPUT
+    problems: tuple[Problem, ...] = ()
+
+    @classmethod
+    def from_problems(cls, problems: tuple[Problem, ...], next: str | None = None) -> ConfigError:
+        """One error that lists all ``problems``, one a line."""
+        count = len(problems)
+        head = "1 problem in the config" if count == 1 else f"{count} problems in the config"
+        error = cls("\n".join([f"{head}:", *(f"  {p}" for p in problems)]), next=next)
+        error.problems = problems
+        return error
+
+
+class PluginError(FluxError):
+    """A class that a config or a command names cannot be had."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class MissingPlugin(PluginError):
+    """Nothing that is installed or registered provides the name."""
+
+
+class AmbiguousPlugin(PluginError):
+    """Several distributions provide the name; ``type='<distribution>:<name>'`` chooses."""
+
+
+class IncompatiblePlugin(PluginError):
+    """The plugin was written for another version of the core or of a contract."""
+
+
+class LoadFailed(PluginError):
+    """The plugin is there, but its import or its contract fails."""
+
+
+class SpecMismatch(FluxError):
+    """Two sides (dataset, checkpoint, policy, robot) describe different embodiments."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class DataError(FluxError):
+    """A dataset is missing, empty, of another version, or damaged."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class CheckpointError(FluxError):
+    """A checkpoint is missing, damaged, or of another model."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class RunFailed(FluxError):
+    """Work that was under way could not be finished (disk full, worker lost)."""
+
+
+class OperatorError(FluxError):
+    """The robot, or its driver, did not do what it was asked."""
+
+
+class NotReady(OperatorError):
+    """The robot does not answer yet; trying again may help."""
+
+
+class Rejected(OperatorError):
+    """The robot or its operator refuses the request (limits, e-stop, credentials)."""
+
+
+class Faulted(OperatorError):
+    """The robot reports a fault, or the connection to it is gone."""
+
+
+class SafetyStop(FluxError):
+    """A safety rule ended the motion; the robot holds its position."""

@@ -1,0 +1,44 @@
+"""One reading of a robot: its state, its pictures, and when each arrived."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypedDict
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+STATE = "state"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What ``Operator.get_frame`` returns; all arrays are fresh and belong to the caller.
+
+    Args:
+        state: ``(state_dim,)`` float64 in the embodiment's units and order.
+        images: camera name -> ``(height, width, 3)`` uint8, RGB.
+        stamps: stream -> monotonic receipt time in seconds; ``"state"`` and each camera name.
+    """
+
+    state: npt.NDArray[np.float64]
+    images: Mapping[str, npt.NDArray[np.uint8]]
+    stamps: Mapping[str, float]
+
+
+class Observation(TypedDict):
+    """What a policy is asked with.
+
+    ``qpos`` is ``(state_dim,)`` float32 in physical units, ``images`` maps camera name to
+    ``(height, width, 3)`` uint8 RGB, ``task_description`` is the instruction in plain words.
+    """
+
+    qpos: npt.NDArray[np.float32]
+    images: dict[str, npt.NDArray[np.uint8]]
+    task_description: str
+
+
+Sample = dict[str, Any]
+"""One training sample on its way through the transforms; keys as ``data.parquet_dataset`` says."""

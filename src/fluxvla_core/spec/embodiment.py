@@ -1,0 +1,218 @@
+"""What a robot's numbers mean: the one description that dataset, checkpoint, policy and robot share.
+
+Pure data on the standard library, so that a config check, a robot's onboard computer and a server
+hello can read it without anything installed. Lengths are metres, angles radians, times seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from fluxvla_core.errors import SpecMismatch
+
+JOINT_KINDS = ("revolute", "prismatic", "gripper")
+UNITS = ("rad", "m", "normalized")
+ACTION_MODES = ("absolute", "delta")
+ROTATIONS = ("none", "axis_angle", "quaternion_wxyz", "quaternion_xyzw", "euler_xyz", "rotation_6d")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One controlled degree of freedom.
+
+    Args:
+        name: the joint's name in messages and logs, for example ``left_waist``.
+        unit: ``rad``, ``m``, or ``normalized`` (grippers scaled to a range of their own).
+        lower, upper: position limits, in ``unit``.
+        velocity: largest speed, in ``unit``/s.
+        acceleration: largest acceleration, in ``unit``/s^2.
+        kind: ``revolute``, ``prismatic`` or ``gripper``.
+        open, closed: a gripper's values at its ends; together they state its polarity.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    velocity: float
+    acceleration: float
+    kind: str = "revolute"
+    open: float | None = None
+    closed: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in JOINT_KINDS:
+            raise ValueError(f"joint {self.name}: kind {self.kind!r} is none of {JOINT_KINDS}")
+        if self.unit not in UNITS:
+            raise ValueError(f"joint {self.name}: unit {self.unit!r} is none of {UNITS}")
+        numbers = (self.lower, self.upper, self.velocity, self.acceleration)
+        if not all(math.isfinite(n) for n in numbers):
+            raise ValueError(f"joint {self.name}: limits must be finite, got {numbers}")
+        if not self.lower < self.upper:
+            raise ValueError(f"joint {self.name}: lower {self.lower} is not below {self.upper}")
+        if self.velocity <= 0 or self.acceleration <= 0:
+            raise ValueError(f"joint {self.name}: velocity and acceleration must be positive")
+        if self.kind == "gripper" and (self.open is None or self.closed is None):
+            raise ValueError(f"gripper {self.name}: open and closed state its polarity; give both")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One image stream: arrays of shape ``(height, width, 3)``, uint8, in ``encoding`` order."""
+
+    name: str
+    height: int
+    width: int
+    encoding: str = "rgb8"
+
+
+@dataclass(frozen=True)
+class EmbodimentSpec:
+    """A robot as a policy sees it: ``dim`` numbers in, ``dim`` numbers out, some pictures.
+
+    Args:
+        name: for people, for example ``aloha``.
+        joints: order of the action vector, and of the state unless ``state_joints`` is given.
+        cameras: order of the images.
+        rate_hz: how many commands a second the robot takes.
+        action_mode: ``absolute`` joint targets, or ``delta`` from the present position.
+        frame: the frame that Cartesian values are in; ``joint`` when there are none.
+        rotation: how Cartesian rotations are written; ``none`` when there are none.
+        source: where the limits come from (datasheet, URDF, model file).
+        state_joints: the state's own joints, when they differ from the action's.
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    cameras: tuple[Camera, ...]
+    rate_hz: float
+    action_mode: str = "absolute"
+    frame: str = "joint"
+    rotation: str = "none"
+    source: str = ""
+    state_joints: tuple[Joint, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.action_mode not in ACTION_MODES:
+            raise ValueError(f"action_mode {self.action_mode!r} is none of {ACTION_MODES}")
+        if self.rotation not in ROTATIONS:
+            raise ValueError(f"rotation {self.rotation!r} is none of {ROTATIONS}")
+        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise ValueError(f"rate_hz must be positive, got {self.rate_hz}")
+        for what, names in (("joint", self.joint_names), ("camera", self.camera_names)):
+            twice = sorted({n for n in names if names.count(n) > 1})
+            if twice:
+                raise ValueError(f"{what} names must be unique; twice: {', '.join(twice)}")
+
+    @property
+    def dim(self) -> int:
+        """Length of the action vector."""
+        return len(self.joints)
+
+    @property
+    def state_dim(self) -> int:
+        """Length of the state vector."""
+        return len(self.state_joints or self.joints)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(j.name for j in self.joints)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return tuple(j.name for j in self.state_joints or self.joints)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.cameras)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; ``from_dict`` is the inverse."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> EmbodimentSpec:
+        """Build from plain JSON values.
+
+        Raises:
+            SpecMismatch: a key is unknown or missing, or a value is out of its range.
+        """
+        try:
+            values = _known(cls, data)
+            values["joints"] = _joints(values["joints"])
+            values["cameras"] = tuple(Camera(**_known(Camera, c)) for c in values["cameras"])
+            if values.get("state_joints") is not None:
+                values["state_joints"] = _joints(values["state_joints"])
+            return cls(**values)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SpecMismatch(f"this is no embodiment spec: {error}") from error
+
+
+def _joints(items: Iterable[Mapping[str, Any]]) -> tuple[Joint, ...]:
+    return tuple(Joint(**_known(Joint, item)) for item in items)
+
+
+def _known(cls: type, data: Mapping[str, Any]) -> dict[str, Any]:
+    names = {f.name for f in fields(cls)}
+    unknown = sorted(set(data) - names)
+    if unknown:
+        raise ValueError(f"{cls.__name__} takes no {', '.join(map(repr, unknown))}")
+    return dict(data)
+
+
+def differences(a: EmbodimentSpec, b: EmbodimentSpec) -> list[str]:
+    """Every difference that changes what a number means; limits and camera sizes may differ.
+
+    Limits belong to the robot that moves, and pictures are resized by the policy's own
+    transforms, so neither is compared.
+    """
+    found: list[str] = []
+
+    def compare(what: str, left: object, right: object) -> None:
+        if left != right:
+            found.append(f"{what}: {left} / {right}")
+
+    compare("joints and their order", list(a.joint_names), list(b.joint_names))
+    compare("state joints and their order", list(a.state_names), list(b.state_names))
+    compare("action mode", a.action_mode, b.action_mode)
+    compare("frame", a.frame, b.frame)
+    compare("rotation", a.rotation, b.rotation)
+    for left, right in zip(a.joints, b.joints):
+        if left.name == right.name:
+            compare(f"unit of {left.name}", left.unit, right.unit)
+            compare(f"kind of {left.name}", left.kind, right.kind)
+            ends = ((left.open, left.closed), (right.open, right.closed))
+            compare(f"open/closed of gripper {left.name}", *ends)
+    return found
+
+
+def check_match(
+    a: EmbodimentSpec,
+    b: EmbodimentSpec,
+    who_a: str,
+    who_b: str,
+    cameras: Iterable[str] | None = None,
+) -> None:
+    """Refuse to go on when ``a`` and ``b`` mean different things by the same numbers.
+
+    Args:
+        cameras: names that ``a`` needs and ``b`` must have; all of ``a``'s by default.
+
+    Raises:
+        SpecMismatch: names both sides and every difference.
+    """
+    found = differences(a, b)
+    needed = a.camera_names if cameras is None else tuple(cameras)
+    missing = [name for name in needed if name not in b.camera_names]
+    if missing:
+        found.append(f"cameras: {', '.join(missing)} missing; there are {list(b.camera_names)}")
+    if found:
+        lines = "\n".join(f"    {line}" for line in found)
+        raise SpecMismatch(
+            f"{who_a} ({a.name}) and {who_b} ({b.name}) do not fit together:\n{lines}",
+            cause="they were made for different robots or conventions",
+            next="use a checkpoint trained for this robot, or mend the spec that is wrong",
+        )

@@ -1,22 +1,22 @@
 """Every error that FluxVLA raises on purpose, and the exit code that each ends a command with.
 
-    FluxError                     1
-    ├── UsageError                2   the command line asks for something that cannot be
-    ├── ConfigError               2   a config file is missing, unreadable or wrong
-    ├── PluginError               2   a class that a config names cannot be had
-    │   ├── MissingPlugin             nothing installed provides the name
-    │   ├── AmbiguousPlugin           several distributions provide it
-    │   ├── IncompatiblePlugin        written for another core
-    │   └── LoadFailed                its import or its contract fails
-    ├── SpecMismatch              2   dataset, checkpoint, policy and robot disagree
-    ├── DataError                 2   a dataset cannot be read as what it says it is
-    ├── CheckpointError           2   a checkpoint is missing, damaged or of another model
-    ├── RunFailed                 1   work that was under way could not be finished
-    ├── OperatorError             1
-    │   ├── NotReady                  the robot does not answer yet; trying again may help
-    │   ├── Rejected                  the robot or the operator refuses the request
-    │   └── Faulted                   the robot reports a fault
-    └── SafetyStop                1   a safety rule ended the motion
+FluxError                     1
+├── UsageError                2   the command line asks for something that cannot be
+├── ConfigError               2   a config file is missing, unreadable or wrong
+├── PluginError               2   a class that a config names cannot be had
+│   ├── MissingPlugin             nothing installed provides the name
+│   ├── AmbiguousPlugin           several distributions provide it
+│   ├── IncompatiblePlugin        written for another core
+│   └── LoadFailed                its import or its contract fails
+├── SpecMismatch              2   dataset, checkpoint, policy and robot disagree
+├── DataError                 2   a dataset cannot be read as what it says it is
+├── CheckpointError           2   a checkpoint is missing, damaged or of another model
+├── RunFailed                 1   work that was under way could not be finished
+├── OperatorError             1
+│   ├── NotReady                  the robot does not answer yet; trying again may help
+│   ├── Rejected                  the robot or the operator refuses the request
+│   └── Faulted                   the robot reports a fault
+└── SafetyStop                1   a safety rule ended the motion
 """
 
 from __future__ import annotations

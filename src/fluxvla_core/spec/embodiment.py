@@ -1,4 +1,4 @@
-"""What a robot's numbers mean: the one description that dataset, checkpoint, policy and robot share.
+"""What a robot's numbers mean: one description for dataset, checkpoint, policy and robot.
 
 Pure data on the standard library, so that a config check, a robot's onboard computer and a server
 hello can read it without anything installed. Lengths are metres, angles radians, times seconds.
@@ -180,7 +180,7 @@ def differences(a: EmbodimentSpec, b: EmbodimentSpec) -> list[str]:
     compare("action mode", a.action_mode, b.action_mode)
     compare("frame", a.frame, b.frame)
     compare("rotation", a.rotation, b.rotation)
-    for left, right in zip(a.joints, b.joints):
+    for left, right in zip(a.joints, b.joints, strict=False):
         if left.name == right.name:
             compare(f"unit of {left.name}", left.unit, right.unit)
             compare(f"kind of {left.name}", left.kind, right.kind)

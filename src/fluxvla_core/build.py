@@ -1,0 +1,153 @@
+"""From config tables to objects: ``build_<kind>_from_cfg`` for each registry.
+
+A table is built one level deep: ``type`` names the class, the other keys are its arguments, and a
+class builds its own children (a runner its operator, a dataset its transforms). That is how the
+specification's code does it, and it leaves a class free to fill in what the config left out.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.plugins.registry import BY_NAME, Registry
+
+INJECTED = ("cfg", "context")
+"""Parameters that the builder fills when a constructor names them; a config may not."""
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What a run knows that no config says.
+
+    Args:
+        config: the whole resolved config tree.
+        section: the section that runs: ``runner``, ``eval``, ``inference``, …
+        work_dir: where everything that the run makes goes.
+        resume: ``auto``, a checkpoint's path, or None.
+        origins: dotted config key -> ``file:line``.
+        config_file: the file that was named on the command line.
+        task: ``--task``: an id from the config or an instruction in words.
+        nproc: ``--nproc``: how many processes work on this.
+        reporter: where progress goes.
+    """
+
+    config: Mapping[str, Any] = field(default_factory=dict)
+    section: str = ""
+    work_dir: Path = Path("work_dirs/run")
+    resume: str | None = None
+    origins: Mapping[str, str] = field(default_factory=dict)
+    config_file: str | None = None
+    task: str | None = None
+    nproc: int = 1
+    reporter: Reporter = field(default_factory=SilentReporter)
+
+    def where(self, key: str) -> str | None:
+        """``file:line: key`` of a config key, for messages."""
+        place = self.origins.get(key)
+        return f"{place}: {key}" if place else None
+
+
+def build_from_cfg(
+    cfg: Any, registry: Registry, context: RunContext | None = None, **defaults: Any
+) -> Any:
+    """Build the object that the table ``cfg`` describes; an object is returned as it is.
+
+    Args:
+        cfg: a mapping with ``type``, or something already built.
+        context: passed to constructors that name ``context``, its config to those that name
+            ``cfg`` (in the signature or, through ``**kwargs``, in a base class).
+        defaults: arguments used where the table does not set them.
+
+    Raises:
+        ConfigError: no ``type``, an injected parameter is set, or the arguments do not fit.
+        PluginError: the class cannot be had.
+    """
+    if not isinstance(cfg, Mapping):
+        return cfg
+    arguments = {**defaults, **cfg}
+    name = arguments.pop("type", None)
+    if inspect.isclass(name):
+        cls = name
+    elif isinstance(name, str):
+        cls = registry.get(name)
+    else:
+        raise ConfigError(
+            f"a table for fluxvla.{registry.name} needs type = '<class name>', got {name!r}"
+        )
+    taken = parameters(cls)
+    for key in INJECTED:
+        if key in cfg and context is not None:
+            raise ConfigError(
+                f"{cls.__name__}: {key!r} is filled in when the run starts and cannot be set"
+            )
+    if context is not None:
+        if "context" in taken:
+            arguments.setdefault("context", context)
+        if "cfg" in taken:
+            arguments.setdefault("cfg", context.config)
+    try:
+        inspect.signature(cls).bind(**arguments)
+    except TypeError as error:
+        raise ConfigError(
+            f"{cls.__name__}: {error}",
+            where=_section_origin(cfg, context),
+            next=f"fluxvla plugins show {name}",
+        ) from error
+    return cls(**arguments)
+
+
+def parameters(cls: type) -> set[str]:
+    """Names that a constructor takes, following ``**kwargs`` into its base classes."""
+    names: set[str] = set()
+    for base in inspect.getmro(cls):
+        init = base.__dict__.get("__init__")
+        if init is None or base is object:
+            continue
+        found = inspect.signature(init).parameters
+        names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+        if not any(p.kind is p.VAR_KEYWORD for p in found.values()):
+            break
+    return names - {"self"}
+
+
+def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
+    if context is None:
+        return None
+    for section, table in context.config.items():
+        if table is cfg:
+            return context.where(section)
+    return None
+
+
+def _builder(registry: str, kind: str) -> Callable[..., Any]:
+    def build(cfg: Any, context: RunContext | None = None, **defaults: Any) -> Any:
+        return build_from_cfg(cfg, BY_NAME[registry], context, **defaults)
+
+    build.__name__ = build.__qualname__ = f"build_{kind}_from_cfg"
+    build.__doc__ = (
+        f"Build what a table of fluxvla.{registry} describes; see :func:`build_from_cfg`."
+    )
+    return build
+
+
+build_runner_from_cfg = _builder("runners", "runner")
+build_operator_from_cfg = _builder("operators", "operator")
+build_vla_from_cfg = _builder("vlas", "vla")
+build_vision_backbone_from_cfg = _builder("vision_backbones", "vision_backbone")
+build_llm_backbone_from_cfg = _builder("llm_backbones", "llm_backbone")
+build_vlm_backbone_from_cfg = _builder("vlm_backbones", "vlm_backbone")
+build_projector_from_cfg = _builder("projectors", "projector")
+build_head_from_cfg = _builder("heads", "head")
+build_dataset_from_cfg = _builder("datasets", "dataset")
+build_transform_from_cfg = _builder("transforms", "transform")
+build_collator_from_cfg = _builder("collators", "collator")
+build_tokenizer_from_cfg = _builder("tokenizers", "tokenizer")
+build_processor_from_cfg = _builder("processors", "processor")
+build_metric_from_cfg = _builder("metrics", "metric")
+build_action_filter_from_cfg = _builder("action_filters", "action_filter")

@@ -1,0 +1,27 @@
+"""The entry-point groups that the core reads: one per registry."""
+
+from __future__ import annotations
+
+PREFIX = "fluxvla."
+
+REGISTRIES = (
+    "runners",
+    "operators",
+    "vlas",
+    "vision_backbones",
+    "llm_backbones",
+    "vlm_backbones",
+    "projectors",
+    "heads",
+    "datasets",
+    "transforms",
+    "collators",
+    "tokenizers",
+    "processors",
+    "metrics",
+    "action_filters",
+    "hooks",
+    "commands",
+)
+
+GROUPS = tuple(PREFIX + name for name in REGISTRIES)

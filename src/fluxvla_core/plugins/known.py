@@ -1,0 +1,41 @@
+"""Names that first-party distributions provide, so that a missing one can be named with its
+pip command. Shipped with the core and never built from what a user typed: suggesting
+``pip install fluxvla-<typo>`` would invite typosquatters. A test compares it with the
+distributions' own pyproject files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "fluxvla-aloha": {"runners": ("AlohaInferenceRunner",)},
+    "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
+    "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-models": {
+        "heads": ("FlowMatchingHead",),
+        "llm_backbones": ("SentenceEncoder",),
+        "projectors": ("LinearProjector",),
+        "vision_backbones": ("ConvEncoder",),
+        "vlas": ("CompactVLA",),
+    },
+    "fluxvla-sim": {
+        "commands": ("collect",),
+        "operators": ("AlohaSimOperator", "URSimOperator"),
+        "runners": ("AlohaSimEvalRunner",),
+    },
+    "fluxvla-ur": {"runners": ("URInferenceRunner",)},
+}
+
+
+def owner(registry: str, name: str) -> str | None:
+    """The first-party distribution that provides ``name`` in ``registry``, if one does."""
+    for dist, provided in FIRST_PARTY.items():
+        if name in provided.get(registry, ()):
+            return dist
+    return None
+
+
+def names(registry: str) -> list[str]:
+    """Every first-party name of ``registry``, installed or not."""
+    return sorted(n for provided in FIRST_PARTY.values() for n in provided.get(registry, ()))

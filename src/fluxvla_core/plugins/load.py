@@ -1,0 +1,129 @@
+"""From a name to a class: find the one plugin that provides it, check it, import it."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from typing import Any
+
+from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
+from fluxvla_core.plugins import _metadata, known
+from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
+from fluxvla_core.plugins.groups import PREFIX
+
+LIST = "fluxvla plugins list"
+DOCTOR = "fluxvla plugins doctor"
+
+
+def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
+    """The one installed plugin called ``name``, or ``distribution:name``.
+
+    Args:
+        also: names registered in this process, offered beside the installed ones.
+
+    Raises:
+        MissingPlugin: with a did-you-mean, or the pip command when a first-party plugin has it.
+        AmbiguousPlugin: several distributions provide it.
+    """
+    dist, _, short = name.rpartition(":")
+    providers = _metadata.index().plugins.get((group, short), ())
+    hits = [p for p in providers if not dist or canonical(p.dist) == canonical(dist)]
+    if len(hits) == 1:
+        return hits[0]
+    if hits:
+        who = ", ".join(f"{p.origin} ({p.value})" for p in hits)
+        raise AmbiguousPlugin(
+            f"{group}: {short!r} is provided by {who}",
+            next=f"write type='<distribution>:{short}' to choose, or uninstall one",
+        )
+    raise MissingPlugin(*_missing(group, name, short, also), next=LIST)
+
+
+def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[str]:
+    registry = group.removeprefix(PREFIX)
+    installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
+    text = f"no {group} plugin named {name!r}"
+    provider = known.owner(registry, short)
+    if provider:
+        text += f"; {provider} provides it and is not installed: pip install {provider}"
+    else:
+        near = difflib.get_close_matches(short, [*installed, *known.names(registry)], 1)
+        if near:
+            text += f"; did you mean {near[0]!r}?"
+            if near[0] not in installed:
+                dist = known.owner(registry, near[0])
+                text += f" ({dist} provides it and is not installed: pip install {dist})"
+    broken = _metadata.index().broken
+    if broken:
+        text += f"\n  {len(broken)} installed distribution(s) could not be read: {DOCTOR}"
+    return (f"{text}\n  installed: {', '.join(installed) or '(none)'}",)
+
+
+def unmet(plugin: Plugin) -> str | None:
+    """Why the plugin's own requirement on the core does not hold, or None.
+
+    ``pip install --no-deps``, conda and ROS overlays go past pip's check, so it is made again.
+    """
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    for text in plugin.requires:
+        try:
+            requirement = Requirement(text)
+        except InvalidRequirement as error:
+            return f"{plugin.origin} has a requirement that cannot be read: {error}"
+        if canonical(requirement.name) != CORE:
+            continue
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        have = _metadata.version(CORE)
+        if have and not requirement.specifier.contains(have, prereleases=True):
+            return (
+                f"{plugin.origin} needs {requirement.name}{requirement.specifier}, "
+                f"but {have} is installed"
+            )
+    return None
+
+
+def load(plugin: Plugin) -> Any:
+    """Import the module that the entry point names and return its object.
+
+    Raises:
+        IncompatiblePlugin: the plugin requires another core.
+        LoadFailed: the import fails; the message names the distribution and the reason.
+    """
+    why = unmet(plugin)
+    if why:
+        raise IncompatiblePlugin(
+            f"{plugin.group}:{plugin.name}: {why}",
+            next=f"pip install --upgrade {plugin.dist} {CORE}",
+        )
+    provides = f"{plugin.origin} provides {plugin.name!r} but"
+    module = plugin.module
+    try:
+        found: Any = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == module.partition(".")[0]:
+            raise LoadFailed(
+                f"{provides} its own module {error.name!r} is missing",
+                cause="a stale or orphaned install",
+                next=f"reinstall {plugin.dist}",
+            ) from error
+        raise LoadFailed(
+            f"{provides} it needs {error.name!r}, which is not installed",
+            next=f"pip install {plugin.dist} again with its dependencies, or install {error.name}",
+        ) from error
+    except KeyboardInterrupt:
+        raise
+    except (Exception, SystemExit) as error:
+        raise LoadFailed(
+            f"{provides} raised {type(error).__name__} on import: {error}", next=DOCTOR
+        ) from error
+    for part in plugin.attribute.split("."):
+        if not hasattr(found, part):
+            raise LoadFailed(
+                f"{plugin.origin}: entry point {plugin.name} = {plugin.value!r} names an object "
+                "that does not exist",
+                next=f"reinstall {plugin.dist}, or tell its author",
+            )
+        found = getattr(found, part)
+    return found

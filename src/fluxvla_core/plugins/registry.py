@@ -1,0 +1,118 @@
+"""Registries: a view over one entry-point group plus what this process registered itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+from fluxvla_core.contracts.check import check_class
+from fluxvla_core.errors import LoadFailed, PluginError
+from fluxvla_core.plugins import _metadata
+from fluxvla_core.plugins._metadata import Plugin
+from fluxvla_core.plugins.groups import PREFIX, REGISTRIES
+from fluxvla_core.plugins.load import find, load
+
+T = TypeVar("T", bound=Callable[..., Any])
+
+
+class Registry:
+    """Names to classes. Installed ones are imported when asked for by name, never before."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.group = PREFIX + name
+        self._here: dict[str, Any] = {}
+        self._loaded: dict[str, Any] = {}
+        self._failed: dict[str, PluginError] = {}
+
+    def register_module(self, name: str | None = None, *, force: bool = False) -> Callable[[T], T]:
+        """Decorator that registers a class in this process, under its own name by default.
+
+        For notebooks, tests and ``fluxvla run --plugin FILE``; a distribution uses entry points.
+
+        Raises:
+            LoadFailed: the name is taken in this process (``force=True`` replaces it), or the
+                class breaks the registry's contract.
+        """
+
+        def register(cls: T) -> T:
+            key = name or cls.__name__
+            present = self._here.get(key)
+            if present is not None and present is not cls and not force:
+                raise LoadFailed(
+                    f"{self.group}: {key!r} is already registered in this process, "
+                    f"by {present.__module__}",
+                    next="give one of them another name, or say force=True",
+                )
+            check_class(self.name, cls, f"{cls.__module__}:{cls.__qualname__}")
+            self._here[key] = cls
+            return cls
+
+        return register
+
+    def get(self, name: str) -> Any:
+        """The class called ``name`` (or ``distribution:name``).
+
+        What this process registered comes first: it is the nearer intention. A load failure is
+        remembered and raised again as it was.
+
+        Raises:
+            PluginError: nothing, or more than one, provides the name, or it cannot be loaded.
+        """
+        if name in self._here:
+            return self._here[name]
+        if name in self._failed:
+            raise self._failed[name]
+        if name not in self._loaded:
+            try:
+                plugin = find(self.group, name, tuple(self._here))
+                cls = load(plugin)
+                check_class(self.name, cls, plugin.origin)
+            except PluginError as error:
+                self._failed[name] = error
+                raise
+            self._loaded[name] = cls
+        return self._loaded[name]
+
+    def registered(self, name: str) -> Any | None:
+        """The class that this process registered under ``name``, or None; imports nothing."""
+        return self._here.get(name)
+
+    def installed(self) -> dict[str, tuple[Plugin, ...]]:
+        """Every installed name with its providers; imports nothing."""
+        items = _metadata.index().plugins.items()
+        return {name: plugins for (group, name), plugins in items if group == self.group}
+
+    def unregister(self, name: str) -> None:
+        """Forget what this process registered under ``name``."""
+        self._here.pop(name, None)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._here or name in self.installed()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted({*self._here, *self.installed()}))
+
+    def __repr__(self) -> str:
+        return f"Registry({self.name!r}: {', '.join(self) or 'empty'})"
+
+
+BY_NAME: dict[str, Registry] = {name: Registry(name) for name in REGISTRIES}
+
+RUNNERS = BY_NAME["runners"]
+OPERATORS = BY_NAME["operators"]
+VLAS = BY_NAME["vlas"]
+VISION_BACKBONES = BY_NAME["vision_backbones"]
+LLM_BACKBONES = BY_NAME["llm_backbones"]
+VLM_BACKBONES = BY_NAME["vlm_backbones"]
+PROJECTORS = BY_NAME["projectors"]
+HEADS = BY_NAME["heads"]
+DATASETS = BY_NAME["datasets"]
+TRANSFORMS = BY_NAME["transforms"]
+COLLATORS = BY_NAME["collators"]
+TOKENIZERS = BY_NAME["tokenizers"]
+PROCESSORS = BY_NAME["processors"]
+METRICS = BY_NAME["metrics"]
+ACTION_FILTERS = BY_NAME["action_filters"]
+HOOKS = BY_NAME["hooks"]
+COMMANDS = BY_NAME["commands"]

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import tomli
+
+from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
+from fluxvla_core.plugins import known
+from fluxvla_core.plugins.registry import OPERATORS, RUNNERS, Registry
+
+ROOT = Path(__file__).parents[2]
+OPERATOR = "class {name}:\n    api = '1.0'\n    def get_frame(self): return {{}}\n"
+
+
+def entry(name: str, value: str, group: str = "operators") -> str:
+    return f"[fluxvla.{group}]\n{name} = {value}\n"
+
+
+def test_only_the_named_class_is_imported(install):
+    install(
+        "fluxvla-a",
+        entry_points=entry("A", "mod_a:A"),
+        files={"mod_a.py": OPERATOR.format(name="A")},
+    )
+    install(
+        "fluxvla-b", entry_points=entry("B", "mod_b:B"), files={"mod_b.py": "raise RuntimeError"}
+    )
+    assert OPERATORS.get("A").__name__ == "A"
+
+
+def test_a_misspelt_name_gets_a_suggestion(install):
+    install("fluxvla-a", entry_points=entry("ArmOperator", "mod_a:A"))
+    with pytest.raises(MissingPlugin, match="did you mean 'ArmOperator'") as error:
+        OPERATORS.get("ArmOperatr")
+    assert "next: fluxvla plugins list" in str(error.value)
+    assert error.value.exit_code == 2
+
+
+def test_a_missing_first_party_plugin_is_named_with_its_pip_command(monkeypatch):
+    monkeypatch.setattr(known, "FIRST_PARTY", {"fluxvla-acme": {"runners": ("AcmeRunner",)}})
+    with pytest.raises(MissingPlugin, match=r"pip install fluxvla-acme"):
+        RUNNERS.get("AcmeRunner")
+    with pytest.raises(MissingPlugin, match=r"did you mean 'AcmeRunner'\? \(fluxvla-acme provides"):
+        RUNNERS.get("AcmeRuner")
+
+
+def test_no_pip_command_is_made_up_from_what_was_typed():
+    with pytest.raises(MissingPlugin) as error:
+        RUNNERS.get("EvilPackageRunner")
+    assert "pip install" not in str(error.value)
+
+
+def test_two_providers_are_an_error_that_lists_both(install):
+    for dist in ("acme-arm", "fluxvla-arm"):
+        name = dist.replace("-", "_")
+        install(
+            dist,
+            entry_points=entry("Arm", f"{name}:Arm"),
+            files={f"{name}.py": OPERATOR.format(name="Arm")},
+        )
+    with pytest.raises(AmbiguousPlugin) as error:
+        OPERATORS.get("Arm")
+    text = str(error.value)
+    assert "acme-arm 1.0 (acme_arm:Arm), fluxvla-arm 1.0 (fluxvla_arm:Arm)" in text
+    assert "type='<distribution>:Arm'" in text
+    assert OPERATORS.get("acme-arm:Arm").__module__ == "acme_arm"
+    assert OPERATORS.get("fluxvla_arm:Arm").__module__ == "fluxvla_arm"
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (None, "its own module 'mod_x' is missing"),
+        ("import rclpy_absent", "it needs 'rclpy_absent', which is not installed"),
+        ("raise OSError('no display')", "raised OSError on import: no display"),
+        ("raise SystemExit(3)", "raised SystemExit on import: 3"),
+        ("Y = 1", "names an object that does not exist"),
+        ("X = 1", "is a int, not a class"),
+        ("class X: pass", "get_frame() is missing"),
+        ("class X:\n    get_frame = 3", "get_frame is a int, not a method"),
+        ("class X:\n    def get_frame(self, slop): pass", "get_frame() must accept no argument"),
+    ],
+)
+def test_a_plugin_that_cannot_be_loaded_says_why(install, source, message):
+    files = {} if source is None else {"mod_x.py": source}
+    install("fluxvla-x", version="0.3", entry_points=entry("X", "mod_x:X"), files=files)
+    with pytest.raises(LoadFailed, match=re.escape(message)) as error:
+        OPERATORS.get("X")
+    assert "fluxvla-x 0.3" in str(error.value)
+    with pytest.raises(LoadFailed) as again:  # remembered, not tried again
+        OPERATORS.get("X")
+    assert again.value is error.value
+
+
+def test_a_requirement_on_another_core_is_checked_before_import(install):
+    install(
+        "fluxvla-old",
+        entry_points=entry("Old", "mod_old:Old"),
+        files={"mod_old.py": "raise RuntimeError('imported')"},
+        requires=("fluxvla-core<0.0.1",),
+    )
+    with pytest.raises(
+        IncompatiblePlugin, match=r"fluxvla-old 1\.0 needs fluxvla-core<0\.0\.1, but"
+    ):
+        OPERATORS.get("Old")
+
+
+@pytest.mark.parametrize(
+    ("api", "upgrade"), [("1.9", "fluxvla-core"), ("2.0", "fluxvla-core"), ("0.9", "fluxvla-x")]
+)
+def test_the_contract_version_is_caret_checked(install, api, upgrade):
+    source = f"class X:\n    api = '{api}'\n    def get_frame(self): pass"
+    install("fluxvla-x", entry_points=entry("X", "mod_x:X"), files={"mod_x.py": source})
+    with pytest.raises(IncompatiblePlugin) as error:
+        OPERATORS.get("X")
+    assert f"written for operators {api}, this core speaks 1.0" in str(error.value)
+    assert f"pip install --upgrade {upgrade}" in str(error.value)
+
+
+def test_register_module_serves_this_process_only():
+    registry = Registry("operators")
+
+    @registry.register_module()
+    class Mine:
+        def get_frame(self) -> dict:
+            return {}
+
+    assert registry.get("Mine") is Mine
+    assert "Mine" in registry
+    with pytest.raises(LoadFailed, match="already registered in this process"):
+        registry.register_module("Mine")(type("Other", (Mine,), {}))
+    registry.unregister("Mine")
+    assert "Mine" not in registry
+
+
+def test_a_type_never_resolves_to_an_import_path():
+    with pytest.raises(MissingPlugin):
+        RUNNERS.get("subprocess.check_output")
+    with pytest.raises(MissingPlugin):
+        RUNNERS.get("subprocess:check_output")
+
+
+def test_the_table_of_first_party_names_equals_their_pyproject_files():
+    stated: dict[str, dict[str, tuple[str, ...]]] = {}
+    for file in sorted((ROOT / "plugins").glob("*/pyproject.toml")):
+        project = tomli.loads(file.read_text())["project"]
+        stated[project["name"]] = {
+            group.removeprefix("fluxvla."): tuple(sorted(names))
+            for group, names in project["entry-points"].items()
+        }
+    table = {d: {r: tuple(sorted(n)) for r, n in t.items()} for d, t in known.FIRST_PARTY.items()}
+    assert table == stated

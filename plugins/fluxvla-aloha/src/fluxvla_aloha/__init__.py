@@ -1,0 +1,1 @@
+"""FluxVLA on ALOHA."""

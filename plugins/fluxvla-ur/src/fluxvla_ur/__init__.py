@@ -1,0 +1,1 @@
+"""FluxVLA on Universal Robots arms."""

@@ -15,7 +15,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-models": {
         "heads": ("FlowMatchingHead",),
         "llm_backbones": ("SentenceEncoder",),
-        "projectors": ("LinearProjector",),
+        "projectors": ("FiLMProjector",),
         "vision_backbones": ("ConvEncoder",),
         "vlas": ("CompactVLA",),
     },

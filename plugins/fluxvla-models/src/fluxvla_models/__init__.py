@@ -1,0 +1,1 @@
+"""Vision-Language-Action models, each composed from parts that a config names."""

@@ -1,0 +1,38 @@
+"""Joins what is seen, what is asked, and where the joints are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class FiLMProjector(nn.Module):
+    """Visual features, scaled and shifted by the instruction, beside state and instruction.
+
+    The scaling is FiLM (Perez et al. 2018): the instruction chooses what in the picture counts.
+
+    Args:
+        vision_dim, text_dim: widths of the two encoders' vectors; the model fills them in.
+        state_dim: length of the (padded) state vector.
+        width: length of the context vector.
+    """
+
+    def __init__(self, vision_dim: int, text_dim: int, state_dim: int, width: int = 256) -> None:
+        super().__init__()
+        self.out_dim = width
+        self.vision = nn.Sequential(nn.LayerNorm(vision_dim), nn.Linear(vision_dim, width))
+        self.state = nn.Sequential(nn.Linear(state_dim, width), nn.GELU(), nn.Linear(width, width))
+        self.text = nn.Linear(text_dim, width)
+        self.film = nn.Linear(text_dim, 2 * width)
+        self.mix = nn.Sequential(
+            nn.LayerNorm(3 * width),
+            nn.Linear(3 * width, 2 * width),
+            nn.GELU(),
+            nn.Linear(2 * width, width),
+        )
+
+    def forward(self, vision: Tensor, text: Tensor, states: Tensor) -> Tensor:
+        """``(B, vision_dim)``, ``(B, text_dim)``, ``(B, state_dim)`` -> ``(B, width)``."""
+        scale, shift = self.film(text).chunk(2, dim=-1)
+        seen = self.vision(vision) * (1 + scale) + shift
+        return self.mix(torch.cat([seen, self.state(states), self.text(text)], dim=-1))

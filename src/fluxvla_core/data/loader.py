@@ -1,0 +1,106 @@
+"""A torch ``DataLoader`` whose batches do not depend on the number of its workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from fluxvla_core.data.sampler import EpochSampler, SampleKey
+from fluxvla_core.errors import ConfigError, FluxError
+
+
+class Loader:
+    """Batches without end, from ``sampler.start`` on; ``make_loader`` builds it.
+
+    Prefetching runs ahead of training, so a position counts batches that were *used*:
+    ``sampler.advance(start, used)``.
+    """
+
+    def __init__(self, inner: Any, sampler: EpochSampler) -> None:
+        self.inner = inner
+        self.sampler = sampler
+
+    def __iter__(self) -> Iterator[Any]:
+        for batch in self.inner:
+            if isinstance(batch, _Failed):
+                raise batch.error
+            yield batch
+
+
+def make_loader(
+    dataset: Any,
+    collator: Callable[[Sequence[Any]], Any],
+    sampler: EpochSampler,
+    num_workers: int = 0,
+    pin_memory: bool = False,
+    prefetch_factor: int = 2,
+    multiprocessing_context: str | None = None,
+) -> Loader:
+    """Load batches of ``dataset`` in the order of ``sampler``.
+
+    Args:
+        dataset: has ``get_sample(index, epoch)``, or ``get_samples(keys)`` for grouped reads;
+            ``prepare()`` is called first where there is one.
+        num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
+        pin_memory: for a GPU.
+        multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
+
+    Raises:
+        ConfigError: ``num_workers`` is negative.
+    """
+    import torch
+    from torch.utils.data import DataLoader
+
+    if num_workers < 0:
+        raise ConfigError(f"per_device_num_workers must be at least 0, got {num_workers}")
+    prepare = getattr(dataset, "prepare", None)
+    if prepare is not None:
+        prepare()
+    inner = DataLoader(
+        _Keyed(dataset),
+        batch_sampler=sampler,  # type: ignore[arg-type]
+        collate_fn=_Collate(collator),
+        num_workers=num_workers,
+        pin_memory=pin_memory,
+        prefetch_factor=prefetch_factor if num_workers else None,
+        multiprocessing_context=multiprocessing_context if num_workers else None,
+        # The loader draws a base seed for its workers; from the global generator that draw
+        # would make a resumed run differ from an uninterrupted one.
+        generator=torch.Generator().manual_seed(0),
+    )
+    return Loader(inner, sampler)
+
+
+class _Failed:
+    """An error on its way out of a worker: torch would rebuild it from its text alone."""
+
+    def __init__(self, error: FluxError) -> None:
+        self.error = error
+
+
+class _Keyed:
+    """What torch's fetcher sees: a dataset that is asked for a whole batch of keys."""
+
+    def __init__(self, dataset: Any) -> None:
+        self.dataset = dataset
+
+    def __getitems__(self, keys: list[SampleKey]) -> Any:
+        try:
+            if hasattr(self.dataset, "get_samples"):
+                return self.dataset.get_samples(keys)
+            return [self.dataset.get_sample(key.index, key.epoch) for key in keys]
+        except FluxError as error:
+            return _Failed(error)
+
+
+class _Collate:
+    def __init__(self, collator: Callable[[Sequence[Any]], Any]) -> None:
+        self.collator = collator
+
+    def __call__(self, samples: Any) -> Any:
+        if isinstance(samples, _Failed):
+            return samples
+        try:
+            return self.collator(samples)
+        except FluxError as error:
+            return _Failed(error)

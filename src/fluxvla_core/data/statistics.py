@@ -1,0 +1,134 @@
+"""Exact statistics of columns and of images, in one pass and mergeable.
+
+Mean and variance are kept as (count, mean, sum of squared deviations) in float64 and joined by
+Chan's formula, so many small chunks give what one big one gives. Quantiles of columns are true
+quantiles; pixels have 256 values, so their histogram loses nothing.
+Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+variances", Stanford STAN-CS-79-773, 1979.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+LEVELS = 256
+
+Floats = npt.NDArray[np.float64]
+Stats = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean, sum of squared deviations, min and max of the rows seen; each ``(D,)``."""
+
+    count: int
+    mean: Floats
+    m2: Floats
+    min: Floats
+    max: Floats
+
+    @classmethod
+    def of(cls, rows: npt.NDArray[Any]) -> Moments:
+        """Moments of ``(N, D)`` rows, N at least 1."""
+        wide = rows.astype(np.float64)
+        mean = wide.mean(axis=0)
+        m2 = np.square(wide - mean).sum(axis=0)
+        return cls(len(wide), mean, m2, wide.min(axis=0), wide.max(axis=0))
+
+    def merge(self, other: Moments) -> Moments:
+        """Moments of both together."""
+        count = self.count + other.count
+        delta = other.mean - self.mean
+        return Moments(
+            count,
+            self.mean + delta * (other.count / count),
+            self.m2 + other.m2 + np.square(delta) * (self.count * other.count / count),
+            np.minimum(self.min, other.min),
+            np.maximum(self.max, other.max),
+        )
+
+    @property
+    def std(self) -> Floats:
+        """Population standard deviation, ``(D,)``."""
+        return np.sqrt(self.m2 / self.count)
+
+
+def moments(chunks: Iterable[npt.NDArray[Any]]) -> Moments:
+    """Moments of all rows of all non-empty ``(n, D)`` chunks.
+
+    Raises:
+        ValueError: there is not one row.
+    """
+    total: Moments | None = None
+    for chunk in chunks:
+        if len(chunk):
+            part = Moments.of(chunk)
+            total = part if total is None else total.merge(part)
+    if total is None:
+        raise ValueError("statistics of no rows")
+    return total
+
+
+def column_statistics(rows: npt.NDArray[Any], chunk: int = 65536) -> Stats:
+    """Statistics of ``(N, D)`` rows: min, max, mean, std, the quantiles (each ``(D,)``), count.
+
+    ``count`` is ``(1,)`` int64. The chunk bounds memory, not precision.
+    """
+    total = moments(rows[i : i + chunk] for i in range(0, len(rows), chunk))
+    levels = np.quantile(rows.astype(np.float64), list(QUANTILES.values()), axis=0)
+    return {
+        "min": total.min,
+        "max": total.max,
+        "mean": total.mean,
+        "std": total.std,
+        "count": np.array([total.count], dtype=np.int64),
+        **dict(zip(QUANTILES, levels, strict=True)),
+    }
+
+
+def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+    """How often each of 256 values occurs, ``(3, 256)``, in an ``(H, W, 3)`` uint8 image."""
+    shifted = image.reshape(-1, 3).astype(np.int32) + np.array([0, LEVELS, 2 * LEVELS], np.int32)
+    return np.bincount(shifted.ravel(), minlength=3 * LEVELS).reshape(3, LEVELS)
+
+
+def histogram_statistics(histogram: npt.NDArray[np.int64], frames: int) -> Stats:
+    """Statistics of the pixels counted in ``(3, 256)``, scaled to 0..1, each ``(3, 1, 1)``.
+
+    ``count`` is the number of frames, ``(1,)``, as LeRobot counts images.
+    """
+    values = np.arange(LEVELS, dtype=np.float64)
+    pixels = histogram.sum(axis=1)
+    mean = histogram @ values / pixels
+    variance = np.array([h @ np.square(values - m) for h, m in zip(histogram, mean, strict=True)])
+    seen = [np.flatnonzero(channel) for channel in histogram]
+    stats: dict[str, npt.NDArray[Any]] = {
+        "min": np.array([s[0] for s in seen], np.float64),
+        "max": np.array([s[-1] for s in seen], np.float64),
+        "mean": mean,
+        "std": np.sqrt(variance / pixels),
+    }
+    for name, level in QUANTILES.items():
+        stats[name] = np.array([_histogram_quantile(h, level) for h in histogram])
+    scaled = {name: (value / 255.0).reshape(3, 1, 1) for name, value in stats.items()}
+    return {**scaled, "count": np.array([frames], dtype=np.int64)}
+
+
+def _histogram_quantile(histogram: npt.NDArray[np.int64], level: float) -> float:
+    """The quantile of the counted values, by linear interpolation as ``np.quantile`` does it."""
+    cumulative = np.cumsum(histogram)
+    place = level * (int(cumulative[-1]) - 1)
+    low = int(np.floor(place))
+    below, above = np.searchsorted(cumulative, [low, low + (place > low)], side="right")
+    return float(below + (above - below) * (place - low))
+
+
+def as_lists(stats: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    """Plain JSON values."""
+    return {name: value.tolist() for name, value in stats.items()}

@@ -28,7 +28,7 @@ def test_arrays_are_stacked_with_their_dtype_and_values(array, count):
 
 def test_tensors_are_stacked_metas_listed_and_absent_keys_left_out():
     collate = build_collator_from_cfg(
-        dict(type="DictCollator", keys=["a", "i", "absent"], meta_keys=["task", "stats"])
+        {"type": "DictCollator", "keys": ["a", "i", "absent"], "meta_keys": ["task", "stats"]}
     )
     batch = collate(
         [

@@ -80,11 +80,11 @@ def test_drop_last_drops_the_incomplete_global_batch():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (dict(length=0, batch_size=2), "the dataset holds no samples"),
-        (dict(length=4, batch_size=0), "batch size must be at least 1, got 0"),
-        (dict(length=4, batch_size=2, rank=2, world=2), "rank 2 is not among 2 processes"),
+        ({"length": 0, "batch_size": 2}, "the dataset holds no samples"),
+        ({"length": 4, "batch_size": 0}, "batch size must be at least 1, got 0"),
+        ({"length": 4, "batch_size": 2, "rank": 2, "world": 2}, "rank 2 is not among 2 processes"),
         (
-            dict(length=3, batch_size=2, world=2, drop_last=True),
+            {"length": 3, "batch_size": 2, "world": 2, "drop_last": True},
             "3 samples do not fill one global batch of 4",
         ),
     ],

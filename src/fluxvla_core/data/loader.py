@@ -56,9 +56,10 @@ def make_loader(
     prepare = getattr(dataset, "prepare", None)
     if prepare is not None:
         prepare()
-    inner = DataLoader(
-        _Keyed(dataset),
-        batch_sampler=sampler,  # type: ignore[arg-type]
+    keyed: Any = _Keyed(dataset)
+    inner: DataLoader[Any] = DataLoader(
+        keyed,
+        batch_sampler=sampler,
         collate_fn=_Collate(collator),
         num_workers=num_workers,
         pin_memory=pin_memory,

@@ -8,6 +8,7 @@ size, and a run resumes at a position instead of replaying what it has seen.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ from fluxvla_core.data.rng import order_rng
 from fluxvla_core.errors import ConfigError
 
 
-class SampleKey(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class SampleKey:
     """What a data worker is asked for."""
 
     epoch: int

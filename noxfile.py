@@ -1,0 +1,207 @@
+"""The commands of users and of CI.
+
+    nox -s demo [-- --smoke | --full] [--fresh]     from demonstrations to an evaluated policy
+    nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
+    nox -s lint | types | layers | bench            one part of it
+
+Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import nox
+
+ROOT = Path(__file__).resolve().parent
+sys.path.insert(0, str(ROOT))
+
+from tools import envs, project, rendering, shell, torch_build, wheels  # noqa: E402
+
+nox.needs_version = ">=2024.4.15"
+nox.options.sessions = ["tests"]
+nox.options.default_venv_backend = "none"
+
+EXTRAS = "data,train,report"
+PYTEST = ["-n", os.environ.get("FLUXVLA_TEST_PROCESSES", "2"), "--dist", "loadfile"]
+
+
+@nox.session
+def tests(session: nox.Session) -> None:
+    """Lint, types, layers, all tests with the packaging ones, and the demo's short form."""
+    with steps(session) as step:
+        dev = dev_env(session)
+        if session.posargs:
+            step("pytest", lambda: dev.run("pytest", *session.posargs, env=rendering.VARIABLES))
+            return
+        step("lint", lambda: check_lint(dev))
+        step("types", lambda: dev.run("mypy", cwd=ROOT))
+        step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
+        step("pytest", lambda: dev.run("pytest", *PYTEST, cwd=ROOT, env=rendering.VARIABLES))
+        step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
+
+
+@nox.session
+def demo(session: nox.Session) -> None:
+    """Collect, train, evaluate and run a policy for the simulated ALOHA; one HTML report."""
+    with steps(session) as step:
+        step("demo", lambda: run_demo(session, session.posargs))
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """ruff check and ruff format --check."""
+    with steps(session) as step:
+        dev = dev_env(session)
+        step("lint", lambda: check_lint(dev))
+
+
+@nox.session
+def types(session: nox.Session) -> None:
+    """mypy, strict, on the core."""
+    with steps(session) as step:
+        dev = dev_env(session)
+        step("types", lambda: dev.run("mypy", *session.posargs, cwd=ROOT))
+
+
+@nox.session
+def layers(session: nox.Session) -> None:
+    """import-linter: which room of the core may import which."""
+    with steps(session) as step:
+        dev = dev_env(session)
+        step("layers", lambda: dev.run("lint-imports", *session.posargs, cwd=ROOT))
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """Every benchmark of benchmarks/, or those named; results go to benchmarks/results/."""
+    with steps(session) as step:
+        dev = dev_env(session)
+        named = session.posargs or sorted(p.stem for p in (ROOT / "benchmarks").glob("[!_]*.py"))
+        for name in named:
+            script = ROOT / "benchmarks" / f"{name}.py"
+            step(name, lambda s=script: dev.run("python", s, cwd=ROOT, env=rendering.VARIABLES))
+
+
+def check_lint(dev: envs.Env) -> None:
+    dev.run("ruff", "check", ".", cwd=ROOT)
+    dev.run("ruff", "format", "--check", ".", cwd=ROOT)
+
+
+def dev_env(session: nox.Session) -> envs.Env:
+    """.nox/dev: torch, the tools, and core and plugins in editable mode, able to render."""
+    env = envs.Env(ROOT / ".nox" / "dev")
+    dists = project.distributions(ROOT)
+    pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
+    needs = nox.project.dependency_groups(pyproject, "dev")
+
+    def install(changed: list[str], fresh: bool) -> None:
+        words: list[str] = []
+        for dist in (d for d in dists if d.name in changed):
+            extras = f"[{EXTRAS}]" if dist.path == ROOT else ""
+            words += ["-e", f"{dist.path}{extras}"]
+        session.log(f"installing in editable mode: {', '.join(changed)}")
+        env.pip_install("--no-build-isolation", *words, constraints=project.CONSTRAINTS)
+
+    # Sources are used in place; only what an installation reads makes it out of date.
+    parts = {d.name: project.digest([d.path / "pyproject.toml"], relative_to=d.path) for d in dists}
+    env.filled(base_of(needs), parts, lambda: install_base(session, env, needs), install)
+    make_renderable(session, env)
+    return env
+
+
+def demo_env(session: nox.Session) -> tuple[envs.Env, str]:
+    """.nox/demo: torch and the wheels of core and plugins, nothing else; and what they are made of.
+
+    The second value changes whenever the code of any wheel does.
+    """
+    env = envs.Env(ROOT / ".nox" / "demo")
+    dists = project.distributions(ROOT)
+    built: dict[str, Path] = {}
+
+    def install(changed: list[str], fresh: bool) -> None:
+        builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
+        built.update(wheels.build(dists, ROOT / "dist", builder))
+        session.log(f"installing wheels: {', '.join(changed)}")
+        core = dists[0].name
+        named = [f"{path}[{EXTRAS}]" if name == core else path for name, path in built.items()]
+        env.pip_install(*named, constraints=project.CONSTRAINTS)
+        if not fresh:  # same version, other content: pip would keep what is there
+            again = ["--force-reinstall", "--no-deps", *(built[name] for name in changed)]
+            env.pip_install(*again, constraints=project.CONSTRAINTS)
+
+    parts = {d.name: d.fingerprint() for d in dists}
+    env.filled(base_of(()), parts, lambda: install_base(session, env, ()), install)
+    make_renderable(session, env)
+    return env, project.combined(parts)
+
+
+def base_of(requirements: tuple[str, ...]) -> dict[str, str]:
+    return {
+        "python": sys.version,
+        "constraints": project.CONSTRAINTS.read_text(encoding="utf-8"),
+        "gpu": str(torch_build.has_nvidia_gpu()),
+        "requirements": " ".join(requirements),
+    }
+
+
+def install_base(session: nox.Session, env: envs.Env, requirements: tuple[str, ...]) -> None:
+    version = project.constrained_version("torch")
+    session.log(f"installing torch {version} into {env.root.relative_to(ROOT)}")
+    way = torch_build.install(env, version, project.CONSTRAINTS, session.log)
+    session.log(f"torch came by way of: {way}")
+    if requirements:
+        session.log(f"installing {len(requirements)} tools and their dependencies")
+        env.pip_install(*requirements, constraints=project.CONSTRAINTS)
+
+
+def make_renderable(session: nox.Session, env: envs.Env) -> None:
+    try:
+        rendering.ensure(env, session.log)
+    except rendering.CannotRender as error:
+        print(error, file=sys.stderr)
+        # nox would turn a session's error into 1; this one is 'bad surroundings', as the CLI's 2.
+        sys.exit(2)
+
+
+def run_demo(session: nox.Session, arguments: list[str]) -> None:
+    began = time.monotonic()
+    env, build = demo_env(session)
+    words = ["--build", build, "--installed-in", f"{time.monotonic() - began:.1f}", *arguments]
+    env.run("python", "-m", "tools.demo", *words, cwd=ROOT, env=rendering.VARIABLES)
+
+
+class steps:
+    """Run the parts of a session one after the other; name all that failed at the end.
+
+    A failing part does not keep the next one from running: CI reports everything in one go.
+    """
+
+    def __init__(self, session: nox.Session) -> None:
+        self.session = session
+        self.failed: list[str] = []
+        self.took: list[str] = []
+
+    def __enter__(self) -> steps:
+        return self
+
+    def __call__(self, name: str, action: object) -> None:
+        self.session.log(f"== {name}")
+        began = time.monotonic()
+        try:
+            action()  # type: ignore[operator]
+        except shell.StepFailed as error:
+            self.session.warn(f"{name}: {error}")
+            self.failed.append(name)
+        self.took.append(f"{name} {time.monotonic() - began:.0f} s")
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, shell.StepFailed):
+            self.session.error(f"{error}\n{error.output}")
+        if kind is None:
+            self.session.log("took: " + ", ".join(self.took))
+            if self.failed:
+                self.session.error("failed: " + ", ".join(self.failed))

@@ -1,0 +1,105 @@
+"""Virtual environments that are filled once and re-used until what they are made from changes.
+
+nox keeps one environment for each session. Here several sessions share one (lint, types, layers
+and tests need the same things, torch among them), so the environments are named and kept here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from tools import shell
+
+STAMP = "fluxvla-installed.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Env:
+    """A virtual environment at ``root``."""
+
+    root: Path
+
+    @property
+    def bin(self) -> Path:
+        return self.root / ("Scripts" if os.name == "nt" else "bin")
+
+    @property
+    def python(self) -> Path:
+        return self.bin / "python"
+
+    def variables(self) -> dict[str, str]:
+        """What an activated environment sets, for programs that look for it."""
+        path = os.pathsep.join([str(self.bin), os.environ.get("PATH", os.defpath)])
+        return {"VIRTUAL_ENV": str(self.root), "PATH": path}
+
+    def run(
+        self,
+        program: str,
+        *words: str | os.PathLike[str],
+        cwd: Path | None = None,
+        env: Mapping[str, str] | None = None,
+        quiet: bool = False,
+        echo: bool = True,
+    ) -> str:
+        """``shell.run`` of one of this environment's programs, which come first on its PATH."""
+        variables = {**self.variables(), **(env or {})}
+        command = [self.bin / program, *words]
+        return shell.run(command, cwd=cwd, env=variables, quiet=quiet, echo=echo)
+
+    def pip_install(self, *words: str | os.PathLike[str], constraints: Path) -> None:
+        """pip install under the constraints; raises StepFailed."""
+        options = ["-q", "--disable-pip-version-check", "-c", str(constraints)]
+        self.run("python", "-m", "pip", "install", *options, *words)
+
+    def create(self) -> None:
+        """Make it anew and empty, with the Python that runs this."""
+        shutil.rmtree(self.root, ignore_errors=True)
+        shell.run([sys.executable, "-m", "virtualenv", "-q", self.root])
+
+    def stamp(self) -> dict[str, str]:
+        """What was installed by ``filled``; empty when nothing was, or the stamp is damaged."""
+        try:
+            content = json.loads((self.root / STAMP).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def filled(
+        self,
+        base: Mapping[str, str],
+        parts: Mapping[str, str],
+        install_base: Callable[[], None],
+        install_parts: Callable[[list[str], bool], None],
+    ) -> bool:
+        """Bring the environment to a described state; return whether anything had to be done.
+
+        ``base`` describes what makes everything be installed from nothing (Python, constraints,
+        lists of requirements); ``parts`` maps each part to a fingerprint. A changed base means a
+        new environment. ``install_parts(changed, fresh)`` gets the parts to bring up to date. The
+        stamp is taken away first and written last: an interrupted installation is repeated.
+        """
+        old = self.stamp()
+        key = hashlib.sha256(json.dumps(dict(base), sort_keys=True).encode()).hexdigest()
+        fresh = old.get("base") != key or not self.python.exists()
+        gone = {name for name in old if name != "base"} - set(parts)
+        if gone and not fresh:
+            fresh = True  # a part that left the repository must leave the environment, too
+        changed = [name for name, print_ in parts.items() if fresh or old.get(name) != print_]
+        if not changed and not fresh:
+            return False
+        if fresh:
+            self.create()
+            install_base()
+        else:
+            (self.root / STAMP).unlink()
+        install_parts(changed, fresh)
+        record = {"base": key, **parts}
+        (self.root / STAMP).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        return True

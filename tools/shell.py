@@ -1,0 +1,87 @@
+"""Run a command in sight of the user and stop in a way that lets it finish what it must."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+# A training run that is interrupted writes one last checkpoint; on two slow cores that takes
+# seconds, and a minute is what a full disk or a network drive may need.
+INTERRUPT_SECONDS = 60.0
+
+
+class StepFailed(Exception):
+    """A command ended with an exit status other than 0.
+
+    ``command`` is what was run, ``status`` its exit status, ``output`` what it printed when that
+    was kept back (``quiet=True``), else the empty string.
+    """
+
+    def __init__(self, command: Sequence[str], status: int, output: str = "") -> None:
+        self.command = tuple(command)
+        self.status = status
+        self.output = output
+        super().__init__(f"exit status {status} from: {shlex.join(self.command)}")
+
+
+def child_environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment of this process without what would leak another Python into a child."""
+    env = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "PYTHONHOME"}}
+    env.pop("__PYVENV_LAUNCHER__", None)
+    env["PYTHONUNBUFFERED"] = "1"
+    env.update(extra or {})
+    return env
+
+
+def run(
+    command: Sequence[str | os.PathLike[str]],
+    *,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    quiet: bool = False,
+    echo: bool = True,
+) -> str:
+    """Run one command and return what it printed (the empty string unless ``quiet``).
+
+    ``env`` is added to ``child_environment()``. With ``quiet`` stdout and stderr are kept back and
+    come with the error. On Ctrl-C the child, which got the same signal, is given
+    ``INTERRUPT_SECONDS`` to end by itself, then it is terminated; ``KeyboardInterrupt`` goes on.
+    Raises StepFailed on any exit status but 0, and on a program that cannot be started (127).
+    """
+    words = [os.fspath(word) for word in command]
+    if echo:
+        print(f"$ {shlex.join(words)}", flush=True)
+    sink = subprocess.PIPE if quiet else None
+    try:
+        child = subprocess.Popen(
+            words,
+            cwd=cwd,
+            env=child_environment(env),
+            stdout=sink,
+            stderr=subprocess.STDOUT if quiet else None,
+            text=True,
+        )
+    except OSError as error:
+        raise StepFailed(words, 127, str(error)) from error
+    try:
+        output, _ = child.communicate()
+    except KeyboardInterrupt:
+        _let_it_end(child)
+        raise
+    if child.returncode:
+        raise StepFailed(words, child.returncode, output or "")
+    return output or ""
+
+
+def _let_it_end(child: subprocess.Popen[str]) -> None:
+    for stop, seconds in ((None, INTERRUPT_SECONDS), (child.terminate, 10.0), (child.kill, None)):
+        if stop is not None:
+            stop()
+        try:
+            child.wait(timeout=seconds)
+            return
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            continue

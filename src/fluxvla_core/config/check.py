@@ -1,0 +1,235 @@
+"""Check a whole config against the classes that it names, before anything is imported or built.
+
+Keys and classes only. Types of values are left to the constructors: annotations in the wild are
+too often wrong to refuse a config by them.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import Any
+
+from fluxvla_core.config import keys
+from fluxvla_core.config.constructor import Signature
+from fluxvla_core.config.requirements import requirement_problems
+from fluxvla_core.config.resolve import SECTIONS, SLOTS, Found, resolve
+from fluxvla_core.config.tree import Config
+from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem
+from fluxvla_core.plugins.load import LIST
+
+INJECTED = ("cfg", "context")
+"""Constructor parameters that are filled in when the run starts; a config may not set them."""
+
+LOADERS = ("train_dataloader", "val_dataloader")
+_NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, "requires", "hooks")
+# Keys under which a table without ``type`` can only be a slip.
+_NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filters"}
+
+
+@dataclass(frozen=True)
+class Use:
+    """One class that the config names: where, from which registry, and who provides it."""
+
+    key: str
+    found: Found
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check found.
+
+    Args:
+        sections: names of the runnable sections (tables whose ``type`` is a runner).
+        trains: those of them that train.
+        uses: every class named in what was checked.
+        problems: empty if the config is good.
+        missing: whether a plugin that is not there is among them.
+    """
+
+    sections: tuple[str, ...]
+    trains: frozenset[str]
+    uses: tuple[Use, ...]
+    problems: tuple[Problem, ...]
+    missing: bool = False
+
+
+def check_config(config: Config, section: str | None = None) -> Checked:
+    """:func:`examine`, with all problems raised as one ConfigError."""
+    checked = examine(config, section)
+    if checked.problems:
+        next_step = LIST if checked.missing else None
+        raise ConfigError.from_problems(checked.problems, next=next_step)
+    return checked
+
+
+def examine(config: Config, section: str | None = None) -> Checked:
+    """Everything that is wrong with ``config``, without importing a plugin.
+
+    Args:
+        section: check for running this one. Plugins that only other sections need may then be
+            missing: a robot's computer needs no training plugin to run ``inference``.
+    """
+    walk = _Walk(config)
+    for name, value in config.tree.items():
+        walk.top(name, value)
+    problems = walk.problems + requirement_problems(config)
+    sections = tuple(walk.sections)
+    trains = frozenset(walk.trains)
+    for name in sections:
+        if name in trains and section in (None, name):
+            problems += _loader_problems(config, name)
+    missing = walk.missing
+    if section in sections:
+        needed = _needed(config, section, section in trains, sections)
+        missing = [p for p in missing if p.key.partition(".")[0] in needed]
+    order = {p: i for i, p in enumerate(keys.every(config.tree))}
+    problems = sorted([*problems, *missing], key=lambda p: order.get(p.key, -1))
+    return Checked(sections, trains, tuple(walk.uses), tuple(problems), bool(missing))
+
+
+def _needed(config: Config, section: str, trains: bool, sections: tuple[str, ...]) -> set[str]:
+    """Top-level names whose plugins must be there to run ``section``."""
+    if not trains:
+        return {section, "hooks"}
+    return {name for name in config.tree if name == section or name not in sections}
+
+
+def _loader_problems(config: Config, section: str) -> list[Problem]:
+    loader = config.tree.get("train_dataloader")
+    if loader is None:
+        what = f"{section!r} trains, and there is no train_dataloader = dict(dataset=dict(...))"
+        return [config.problem(section, what)]
+    if isinstance(loader, dict) and not isinstance(loader.get("dataset"), dict):
+        what = "needs dataset = dict(type=...)"
+        return [config.problem("train_dataloader", what)]
+    return []
+
+
+class _Walk:
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.problems: list[Problem] = []
+        self.missing: list[Problem] = []  # plugins that are not installed
+        self.sections: list[str] = []
+        self.trains: list[str] = []
+        self.uses: list[Use] = []
+
+    def add(self, key: str, what: str) -> None:
+        self.problems.append(self.config.problem(key, what))
+
+    def top(self, name: str, value: Any) -> None:
+        """One top-level name: a section, a known table, or a variable to compose from."""
+        key = keys.child("", name)
+        if name in LOADERS:
+            if isinstance(value, dict):
+                self.children(key, value, whole=True)
+            elif value is not None:
+                self.add(key, f"must be a table, got {value!r}")
+        elif name in SLOTS:
+            if name in _NEEDS_TYPE and not isinstance(value, dict) and value is not None:
+                self.add(key, f"must be a table with type = '...', got {value!r}")
+            else:
+                self.value(key, value, SLOTS[name], whole=True)
+        elif isinstance(value, dict) and "type" not in value:
+            near = difflib.get_close_matches(name, _NAMED, 1, 0.8)
+            if near:
+                self.add(
+                    key,
+                    f"no section of that name; did you mean {near[0]!r}? (if it is a variable of "
+                    "your own, give it a name that looks less like one)",
+                )
+            self.children(key, value, whole=False)
+        else:
+            self.value(key, value, None, whole=False)
+
+    def children(self, key: str, table: dict[str, Any], whole: bool) -> None:
+        for name, value in table.items():
+            if name != "type":
+                self.value(keys.child(key, name), value, SLOTS.get(name), whole)
+
+    def value(self, key: str, value: Any, registry: str | None, whole: bool) -> None:
+        """``whole`` is False in variables, which a config may complete elsewhere."""
+        if isinstance(value, list):
+            for index, item in enumerate(value):
+                self.value(keys.child(key, index), item, registry, whole)
+        elif registry == "hooks" and isinstance(value, str):
+            self.component(key, {"type": value}, registry, whole, at=key)
+        elif isinstance(value, dict):
+            if "type" in value:
+                self.component(key, value, registry, whole, at=keys.child(key, "type"))
+                return
+            slot = keys.split(key)[-1]
+            if whole and slot in _NEEDS_TYPE and value:
+                self.add(key, f"this table needs type = '<one of fluxvla.{registry}>'")
+            self.children(key, value, whole)
+
+    def component(
+        self, key: str, table: dict[str, Any], registry: str | None, whole: bool, at: str
+    ) -> None:
+        """One table that is built; ``at`` is the key of its type's name."""
+        kind = table["type"]
+        if not isinstance(kind, str):
+            self.add(at, f"type must be a class's name in quotes, got {kind!r}")
+            self.children(key, table, whole)
+            return
+        try:
+            found = resolve(kind, registry)
+        except PluginError as error:
+            text = error.what.partition("\n")[0]
+            if error.next and error.next != LIST:
+                text += f": {error.next}"
+            problem = self.config.problem(at, text)
+            (self.missing if isinstance(error, MissingPlugin) else self.problems).append(problem)
+            if registry == "runners" and "." not in key:
+                self.sections.append(key)
+        else:
+            if found.registry == "runners" and "." not in key:
+                self.sections.append(key)
+                whole = True
+                if found.signature and found.signature.trains:
+                    self.trains.append(key)
+            self.uses.append(Use(key, found))
+            if found.signature is not None:
+                self.arguments(key, table, found.signature, whole)
+        self.children(key, table, whole)
+
+    def arguments(self, key: str, table: dict[str, Any], signature: Signature, whole: bool) -> None:
+        given = [name for name in table if name != "type"]
+        for name in given:
+            inner = keys.child(key, name)
+            if name in INJECTED:
+                self.add(inner, f"{name!r} is filled in when the run starts and cannot be set")
+            elif name not in signature.names and not signature.open:
+                self.add(inner, self._unknown(key, name, signature, table))
+        lacking = [
+            p.name
+            for p in signature.parameters
+            if p.required and p.name not in given and p.name not in INJECTED
+        ]
+        if lacking and whole:
+            self.add(
+                key,
+                f"{signature.name} needs {', '.join(map(repr, lacking))} "
+                f"(defined at {signature.place})",
+            )
+
+    def _unknown(self, key: str, name: str, signature: Signature, table: dict[str, Any]) -> str:
+        free = [p for p in signature.parameters if p.name not in table and p.name not in INJECTED]
+        near = difflib.get_close_matches(name, [p.name for p in free], 1)
+        text = f"{signature.name} takes no {name!r}"
+        if near:
+            place = next(p.place for p in free if p.name == near[0])
+            return f"{text}; did you mean {near[0]!r}? (defined at {place})"
+        text += f" (defined at {signature.place})"
+        here, there = (self.config.where(keys.child(key, n)) for n in (name, "type"))
+        if _file(here) != _file(there):
+            text += (
+                f"; it was written for the class that {there} replaced: "
+                f"add _delete_=True to that table, or override the whole table {key!r}"
+            )
+        return text
+
+
+def _file(place: str) -> str:
+    return place if place.startswith("--set") else place.rpartition(":")[0]

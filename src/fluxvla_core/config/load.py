@@ -1,0 +1,225 @@
+"""Read a config: ``.py``, ``.toml``, or the ``config.resolved.json`` of an earlier run."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import json
+import types
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.config import keys
+from fluxvla_core.config.merge import join_bases, merge
+from fluxvla_core.config.py_positions import py_positions
+from fluxvla_core.config.tree import Config, plain, shown, strip
+from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.plugins.locate import locate
+
+BASE = "_base_"
+FORMAT = "fluxvla-config-1"
+SUFFIXES = (".py", ".toml", ".json")
+
+
+def load_config(path: str | Path) -> Config:
+    """The config in ``path`` with everything that it inherits.
+
+    A ``.py`` config is a program that the user chose to run; its public names that hold plain
+    data become the tree. ``.toml`` and ``.json`` are data and nothing is executed, and a ``.py``
+    that lies in a checkpoint is refused.
+
+    Raises:
+        ConfigError: it is missing, no file, of another kind, has a syntax error, raises, holds
+            something else than plain data, or its inheritance does not work out.
+    """
+    return _load(Path(path), ())
+
+
+def _load(path: Path, chain: tuple[Path, ...]) -> Config:
+    _check_there(path)
+    real = path.resolve()
+    if real in chain:
+        names = " -> ".join(shown(p) for p in (*chain[chain.index(real) :], real))
+        raise ConfigError(f"{BASE} goes round in a circle: {names}", where=shown(chain[-1]))
+    name = shown(path)
+    if path.suffix == ".json":
+        return _from_json(_read(path), name)
+    if path.suffix == ".toml":
+        own = _from_toml(_read(path), name)
+    else:
+        own = _from_python(_read(path), name, path)
+    bases = own.tree.pop(BASE, None)
+    if bases is None:
+        return Config(strip(own.tree), own.origins, name)
+    listed = [bases] if isinstance(bases, str) else bases
+    if not isinstance(listed, list) or not all(isinstance(b, str) for b in listed):
+        raise ConfigError(
+            f"{BASE} must be a file name or a list of them, got {bases!r}", where=own.where(BASE)
+        )
+    places = {k: v for k, v in own.origins.items() if k.partition(".")[0] != BASE}
+    if not listed:
+        return Config(strip(own.tree), places, name)
+    loaded = [_load(_base_path(b, path, own.where(BASE)), (*chain, real)) for b in listed]
+    return merge(join_bases(loaded), Config(own.tree, places, name))
+
+
+def _check_there(path: Path) -> None:
+    name = shown(path)
+    if path.is_dir():
+        inside = sorted(p.name for p in path.iterdir() if p.suffix in SUFFIXES)
+        raise ConfigError(
+            "this is a directory, not a config file",
+            where=name,
+            next=f"name one of the configs in it: {', '.join(inside)}" if inside else None,
+        )
+    if not path.exists():
+        folder = path.parent
+        if not folder.is_dir():
+            raise ConfigError(f"no such config: there is no folder {shown(folder)}", where=name)
+        others = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES)
+        near = difflib.get_close_matches(path.name, others, 3)
+        hint = f"; did you mean {' or '.join(str(path.with_name(n)) for n in near)}?"
+        raise ConfigError(
+            f"no such config{hint if near else ''}",
+            where=name,
+            next=f"configs there: {', '.join(others)}" if others and not near else None,
+        )
+    if path.suffix not in SUFFIXES:
+        raise ConfigError(
+            f"a config is a .py, .toml or .json file, not {path.suffix or 'one without a suffix'}",
+            where=name,
+        )
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"not a text file in UTF-8 (byte {error.start})", where=shown(path)
+        ) from error
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", where=shown(path)) from error
+
+
+def _base_path(base: str, child: Path, where: str) -> Path:
+    """A file beside ``child``, or ``package:path`` inside an installed plugin (not imported)."""
+    package, colon, inside = base.partition(":")
+    if not colon or not package.isidentifier():
+        path = child.parent / base
+        if not path.exists():
+            raise ConfigError(f"{BASE} names {base!r}, which is not there", where=where)
+        return path
+    init = locate(package)
+    if init is None:
+        raise ConfigError(
+            f"{BASE} names {base!r}, but no package {package!r} is installed",
+            where=where,
+            next="fluxvla plugins list",
+        )
+    path = init.parent / inside
+    if not path.exists():
+        raise ConfigError(f"{BASE} names {base!r}, but {package} has no {inside!r}", where=where)
+    return path
+
+
+def _finish(values: dict[str, Any], origins: dict[str, str], name: str) -> Config:
+    found: list[tuple[str, str]] = []
+    tree = plain(values, "", found)
+    config = Config(tree, origins, name)
+    if found:
+        raise ConfigError.from_problems(tuple(config.problem(k, what) for k, what in found))
+    return config
+
+
+def _from_python(text: str, name: str, path: Path) -> Config:
+    if (path.parent / "manifest.json").is_file():
+        raise ConfigError(
+            "a .py that lies in a checkpoint is not executed: what comes with weights is data",
+            where=name,
+            next=f"use its {path.with_name('config.resolved.json')}",
+        )
+    try:
+        tree = ast.parse(text, name)
+        code = compile(tree, name, "exec")
+    except SyntaxError as error:
+        raise ConfigError(
+            f"syntax error: {error.msg}{_quote(error.text)}", where=f"{name}:{error.lineno}"
+        ) from error
+    except ValueError as error:  # null bytes, before Python 3.12
+        raise ConfigError(f"not Python: {error}", where=name) from error
+    values: dict[str, Any] = {"__file__": str(path.resolve()), "__name__": "fluxvla_config"}
+    try:
+        exec(code, values)
+    except KeyboardInterrupt:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"the config raised {type(error).__name__}: {error}",
+            where=f"{name}:{_line(error, name)}",
+        ) from error
+    data = {k: v for k, v in values.items() if k == BASE or _is_data(k, v)}
+    return _finish(data, py_positions(tree, name), name)
+
+
+def _is_data(name: str, value: Any) -> bool:
+    """Helpers that a config defines for itself (imports, functions, paths) are no keys."""
+    if name.startswith("_") or isinstance(value, types.ModuleType):
+        return False
+    return value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
+
+
+def _line(error: BaseException, name: str) -> int:
+    """The config's own line that the exception passed through last."""
+    line, step = 0, error.__traceback__
+    while step is not None:
+        if step.tb_frame.f_code.co_filename == name:
+            line = step.tb_lineno
+        step = step.tb_next
+    return line
+
+
+def _quote(text: str | None) -> str:
+    return f" in {text.strip()!r}" if text and text.strip() else ""
+
+
+def _from_toml(text: str, name: str) -> Config:
+    import tomli
+
+    from fluxvla_core.config.toml_positions import toml_positions
+
+    try:
+        values = tomli.loads(text)
+    except tomli.TOMLDecodeError as error:
+        line = text.splitlines()[error.lineno - 1 : error.lineno]
+        raise ConfigError(
+            f"syntax error: {error.msg} (column {error.colno}){_quote(line[0] if line else None)}",
+            where=f"{name}:{error.lineno}",
+        ) from error
+    return _finish(values, toml_positions(text, name), name)
+
+
+def _from_json(text: str, name: str) -> Config:
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"syntax error: {error.msg}", where=f"{name}:{error.lineno}") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else None
+        raise ConfigError(
+            f"a .json config is the config.resolved.json of a run (format {FORMAT!r}), "
+            f"this has format {found!r}",
+            where=name,
+            next="write configs as .py or .toml",
+        )
+    tree, origins = data.get("config"), data.get("origins", {})
+    if not isinstance(tree, dict) or not isinstance(origins, dict):
+        raise ConfigError("'config' and 'origins' must be tables", where=name)
+    problems = tuple(
+        Problem(name, key, f"an origin must be 'file:line', got {value!r}")
+        for key, value in origins.items()
+        if not isinstance(value, str)
+    )
+    if problems:
+        raise ConfigError.from_problems(problems)
+    return Config(tree, {k: v for k, v in origins.items() if k in set(keys.every(tree))}, name)

@@ -1,0 +1,146 @@
+"""``--set key=value``: the command line's changes to a config, with TOML values."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from fluxvla_core.config import keys
+from fluxvla_core.config.tree import Config, plain
+from fluxvla_core.errors import ConfigError, Problem
+
+_PYTHON = {"True": True, "False": False, "None": None}
+_SPLIT = re.compile(r"\s*(\+?)=\s*")
+
+
+def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
+    """``config`` with each ``key=value`` set, in order.
+
+    ``key`` is dotted, with list indices (``transforms.0.height``) and ``\\.`` for a dot in a name,
+    and must exist; ``key+=value`` adds a key, or appends to a list. A value is TOML (numbers,
+    ``true``, ``"text"``, ``[1, 2]``, ``{type = "X"}``), Python's ``True``, ``False`` and ``None``,
+    or else a bare word or sentence taken as it is. A table replaces the one that is there.
+
+    Raises:
+        ConfigError: all that do not fit, with a did-you-mean.
+    """
+    tree, origins = copy.deepcopy(config.tree), dict(config.origins)
+    problems: list[Problem] = []
+    for text in overrides:
+        place = f"--set {text}"
+        try:
+            key, add, value = _parse(text)
+            key = _put(tree, key, value, add)
+        except _BadOverride as bad:
+            problems.append(Problem(place, "", str(bad)))
+            continue
+        for old in [k for k in origins if k == key or k.startswith(f"{key}.")]:
+            del origins[old]
+        origins[key] = place
+    if problems:
+        raise ConfigError.from_problems(tuple(problems))
+    return Config(tree, origins, config.file)
+
+
+class _BadOverride(Exception):
+    pass
+
+
+def _parse(text: str) -> tuple[str, bool, Any]:
+    match = _SPLIT.search(text)
+    if match is None or not text[: match.start()].strip():
+        raise _BadOverride("an override is key=value, or key+=value to add")
+    return text[: match.start()].strip(), bool(match[1]), parse_value(text[match.end() :])
+
+
+def parse_value(text: str) -> Any:
+    """The value that ``text`` means; see :func:`apply_overrides`."""
+    import tomli
+
+    text = text.strip()
+    if text in _PYTHON:
+        return _PYTHON[text]
+    if "\n" in text:
+        return text
+    try:
+        value = tomli.loads(f"value = {text}")["value"]
+    except tomli.TOMLDecodeError as error:
+        if text[:1] in {"[", "{", '"', "'"}:
+            raise _BadOverride(f"{text!r} is no TOML value: {error.msg}") from error
+        if _is_number(text):
+            raise _BadOverride(
+                f"{text!r} is no TOML number; write it as {float(text)!r}, or '\"{text}\"' for text"
+            ) from error
+        return text
+    found: list[tuple[str, str]] = []
+    data = plain(value, "", found)
+    return text if found else data  # TOML's dates and times: keep what was typed
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> str:
+    """Set ``key`` in ``tree``; returns the key that now holds the value."""
+    *above, last = keys.split(key)
+    at: Any = tree
+    done = ""
+    for part in above:
+        at = _step(tree, at, part, key)
+        done = keys.child(done, part)
+    if isinstance(at, list):
+        index = _index(at, last, key)
+        at[index] = _added(at[index], value) if add else value
+        return key
+    if not isinstance(at, dict):
+        raise _BadOverride(f"{done!r} is a single value, it has no {last!r}")
+    if last not in at and not add:
+        raise _BadOverride(f"no {key!r} in the config{_hint(tree, key, last)}")
+    if last not in at or not add:
+        at[last] = value
+        return key
+    old = at[last]
+    at[last] = _added(old, value)
+    if isinstance(old, list) and not isinstance(value, list):
+        return keys.child(key, len(old))
+    return key
+
+
+def _added(old: Any, value: Any) -> Any:
+    if isinstance(old, list):
+        return [*old, *value] if isinstance(value, list) else [*old, value]
+    if isinstance(old, dict) and isinstance(value, dict):
+        return {**old, **value}
+    raise _BadOverride(f"it is there already, as {old!r}; += adds a key or appends, = replaces")
+
+
+def _step(tree: dict[str, Any], at: Any, part: str, key: str) -> Any:
+    if isinstance(at, list):
+        return at[_index(at, part, key)]
+    if isinstance(at, dict) and part in at:
+        return at[part]
+    raise _BadOverride(f"no {key!r} in the config{_hint(tree, key, None)}")
+
+
+def _index(at: list[Any], part: str, key: str) -> int:
+    if not part.isdigit():
+        raise _BadOverride(f"{key!r}: {part!r} must be a number, it counts items of a list from 0")
+    if int(part) >= len(at):
+        raise _BadOverride(f"{key!r}: there is no item {part}, the list has {len(at)}")
+    return int(part)
+
+
+def _hint(tree: dict[str, Any], key: str, missing: str | None) -> str:
+    near = difflib.get_close_matches(key, list(keys.every(tree)), 1, 0.75)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    if missing is not None:
+        hint += f" [to add a new key: --set {key}+=...]"
+    return hint

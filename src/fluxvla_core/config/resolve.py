@@ -1,0 +1,134 @@
+"""From a ``type`` in a config to the class behind it, statically: nothing is imported."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fluxvla_core.config import constructor
+from fluxvla_core.config.constructor import Signature
+from fluxvla_core.contracts.check import check_api
+from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
+from fluxvla_core.plugins import known
+from fluxvla_core.plugins._metadata import Plugin, canonical
+from fluxvla_core.plugins.groups import PREFIX
+from fluxvla_core.plugins.load import LIST, find, unmet
+from fluxvla_core.plugins.locate import locate
+from fluxvla_core.plugins.registry import BY_NAME
+
+SECTIONS = ("runner", "inference", "eval")
+
+SLOTS: Mapping[str, str] = {
+    **dict.fromkeys(SECTIONS, "runners"),
+    "model": "vlas",
+    "inference_model": "vlas",
+    "dataset": "datasets",
+    "datasets": "datasets",
+    "transforms": "transforms",
+    "collator": "collators",
+    "metric": "metrics",
+    "operator": "operators",
+    "vision_backbone": "vision_backbones",
+    "llm_backbone": "llm_backbones",
+    "vlm_backbone": "vlm_backbones",
+    "projector": "projectors",
+    "vla_head": "heads",
+    "tokenizer": "tokenizers",
+    "action_filters": "action_filters",
+    "hooks": "hooks",
+}
+"""Key -> the registry that a table under it is built from."""
+
+SEARCHED = tuple(name for name in BY_NAME if name != "commands")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a ``type`` means. ``signature`` is None where no source could be read."""
+
+    registry: str
+    name: str
+    origin: str
+    plugin: Plugin | None
+    signature: Signature | None
+
+    @property
+    def title(self) -> str:
+        return self.signature.name if self.signature else self.name
+
+
+def resolve(name: str, registry: str | None = None) -> Found:
+    """The class called ``name`` (or ``distribution:name``) in ``registry``, or in any.
+
+    Raises:
+        MissingPlugin: nothing provides it; with a did-you-mean or the pip command.
+        AmbiguousPlugin: several distributions, or several registries, do.
+        IncompatiblePlugin: written for another core or contract.
+        LoadFailed: its module or class is not where the entry point says.
+    """
+    if registry is None:
+        registry = _only_registry(name)
+    elif not _has(registry, name):
+        others = [r for r in SEARCHED if _has(r, name)]
+        if others:
+            raise MissingPlugin(
+                f"{name!r} is one of {PREFIX}{others[0]}, and this key takes {PREFIX}{registry}"
+            )
+    here = BY_NAME[registry].registered(name)
+    if here is not None:
+        signature = constructor.of_class(here)
+        return Found(registry, name, "registered in this process", None, signature)
+    plugin = find(PREFIX + registry, name, tuple(BY_NAME[registry]))
+    return installed(plugin)
+
+
+def installed(plugin: Plugin) -> Found:
+    """The class of one entry point; raises as :func:`resolve` does."""
+    registry = plugin.group.removeprefix(PREFIX)
+    why = unmet(plugin)
+    if why:
+        raise IncompatiblePlugin(why)
+    signature = constructor.of_plugin(plugin)
+    if signature is None:
+        if locate(plugin.module) is None:
+            raise LoadFailed(
+                f"{plugin.origin} provides {plugin.name!r} but its module {plugin.module!r} is "
+                f"missing (a stale or orphaned install): reinstall {plugin.dist}"
+            )
+    elif signature.api is not None:
+        check_api(registry, type(signature.name, (), {"api": signature.api}), plugin.origin)
+    return Found(registry, plugin.name, plugin.origin, plugin, signature)
+
+
+def _only_registry(name: str) -> str:
+    """The one registry that has ``name``."""
+    hits = [r for r in SEARCHED if _has(r, name)]
+    if len(hits) == 1:
+        return hits[0]
+    if hits:
+        raise AmbiguousPlugin(
+            f"{name!r} is in {', '.join(PREFIX + r for r in hits)}, and the key does not say which",
+            next="write '<distribution>:<name>', or put it under a key that says it",
+        )
+    short = name.rpartition(":")[2]
+    for registry in SEARCHED:
+        owner = known.owner(registry, short)
+        if owner:
+            raise MissingPlugin(
+                f"no plugin named {name!r}; {owner} provides it and is not installed: "
+                f"pip install {owner}",
+                next=LIST,
+            )
+    names = {n for r in SEARCHED for n in (*BY_NAME[r], *known.names(r))}
+    near = difflib.get_close_matches(short, sorted(names), 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise MissingPlugin(f"no plugin named {name!r} in any registry{hint}", next=LIST)
+
+
+def _has(registry: str, name: str) -> bool:
+    dist, _, short = name.rpartition(":")
+    if not dist:
+        return name in BY_NAME[registry]
+    providers = BY_NAME[registry].installed().get(short, ())
+    return any(canonical(p.dist) == canonical(dist) for p in providers)

@@ -1,0 +1,66 @@
+"""What a run leaves behind so that it can be run again: its config and its environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.config.load import FORMAT
+from fluxvla_core.config.tree import Config
+from fluxvla_core.plugins._metadata import CORE, index, version
+
+CONFIG_FILE = "config.resolved.json"
+ENVIRONMENT_FILE = "environment.json"
+_PACKAGES = ("torch", "numpy", "pyarrow", "av", "mujoco", "transformers", "rclpy")
+
+
+def write_resolved(path: Path, config: Config) -> None:
+    """Write ``config`` so that ``load_config(path)`` gives it back, key for key.
+
+    Raises:
+        OSError: as opening, writing and renaming do; an older file stays as it was.
+    """
+    write_json(
+        path,
+        {"format": FORMAT, "config": config.tree, "origins": dict(sorted(config.origins.items()))},
+    )
+
+
+def environment() -> dict[str, Any]:
+    """Python, the core, every installed plugin and the versions of what they compute with.
+
+    Reads metadata; imports nothing.
+    """
+    plugins = [
+        {
+            "group": plugin.group,
+            "name": plugin.name,
+            "distribution": plugin.dist,
+            "version": plugin.version,
+            "value": plugin.value,
+        }
+        for _, providers in sorted(index().plugins.items())
+        for plugin in providers
+    ]
+    return {
+        "format": "fluxvla-environment-1",
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        CORE: version(CORE),
+        "packages": {name: have for name in _PACKAGES if (have := version(name))},
+        "plugins": plugins,
+    }
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write JSON beside ``path`` and rename it there: a reader never sees half a file."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        aside.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)

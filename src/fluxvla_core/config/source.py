@@ -1,0 +1,241 @@
+"""Classes as their source files state them, across modules, without importing anything."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import functools
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fluxvla_core.plugins.locate import locate
+
+# Bases that no constructor parameter of ours comes from; parsing torch would take a second.
+_PLAIN = frozenset(
+    {
+        "object",
+        "abc.ABC",
+        "typing.Generic",
+        "typing.Protocol",
+        "typing_extensions.Protocol",
+        "torch.nn.Module",
+        "torch.nn.modules.module.Module",
+    }
+)
+_CLOSED = frozenset(sys.stdlib_module_names | {"torch", "numpy"})
+
+
+@dataclass(frozen=True, eq=False)
+class Module:
+    """One parsed source file; ``names`` maps what its top level defines to the defining node."""
+
+    name: str
+    path: Path
+    names: dict[str, ast.AST]
+    stars: tuple[str, ...]
+
+    @property
+    def package(self) -> str:
+        return self.name if self.path.name == "__init__.py" else self.name.rpartition(".")[0]
+
+    def place(self, line: int) -> str:
+        """``package/module.py:line``: short, and enough to find it."""
+        top = self.name.partition(".")[0]
+        parts = self.path.parts
+        start = len(parts) - 1 - parts[::-1].index(top) if top in parts else len(parts) - 1
+        return f"{'/'.join(parts[start:])}:{line}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A class or function definition and the module that it stands in."""
+
+    module: Module
+    node: ast.ClassDef | ast.FunctionDef
+
+    @property
+    def place(self) -> str:
+        return self.module.place(self.node.lineno)
+
+
+@dataclass(frozen=True)
+class Opaque:
+    """A base class that is not followed. ``plain``: it takes no constructor parameters."""
+
+    name: str
+
+    @property
+    def plain(self) -> bool:
+        return self.name in _PLAIN
+
+
+Base = Source | Opaque
+
+
+@functools.cache
+def parse(name: str) -> Module | None:
+    """The module called ``name``, or None where there is no source to read."""
+    if name.partition(".")[0] in _CLOSED:
+        return None
+    path = locate(name)
+    if path is None or path.suffix != ".py" or not path.is_file():
+        return None
+    try:
+        tree = ast.parse(path.read_bytes(), str(path))
+    except (SyntaxError, ValueError):
+        return None  # loading the plugin is what reports this
+    names: dict[str, ast.AST] = {}
+    stars = []
+    for node in _top(tree.body):
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            names[node.name] = node
+        elif isinstance(node, (ast.Import, ast.ImportFrom)):
+            for alias in node.names:
+                if alias.name == "*" and isinstance(node, ast.ImportFrom):
+                    stars.append(_absolute(node, name, path))
+                names[alias.asname or alias.name.partition(".")[0]] = node
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            names[node.targets[0].id] = node.value
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
+            names[node.target.id] = node.value
+    return Module(name, path, names, tuple(stars))
+
+
+def _top(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    for node in body:
+        yield node
+        if isinstance(node, ast.If):
+            yield from _top([*node.body, *node.orelse])
+        elif isinstance(node, ast.Try):
+            yield from _top([*node.body, *node.orelse, *node.finalbody])
+            for handler in node.handlers:
+                yield from _top(handler.body)
+
+
+def _absolute(node: ast.ImportFrom, module: str, path: Path) -> str:
+    if not node.level:
+        return node.module or ""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for _ in range(node.level - 1):
+        package = package.rpartition(".")[0]
+    return f"{package}.{node.module}" if node.module else package
+
+
+def find(module: str, dotted: str, seen: frozenset[tuple[str, str]] = frozenset()) -> Base:
+    """What ``dotted`` means in ``module``, following imports, aliases and lazy ``_EXPORTS``."""
+    whole = f"{module}.{dotted}" if module else dotted
+    parsed = parse(module)
+    if parsed is None or (module, dotted) in seen:
+        return Opaque(whole)
+    seen = seen | {(module, dotted)}
+    first, _, rest = dotted.partition(".")
+    node = parsed.names.get(first)
+    if isinstance(node, ast.ClassDef):
+        return _inside(parsed, node, rest, whole)
+    if isinstance(node, ast.FunctionDef) and not rest:
+        return Source(parsed, node)
+    if isinstance(node, ast.ImportFrom):
+        return _imported(parsed, node, first, rest, seen)
+    if isinstance(node, ast.Import):
+        return _plain_import(node, first, rest, seen)
+    if isinstance(node, (ast.Name, ast.Attribute)):
+        alias = dotted_name(node)
+        if alias:
+            return find(module, f"{alias}.{rest}" if rest else alias, seen)
+    return _elsewhere(parsed, first, rest, whole, seen)
+
+
+def _inside(parsed: Module, node: ast.ClassDef, rest: str, whole: str) -> Base:
+    for part in filter(None, rest.split(".")):
+        inner = [n for n in node.body if isinstance(n, ast.ClassDef) and n.name == part]
+        if not inner:
+            return Opaque(whole)
+        node = inner[-1]
+    return Source(parsed, node)
+
+
+def _imported(
+    parsed: Module, node: ast.ImportFrom, first: str, rest: str, seen: frozenset[tuple[str, str]]
+) -> Base:
+    original = next(a.name for a in node.names if (a.asname or a.name) == first)
+    origin = _absolute(node, parsed.name, parsed.path)
+    target = find(origin, f"{original}.{rest}" if rest else original, seen)
+    if isinstance(target, Opaque) and rest and parse(f"{origin}.{original}") is not None:
+        return find(f"{origin}.{original}", rest, seen)
+    return target
+
+
+def _plain_import(
+    node: ast.Import, first: str, rest: str, seen: frozenset[tuple[str, str]]
+) -> Base:
+    """``import a.b as c; c.X`` and ``import a.b; a.b.X``."""
+    alias = next(a for a in node.names if (a.asname or a.name.partition(".")[0]) == first)
+    parts = [*(alias.name if alias.asname else first).split("."), *rest.split(".")]
+    for cut in range(len(parts) - 1, 0, -1):
+        module = ".".join(parts[:cut])
+        if parse(module) is not None:
+            return find(module, ".".join(parts[cut:]), seen)
+    return Opaque(".".join(parts))
+
+
+def _elsewhere(
+    parsed: Module, first: str, rest: str, whole: str, seen: frozenset[tuple[str, str]]
+) -> Base:
+    """A name from a star import, a submodule, or a lazy export table (PEP 562)."""
+    for origin in parsed.stars:
+        found = find(origin, f"{first}.{rest}" if rest else first, seen)
+        if isinstance(found, Source):
+            return found
+    exports = parsed.names.get("_EXPORTS")
+    if isinstance(exports, ast.Dict):
+        for key, value in zip(exports.keys, exports.values, strict=True):
+            if (
+                isinstance(key, ast.Constant)
+                and key.value == first
+                and isinstance(value, ast.Constant)
+            ):
+                return find(str(value.value), f"{first}.{rest}" if rest else first, seen)
+    if rest and parse(f"{parsed.name}.{first}") is not None:
+        return find(f"{parsed.name}.{first}", rest, seen)
+    return Opaque(first if hasattr(builtins, first) else whole)
+
+
+def dotted_name(node: ast.expr) -> str | None:
+    """``a.b.C`` of a base-class expression; the parameters of a generic are left out."""
+    if isinstance(node, ast.Subscript):
+        return dotted_name(node.value)
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute):
+        outer = dotted_name(node.value)
+        return f"{outer}.{node.attr}" if outer else None
+    return None
+
+
+def linearize(cls: Source) -> list[Base]:
+    """Method resolution order (C3, https://docs.python.org/3/howto/mro.html)."""
+    if not isinstance(cls.node, ast.ClassDef):
+        return [cls]
+    bases: list[Base] = []
+    for expression in cls.node.bases:
+        name = dotted_name(expression)
+        bases.append(find(cls.module.name, name) if name else Opaque(ast.unparse(expression)))
+    rows: list[list[Base]] = [linearize(b) if isinstance(b, Source) else [b] for b in bases]
+    return [cls, *_merge([*rows, bases])]
+
+
+def _merge(rows: list[list[Base]]) -> list[Base]:
+    order: list[Base] = []
+    rows = [row for row in rows if row]
+    while rows:
+        for row in rows:
+            head = row[0]
+            if not any(head in other[1:] for other in rows):
+                break
+        else:
+            head = rows[0][0]  # Python itself refuses such bases when the class is loaded
+        order.append(head)
+        rows = [rest for row in rows if (rest := [b for b in row if b != head])]
+    return order

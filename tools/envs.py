@@ -83,7 +83,7 @@ class Env:
         ``base`` describes what makes everything be installed from nothing (Python, constraints,
         lists of requirements); ``parts`` maps each part to a fingerprint. A changed base means a
         new environment. ``install_parts(changed, fresh)`` gets the parts to bring up to date. The
-        stamp is taken away first and written last: an interrupted installation is repeated.
+        stamp names only what is done: an interrupted installation goes on where it was.
         """
         old = self.stamp()
         key = hashlib.sha256(json.dumps(dict(base), sort_keys=True).encode()).hexdigest()
@@ -97,9 +97,11 @@ class Env:
         if fresh:
             self.create()
             install_base()
-        else:
-            (self.root / STAMP).unlink()
+        unchanged = {name: text for name, text in parts.items() if name not in changed}
+        self._write_stamp({"base": key, **unchanged})
         install_parts(changed, fresh)
-        record = {"base": key, **parts}
-        (self.root / STAMP).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        self._write_stamp({"base": key, **parts})
         return True
+
+    def _write_stamp(self, record: Mapping[str, str]) -> None:
+        (self.root / STAMP).write_text(json.dumps(dict(record), indent=1), encoding="utf-8")

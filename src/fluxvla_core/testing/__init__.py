@@ -1,0 +1,5 @@
+"""Conformance kits: subclass one in a plugin's tests and know that the plugin is right."""
+
+from fluxvla_core.testing.operator import OperatorConformance
+
+__all__ = ["OperatorConformance"]

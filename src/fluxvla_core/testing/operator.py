@@ -1,0 +1,214 @@
+"""What every operator must do, as tests that a plugin inherits.
+
+    from fluxvla_core.testing import OperatorConformance
+
+    class TestMyRobotOperator(OperatorConformance):
+        entry_point = "MyRobotOperator"
+        arguments = {"address": "127.0.0.1"}
+
+pytest collects the inherited tests. ``arguments`` must reach a robot, or a stand-in for one, that
+the tests may move; override the ``operator`` fixture to start such a stand-in first.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from fluxvla_core.contracts.check import missing_operator_methods
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.errors import NotReady, OperatorError, Rejected
+from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+_IMPORT_PROBE = """
+import importlib, json, sys, threading
+importlib.import_module(sys.argv[1])
+print(json.dumps([sorted({m.partition(".")[0] for m in sys.modules}), threading.active_count()]))
+"""
+
+
+class OperatorConformance:
+    """Inherit, set ``entry_point`` and ``arguments``, and run pytest."""
+
+    entry_point: ClassVar[str]
+    """The operator's ``type`` in a config."""
+    arguments: ClassVar[Mapping[str, Any]] = {}
+    """Constructor arguments that reach the robot or its stand-in."""
+    heavy_modules: ClassVar[tuple[str, ...]] = ("torch", "rclpy")
+    """Modules that importing the plugin may not pull in."""
+    ready_within_s: ClassVar[float] = 10.0
+    """How long ``get_frame`` may say NotReady after ``connect``."""
+
+    @pytest.fixture
+    def operator(self) -> Iterator[Any]:
+        """A new, unconnected operator; closed after the test."""
+        operator = OPERATORS.get(self.entry_point)(**self.arguments)
+        yield operator
+        operator.close()
+
+    @pytest.fixture
+    def connected(self, operator: Any) -> Any:
+        operator.connect()
+        self.first_frame(operator)
+        return operator
+
+    def first_frame(self, operator: Any) -> Frame:
+        """Wait for the first frame; NotReady is the one error that means 'try again'."""
+        deadline = time.monotonic() + self.ready_within_s
+        while True:
+            try:
+                frame: Frame = operator.get_frame()
+                return frame
+            except NotReady:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
+
+    def hold(self, operator: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The command that keeps the arm where it is, inside the limits."""
+        joints = operator.embodiment.joints
+        where = dict(zip(operator.embodiment.state_names, operator.get_frame().state, strict=True))
+        target = [np.clip(where.get(j.name, j.lower), j.lower, j.upper) for j in joints]
+        return np.array(target, dtype=np.float64)
+
+    def test_is_complete(self, operator: Any) -> None:
+        assert missing_operator_methods(operator) == []
+        assert getattr(type(operator), "api", None), "declare api = '1.0'"
+
+    def test_import_is_light(self) -> None:
+        module = OPERATORS.get(self.entry_point).__module__
+        run = [sys.executable, "-c", _IMPORT_PROBE, module]
+        found = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+        modules, threads = json.loads(found)
+        assert not set(self.heavy_modules) & set(modules)
+        assert threads == 1, "importing the plugin starts a thread"
+
+    def test_constructor_names_every_parameter(self) -> None:
+        for parameter in inspect.signature(OPERATORS.get(self.entry_point)).parameters.values():
+            assert parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD), (
+                f"{parameter} hides names from the config check"
+            )
+
+    def test_constructor_does_no_io(self) -> None:
+        refuse = mock.Mock(side_effect=AssertionError("the constructor does I/O"))
+        with (
+            mock.patch("socket.socket.connect", refuse),
+            mock.patch("socket.socket.bind", refuse),
+            mock.patch("threading.Thread.start", refuse),
+            mock.patch("subprocess.Popen.__init__", refuse),
+        ):
+            OPERATORS.get(self.entry_point)(**self.arguments).close()
+
+    def test_embodiment_is_valid_before_connect(self, operator: Any) -> None:
+        spec = operator.embodiment
+        assert isinstance(spec, EmbodimentSpec)
+        assert EmbodimentSpec.from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
+
+    def test_nothing_works_before_connect(self, operator: Any) -> None:
+        with pytest.raises(NotReady):
+            operator.get_frame()
+        middle = np.array([(j.lower + j.upper) / 2 for j in operator.embodiment.joints])
+        with pytest.raises(OperatorError):
+            operator.send_action(middle)
+
+    def test_frame_matches_the_embodiment(self, connected: Any) -> None:
+        spec, frame = connected.embodiment, connected.get_frame()
+        assert frame.state.shape == (spec.state_dim,)
+        assert frame.state.dtype == np.float64
+        assert np.isfinite(frame.state).all()
+        assert set(frame.images) == set(spec.camera_names)
+        for camera in spec.cameras:
+            image = frame.images[camera.name]
+            assert (image.shape, image.dtype) == ((camera.height, camera.width, 3), np.uint8)
+        assert set(frame.stamps) == {STATE, *spec.camera_names}
+
+    def test_frames_are_fresh_arrays(self, connected: Any) -> None:
+        first, second = connected.get_frame(), connected.get_frame()
+        pairs = [(first.state, second.state)]
+        pairs += [(first.images[n], second.images[n]) for n in first.images]
+        for a, b in pairs:
+            assert not np.shares_memory(a, b), "get_frame hands out a buffer that it reuses"
+
+    def test_stamps_go_on(self, connected: Any) -> None:
+        first = connected.get_frame()
+        connected.send_action(self.hold(connected))
+        deadline = time.monotonic() + self.ready_within_s
+        waiting = set(first.stamps)
+        while waiting and time.monotonic() < deadline:
+            stamps = connected.get_frame().stamps
+            assert all(stamps[s] >= first.stamps[s] for s in stamps), "a stamp went back"
+            waiting = {s for s in waiting if stamps[s] <= first.stamps[s]}
+            time.sleep(0.02)
+            if waiting:
+                connected.send_action(self.hold(connected))
+        assert not waiting, f"no newer reading of {sorted(waiting)}"
+
+    @pytest.mark.parametrize("fault", ["nan", "inf", "short", "long", "matrix", "above", "below"])
+    def test_bad_actions_are_refused(self, connected: Any, fault: str) -> None:
+        good, joints = self.hold(connected), connected.embodiment.joints
+        bad = {
+            "nan": np.where(np.arange(len(good)) == 0, np.nan, good),
+            "inf": np.where(np.arange(len(good)) == 0, np.inf, good),
+            "short": good[:-1],
+            "long": np.append(good, 0.0),
+            "matrix": good[None],
+            "above": np.array([joints[0].upper + 0.5, *good[1:]]),
+            "below": np.array([joints[0].lower - 0.5, *good[1:]]),
+        }[fault]
+        with pytest.raises(Rejected):
+            connected.send_action(bad)
+        connected.send_action(good)  # a refusal leaves the operator as it was
+
+    def test_the_action_belongs_to_the_caller(self, connected: Any) -> None:
+        action = self.hold(connected)
+        before = action.copy()
+        connected.send_action(action)
+        np.testing.assert_array_equal(action, before)
+
+    def test_stop_works_in_any_state(self, operator: Any) -> None:
+        operator.stop()
+        operator.connect()
+        self.first_frame(operator)
+        operator.stop()
+        operator.stop()
+        operator.close()
+        operator.stop()
+
+    def test_stop_works_from_another_thread(self, connected: Any) -> None:
+        failures: list[BaseException] = []
+
+        def stop() -> None:
+            try:
+                connected.stop()
+            except BaseException as error:  # noqa: BLE001 - carried to the test's own thread
+                failures.append(error)
+
+        thread = threading.Thread(target=stop)
+        thread.start()
+        thread.join(self.ready_within_s)
+        assert not thread.is_alive()
+        assert failures == []
+
+    def test_close_gives_everything_back(self, operator: Any) -> None:
+        before = set(threading.enumerate())
+        operator.connect()
+        self.first_frame(operator)
+        operator.close()
+        operator.close()
+        left = [t.name for t in threading.enumerate() if t not in before and not t.daemon]
+        assert left == [], "close leaves threads behind"
+        with pytest.raises(OperatorError):
+            operator.get_frame()
+        with pytest.raises(OperatorError):
+            operator.send_action(np.zeros(operator.embodiment.dim))

@@ -1,0 +1,126 @@
+"""The kit passes a right operator, and each wrong one fails its own check and says why."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+GOOD = """
+import time
+import numpy as np
+from fluxvla_core.contracts import Frame
+from fluxvla_core.errors import NotReady, Rejected
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
+from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.testing import OperatorConformance
+
+SPEC = EmbodimentSpec("arm", (Joint("a", "rad", -1, 1, 2, 8), Joint("b", "rad", -1, 1, 2, 8)),
+                      (Camera("front", 4, 6),), rate_hz=50)
+
+class SmallOperator:
+    api = "1.0"
+    def __init__(self, speed: float = 1.0):
+        self._state = None
+    @property
+    def embodiment(self):
+        return SPEC
+    def connect(self):
+        self._state = np.zeros(2)
+    def get_frame(self):
+        if self._state is None:
+            raise NotReady("not connected")
+        now = time.monotonic()
+        return Frame(self._state.copy(), {"front": np.zeros((4, 6, 3), np.uint8)},
+                     {"state": now, "front": now})
+    def send_action(self, action):
+        if self._state is None:
+            raise NotReady("not connected")
+        if np.shape(action) != (2,) or not np.isfinite(action).all() or (abs(action) > 1).any():
+            raise Rejected("out of spec")
+        self._state = np.array(action)
+    def stop(self):
+        pass
+    def close(self):
+        self._state = None
+
+OPERATORS.register_module()(SmallOperator)
+
+class TestSmall(OperatorConformance):
+    entry_point = "SmallOperator"
+"""
+
+BROKEN = {
+    "test_is_complete": ('    api = "1.0"\n', ""),
+    "test_import_is_light": ("import time\n", "import time, torch\n"),
+    "test_constructor_names_every_parameter": ("speed: float = 1.0", "**options"),
+    "test_constructor_does_no_io": (
+        "        self._state = None\n    @property",
+        "        self._state = None\n"
+        "        import socket\n"
+        "        socket.socket().bind(('127.0.0.1', 0))\n"
+        "    @property",
+    ),
+    "test_embodiment_is_valid_before_connect": ("return SPEC", "return SPEC.to_dict()"),
+    "test_nothing_works_before_connect": (
+        "def __init__(self, speed: float = 1.0):\n        self._state = None",
+        "def __init__(self, speed: float = 1.0):\n        self._state = np.zeros(2)",
+    ),
+    "test_frame_matches_the_embodiment": (
+        "np.zeros((4, 6, 3), np.uint8)",
+        "np.zeros((6, 4, 3), np.uint8)",
+    ),
+    "test_frames_are_fresh_arrays": ("Frame(self._state.copy()", "Frame(self._state"),
+    "test_stamps_go_on": ("now = time.monotonic()", "now = 5.0"),
+    "test_bad_actions_are_refused[nan]": ("not np.isfinite(action).all()", "False"),
+    "test_bad_actions_are_refused[above]": ("(abs(action) > 1).any()", "False"),
+    "test_the_action_belongs_to_the_caller": (
+        "self._state = np.array(action)",
+        "self._state = np.array(action); action += 1",
+    ),
+    "test_stop_works_in_any_state": (
+        "def stop(self):\n        pass",
+        "def stop(self):\n        self._state[0]",
+    ),
+    "test_close_gives_everything_back": (
+        "def close(self):\n        self._state = None",
+        "def close(self):\n        pass",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """``specimen::check`` -> outcome: all checks of the right one, its own of each wrong one."""
+    folder = tmp_path_factory.mktemp("specimens")
+    wanted = ["specimen_right.py"]
+    (folder / wanted[0]).write_text(GOOD)
+    for number, (check, (old, new)) in enumerate(BROKEN.items()):
+        assert old in GOOD
+        name = f"specimen_{number}.py"
+        source = GOOD.replace(old, new, 1).replace("SmallOperator", f"Small{number}Operator")
+        (folder / name).write_text(source)
+        wanted.append(f"{name}::TestSmall::{check}")
+    options = ["-q", "-rA", "-p", "no:cacheprovider", "--tb=no"]
+    run = [sys.executable, "-m", "pytest", *options, *wanted]
+    text = subprocess.run(run, capture_output=True, text=True, cwd=folder).stdout
+    found = {}
+    for line in text.splitlines():
+        outcome, _, rest = line.partition(" ")
+        if outcome in ("PASSED", "FAILED", "ERROR"):
+            file, _, check = rest.partition(" - ")[0].partition("::TestSmall::")
+            found[f"{file}::{check}"] = outcome
+    return found
+
+
+def test_a_right_operator_passes_every_check(outcomes):
+    right = {k: v for k, v in outcomes.items() if k.startswith("specimen_right.py::")}
+    assert len(right) >= 19
+    assert set(right.values()) == {"PASSED"}
+
+
+@pytest.mark.parametrize("check", BROKEN)
+def test_a_wrong_operator_fails_its_own_check(outcomes, check):
+    number = list(BROKEN).index(check)
+    assert outcomes[f"specimen_{number}.py::{check}"] == "FAILED"

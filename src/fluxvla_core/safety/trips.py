@@ -1,0 +1,200 @@
+"""Rules that end a motion, and the latch that keeps it ended until somebody says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import FluxError, SafetyStop
+from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+# A prismatic joint's tracking error in m, as a share of a revolute one's in rad.
+PRISMATIC_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Why a motion ended: which rule, what it saw, and when (seconds on the loop's clock)."""
+
+    rule: str
+    what: str
+    at: float
+
+
+class Latch:
+    """Once tripped, nothing moves until ``rearm`` is called; every trip is kept.
+
+    Args:
+        now: the loop's clock.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._open: Trip | None = None
+        self.trips: list[Trip] = []
+
+    @property
+    def tripped(self) -> Trip | None:
+        """The trip that holds the robot, or None."""
+        return self._open
+
+    def trip(self, rule: str, error: FluxError | str) -> Trip:
+        """Record a trip and hold the robot."""
+        what = error.what if isinstance(error, FluxError) else error
+        found = Trip(rule, what, self._now())
+        self.trips.append(found)
+        self._open = self._open or found
+        return found
+
+    def check(self) -> None:
+        """Refuse to move on while tripped.
+
+        Raises:
+            SafetyStop: names the first trip since the last re-arming.
+        """
+        if self._open is not None:
+            raise SafetyStop(
+                f"stopped by rule {self._open.rule}: {self._open.what}",
+                next="look at the robot, remove the cause, then re-arm",
+            )
+
+    def rearm(self) -> None:
+        """Allow motion again; what was recorded stays."""
+        self._open = None
+
+
+class TrackingWatch:
+    """Trips when the arm stays too far behind its commands: it is blocked, or not following.
+
+    Args:
+        embodiment: whose action joints are compared with the state's joints of the same names.
+        settings: ``tracking_error`` and ``tracking_time_s``.
+    """
+
+    def __init__(self, embodiment: EmbodimentSpec, settings: SafetySettings) -> None:
+        self._names = embodiment.joint_names
+        self._columns = action_columns(embodiment)
+        allowed = {
+            "revolute": settings.tracking_error,
+            "prismatic": settings.tracking_error * PRISMATIC_SHARE,
+            "gripper": np.inf,
+        }
+        self._allowed: Array = np.array([allowed[j.kind] for j in embodiment.joints])
+        self._time = settings.tracking_time_s
+        self._since: Array = np.full(len(self._names), np.inf)
+
+    def reset(self) -> None:
+        """Begin anew: the arm is where its command is."""
+        self._since[:] = np.inf
+
+    def check(self, command: Array, state: npt.ArrayLike, now: float) -> None:
+        """Compare the last command with where the arm is.
+
+        Args:
+            command: ``(dim,)`` as sent.
+            state: ``(state_dim,)`` as measured.
+            now: seconds, when it was measured.
+
+        Raises:
+            SafetyStop: a joint has been too far behind for too long.
+        """
+        error = np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
+        behind = error > self._allowed
+        self._since = np.where(behind, np.minimum(self._since, now), np.inf)
+        late = np.flatnonzero(behind & (now - self._since >= self._time))
+        if late.size:
+            index = int(late[np.argmax(error[late])])
+            raise SafetyStop(
+                f"{self._names[index]} is {error[index]:.3g} away from its command "
+                f"for {now - self._since[index]:.2f} s; {self._allowed[index]:.3g} are allowed "
+                f"for {self._time:g} s",
+                cause="the arm is blocked, its drive is off, or somebody else commands it",
+                next="free the arm; safety.tracking_error sets what is allowed",
+            )
+
+
+def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
+    """Where in the state vector each action joint's position is; ``(dim,)`` indices.
+
+    Raises:
+        SafetyStop: the state lacks a joint that is commanded.
+    """
+    names = embodiment.state_names
+    missing = [name for name in embodiment.joint_names if name not in names]
+    if missing:
+        raise SafetyStop(
+            f"the state of {embodiment.name} does not tell where {', '.join(missing)} is; "
+            "a joint that cannot be read back cannot be moved safely"
+        )
+    return np.array([names.index(name) for name in embodiment.joint_names], dtype=np.intp)
+
+
+def check_chunk(
+    chunk: npt.ArrayLike,
+    embodiment: EmbodimentSpec,
+    last: Array,
+    rate_hz: float,
+    settings: SafetySettings,
+) -> Array:
+    """Refuse a chunk that is no motion; what is merely too fast or too far is left to the limits.
+
+    Args:
+        chunk: ``(T, dim)`` keyframes from a policy.
+        embodiment: whose joints they are for.
+        last: ``(dim,)`` the command that the arm has now.
+        rate_hz: keyframes a second.
+        settings: ``jump_s`` and ``excess``.
+
+    Returns:
+        ``(T, dim)`` float64.
+
+    Raises:
+        SafetyStop: another shape, empty, a value that is not finite, far beyond a position limit,
+            or a jump that no motion explains.
+    """
+    try:
+        keyframes = np.asarray(chunk, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SafetyStop(f"the policy's chunk is no array of numbers: {error}") from error
+    dim = embodiment.dim
+    if keyframes.ndim != 2 or keyframes.shape[1] != dim or len(keyframes) == 0:
+        raise SafetyStop(
+            f"the policy's chunk has shape {keyframes.shape}; {embodiment.name} takes (T, {dim})"
+        )
+    names = embodiment.joint_names
+    bad = np.argwhere(~np.isfinite(keyframes))
+    if bad.size:
+        row, column = bad[0]
+        raise SafetyStop(
+            f"the policy's chunk is not finite: keyframe {row}, {names[column]} is "
+            f"{keyframes[row, column]}",
+            cause="the policy diverged, or an input that it was given is not finite",
+        )
+    joints = embodiment.joints
+    lower, upper = np.array([(j.lower, j.upper) for j in joints]).T
+    excess = np.maximum(lower - keyframes, keyframes - upper) / (upper - lower)
+    row, column = np.unravel_index(np.argmax(excess), excess.shape)
+    if excess[row, column] > settings.excess:
+        joint = joints[column]
+        raise SafetyStop(
+            f"keyframe {row} wants {joint.name} at {keyframes[row, column]:.4g}, far beyond its "
+            f"limits [{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
+            cause="the policy's units or statistics are not this robot's",
+        )
+    moves = np.diff(np.vstack([last, keyframes]), axis=0)
+    # Each keyframe has its own period to move in; jump_s comes on top.
+    seconds = np.abs(moves) / np.array([j.velocity for j in joints]) - 1.0 / rate_hz
+    row, column = np.unravel_index(np.argmax(seconds), seconds.shape)
+    if seconds[row, column] > settings.jump_s:
+        raise SafetyStop(
+            f"keyframe {row} wants {names[column]} to jump by {moves[row, column]:.4g}; at full "
+            f"speed that takes {seconds[row, column]:.2f} s more than there are",
+            cause="the policy is not for the pose that the arm is in, or it diverged",
+            next="move the arm to the start pose first; safety.jump_s sets what is allowed",
+        )
+    return keyframes

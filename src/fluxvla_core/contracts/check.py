@@ -44,6 +44,8 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
     wanted = dict(_METHODS.get(registry, {}))
     if registry == "runners" and is_train_runner(cls):
         wanted = {"run": 1, "run_setup": 1}
+    if registry == "transforms" and getattr(cls, "needs_rng", False):
+        wanted = {"__call__": 2}
     problems = [p for m, n in wanted.items() if (p := _method_problem(cls, m, n))]
     if problems:
         raise LoadFailed(

@@ -1,0 +1,200 @@
+"""Transforms of pictures: uint8 until they are normalised, never resized twice.
+
+``sample["images"]`` is a list of ``(3, H, W)`` arrays, one a camera, or one ``(3N, H, W)`` array
+of N cameras of equal size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import ConfigError, DataError
+
+Sample = dict[str, Any]
+Image = npt.NDArray[Any]
+Images = list[Image] | Image
+
+INTERPOLATIONS = ("linear", "area")
+_OTHER_ORDER = "height, width and channels are in another order, or there is an alpha channel"
+
+
+class ResizeImages:
+    """Stretches every picture to ``height`` x ``width``; gives ``(3N, height, width)``, same dtype.
+
+    Args:
+        interpolation: ``linear``, or ``area``, which does not alias when it shrinks.
+    """
+
+    def __init__(self, height: int, width: int, interpolation: str = "linear") -> None:
+        if height < 1 or width < 1:
+            raise ConfigError(f"ResizeImages: {height} x {width} is no size")
+        if interpolation not in INTERPOLATIONS:
+            raise ConfigError(
+                f"ResizeImages: interpolation {interpolation!r} is none of "
+                f"{', '.join(INTERPOLATIONS)}"
+            )
+        self.height = height
+        self.width = width
+        self.interpolation = interpolation
+
+    def __call__(self, sample: Sample) -> Sample:
+        resized = [self._resize(image) for image in split(sample["images"])]
+        return {**sample, "images": np.concatenate(resized)}
+
+    def _resize(self, image: Image) -> Image:
+        if image.shape[1:] == (self.height, self.width):
+            return image
+        import cv2
+
+        flag = cv2.INTER_AREA if self.interpolation == "area" else cv2.INTER_LINEAR
+        tall = np.ascontiguousarray(image.transpose(1, 2, 0))
+        out: Image = cv2.resize(tall, (self.width, self.height), interpolation=flag)
+        return out.transpose(2, 0, 1)
+
+
+class CropImages:
+    """Cuts the same rectangle out of every picture; a list stays a list.
+
+    Args:
+        top, left: of the rectangle's corner, in pixels of the picture as it arrives here.
+        height, width: of the rectangle.
+
+    Raises:
+        DataError: a picture is smaller than the rectangle asks for.
+    """
+
+    def __init__(self, top: int, left: int, height: int, width: int) -> None:
+        if min(top, left) < 0 or min(height, width) < 1:
+            raise ConfigError(
+                f"CropImages: top {top}, left {left}, height {height}, width {width} "
+                "is no rectangle"
+            )
+        self.top = top
+        self.left = left
+        self.height = height
+        self.width = width
+
+    def __call__(self, sample: Sample) -> Sample:
+        images = sample["images"]
+        if isinstance(images, list):
+            return {**sample, "images": [self._crop(image) for image in images]}
+        return {**sample, "images": self._crop(images)}
+
+    def _crop(self, image: Image) -> Image:
+        bottom, right = self.top + self.height, self.left + self.width
+        if bottom > image.shape[1] or right > image.shape[2]:
+            raise DataError(
+                f"CropImages: rows {self.top}:{bottom}, columns {self.left}:{right} are not in a "
+                f"picture of {image.shape[1]} x {image.shape[2]} pixels"
+            )
+        return image[:, self.top : bottom, self.left : right]
+
+
+class NormalizeImages:
+    """``(x - mean) / (std + 1e-8)`` for each camera and channel; gives ``(3N, H, W)`` float32.
+
+    Args:
+        means, stds: one group of 3, for all cameras, or one group a camera; in the picture's own
+            units, that is 0..255 for uint8.
+        scale_to_unit_interval: divide by 255 first; means and stds are then in 0..1.
+
+    Raises:
+        ConfigError: groups that fit no number of cameras.
+    """
+
+    def __init__(
+        self,
+        means: Sequence[Any],
+        stds: Sequence[Any],
+        scale_to_unit_interval: bool = False,
+    ) -> None:
+        self.means = _groups(means, "means")
+        self.stds = _groups(stds, "stds")
+        if self.means.shape != self.stds.shape:
+            raise ConfigError(
+                f"NormalizeImages: {len(self.means)} groups of means, {len(self.stds)} of stds"
+            )
+        if (self.stds <= 0).any():
+            raise ConfigError("NormalizeImages: every std must be positive")
+        self.scale_to_unit_interval = scale_to_unit_interval
+
+    def __call__(self, sample: Sample) -> Sample:
+        images = stack(sample["images"]).astype(np.float32)
+        cameras = len(images) // 3
+        if len(self.means) not in (1, cameras):
+            raise ConfigError(
+                f"NormalizeImages: {len(self.means)} groups of means and stds, {cameras} cameras",
+                next="give one group for all cameras, or one for each",
+            )
+        if self.scale_to_unit_interval:
+            images /= 255.0
+        repeat = cameras // len(self.means)
+        images -= np.tile(self.means, (repeat, 1)).reshape(-1, 1, 1)
+        images /= np.tile(self.stds, (repeat, 1)).reshape(-1, 1, 1) + np.float32(1e-8)
+        return {**sample, "images": images}
+
+
+class SimpleNormalizeImages:
+    """``x / 255 * 2 - 1``; gives ``(3N, H, W)`` float32 in -1..1."""
+
+    def __call__(self, sample: Sample) -> Sample:
+        images = stack(sample["images"]).astype(np.float32)
+        images *= np.float32(2 / 255)
+        images -= np.float32(1)
+        return {**sample, "images": images}
+
+
+def split(images: Images) -> list[Image]:
+    """One ``(3, H, W)`` array a camera.
+
+    Raises:
+        DataError: an array whose channels are not a multiple of 3, or no picture at all.
+    """
+    if not isinstance(images, list):
+        if images.ndim != 3 or len(images) == 0 or len(images) % 3:
+            raise DataError(
+                f"images of shape {images.shape} are not (3N, height, width)",
+                cause=_OTHER_ORDER,
+            )
+        return list(images.reshape(-1, 3, *images.shape[1:]))
+    if not images:
+        raise DataError("the sample has no pictures")
+    for image in images:
+        if image.ndim != 3 or len(image) != 3:
+            raise DataError(
+                f"an image of shape {image.shape} is not (3, height, width)",
+                cause=_OTHER_ORDER,
+            )
+    return images
+
+
+def stack(images: Images) -> Image:
+    """``(3N, H, W)``.
+
+    Raises:
+        DataError: the cameras' sizes differ.
+    """
+    parts = split(images)
+    sizes = [part.shape[1:] for part in parts]
+    if len(set(sizes)) > 1:
+        listed = ", ".join(f"{h} x {w}" for h, w in sizes)
+        raise DataError(
+            f"cameras of different sizes cannot be stacked: {listed}",
+            next="put ResizeImages before this transform",
+        )
+    return images if isinstance(images, np.ndarray) else np.concatenate(parts)
+
+
+def _groups(values: Sequence[Any], what: str) -> npt.NDArray[np.float32]:
+    array = np.asarray(values, np.float32)
+    array = array.reshape(1, -1) if array.ndim == 1 else array
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+        raise ConfigError(
+            f"NormalizeImages: {what} must be 3 numbers, or 3 for each camera; "
+            f"got shape {np.shape(values)}"
+        )
+    return array

@@ -1,0 +1,234 @@
+"""States and actions to what a model computes with, and back to what a robot obeys."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.transforms.scaling import Affine, check_norm_type, make_affine
+
+Sample = dict[str, Any]
+Floats = npt.NDArray[np.float64]
+
+
+class NormalizeStatesAndActions:
+    """Normalises ``states`` ``(D,)`` and, where there are any, ``actions`` ``(T, D)``.
+
+    The statistics are ``sample["stats"][state_key]`` and ``[action_key]``. The result is float32,
+    padded with ``pad_value`` to ``state_dim`` and ``action_dim``. Nothing is clipped.
+
+    Args:
+        state_key, action_key: entries of the statistics, usually ``proprio`` and ``action``.
+        action_dim, state_dim: widths that the model wants; the data's own if None.
+        norm_type: ``mean_std``, ``quantile``, ``min_max`` or ``none``.
+        action_norm_mask: ``(D,)``, D being the data's own width; False leaves a dimension as is.
+        std_floor: no dimension is divided by less than this, in the data's units.
+
+    Raises:
+        ConfigError: an unknown ``norm_type``, statistics that are missing or of another width,
+            or a width that would cut dimensions off.
+    """
+
+    def __init__(
+        self,
+        state_key: str = "proprio",
+        action_key: str = "action",
+        action_dim: int | None = None,
+        state_dim: int | None = None,
+        norm_type: str = "mean_std",
+        pad_value: float = 0.0,
+        action_norm_mask: Sequence[bool] | None = None,
+        std_floor: float = 0.0,
+    ) -> None:
+        check_norm_type(norm_type, type(self).__name__)
+        self.state_key = state_key
+        self.action_key = action_key
+        self.action_dim = action_dim
+        self.state_dim = state_dim
+        self.norm_type = norm_type
+        self.pad_value = pad_value
+        self.action_norm_mask = action_norm_mask
+        self.std_floor = std_floor
+        self._known: tuple[Any, Affine, Affine] | None = None
+
+    def __call__(self, sample: Sample) -> Sample:
+        state_scale, action_scale = self._scales(sample.get("stats"))
+        states = sample["states"]
+        _check_width("states", states, state_scale.dim, self.state_key)
+        out = {**sample, "states": self._pad(state_scale.forward(states), self.state_dim, "state")}
+        if "actions" in sample:
+            actions = sample["actions"]
+            _check_width("actions", actions, action_scale.dim, self.action_key)
+            scaled = action_scale.forward(actions, states)
+            out["actions"] = self._pad(scaled, self.action_dim, "action")
+        return out
+
+    def inverse(
+        self, actions: npt.ArrayLike, stats: Mapping[str, Any], states: npt.ArrayLike | None = None
+    ) -> Floats:
+        """Normalised, padded actions ``(..., T, >= D)`` -> physical ``(..., T, D)``, float64.
+
+        ``states`` ``(D,)`` in physical units is needed when the statistics count actions from it.
+        """
+        scale = self._scales(stats)[1]
+        return scale.inverse(np.asarray(actions)[..., : scale.dim], states)
+
+    def inverse_states(self, states: npt.ArrayLike, stats: Mapping[str, Any]) -> Floats:
+        """Normalised, padded states ``(..., >= D)`` -> physical ``(..., D)``, float64."""
+        scale = self._scales(stats)[0]
+        return scale.inverse(np.asarray(states)[..., : scale.dim])
+
+    def denormalizer(
+        self, norm_stats: Mapping[str, Any], statistic_name: str = "private"
+    ) -> DenormalizePrivateAction:
+        """The transform that undoes this one's actions."""
+        return DenormalizePrivateAction(
+            norm_stats=norm_stats,
+            norm_type=self.norm_type,
+            action_norm_mask=self.action_norm_mask,
+            std_floor=self.std_floor,
+            statistic_name=statistic_name,
+            action_key=self.action_key,
+        )
+
+    def _scales(self, stats: Any) -> tuple[Affine, Affine]:
+        if self._known is None or self._known[0] is not stats:
+            who = type(self).__name__
+            state = make_affine(
+                _entry(stats, self.state_key, who), self.norm_type, who, self.std_floor
+            )
+            entry = _entry(stats, self.action_key, who)
+            action = make_affine(entry, self.norm_type, who, self.std_floor, self.action_norm_mask)
+            self._known = (stats, state, action)
+        return self._known[1:]
+
+    def _pad(self, values: Floats, dim: int | None, what: str) -> npt.NDArray[np.float32]:
+        have = values.shape[-1]
+        if dim is None or dim == have:
+            return values.astype(np.float32)
+        if dim < have:
+            raise ConfigError(
+                f"{type(self).__name__}: {what}_dim {dim} would cut the data's {have} dimensions",
+                next=f"set {what}_dim to {have} or more, as wide as the model's input",
+            )
+        widths = [(0, 0)] * (values.ndim - 1) + [(0, dim - have)]
+        return np.pad(values, widths, constant_values=self.pad_value).astype(np.float32)
+
+
+class DenormalizePrivateAction:
+    """A model's actions in the robot's units: the exact inverse of ``NormalizeStatesAndActions``.
+
+    Called with ``{"action": (1, T, D) or (T, D)}``, and ``"states"`` ``(D,)`` in physical units
+    when the statistics count actions from the state. Returns ``(T, action_dim)`` float64.
+
+    Args:
+        norm_stats: the statistics, or the path of ``dataset_statistics.json``.
+        action_dim: the robot's width; what a model's padding added is cut off.
+        norm_type, action_norm_mask, std_floor: as in training.
+        statistic_name, action_key: where in ``norm_stats`` the action's entry is.
+
+    Raises:
+        ConfigError: an unknown ``norm_type``, no statistics, or an action of another width.
+    """
+
+    def __init__(
+        self,
+        norm_stats: Mapping[str, Any] | str | Path | None = None,
+        action_dim: int | None = None,
+        norm_type: str = "mean_std",
+        action_norm_mask: Sequence[bool] | None = None,
+        std_floor: float = 0.0,
+        statistic_name: str = "private",
+        action_key: str = "action",
+    ) -> None:
+        check_norm_type(norm_type, type(self).__name__)
+        self.norm_stats = None if norm_stats is None else load_statistics(norm_stats)
+        self.action_dim = action_dim
+        self.norm_type = norm_type
+        self.action_norm_mask = action_norm_mask
+        self.std_floor = std_floor
+        self.statistic_name = statistic_name
+        self.action_key = action_key
+        self._affine: Affine | None = None
+
+    def __call__(self, data: Mapping[str, Any]) -> Floats:
+        action = np.asarray(data["action"], np.float64)
+        if action.ndim == 3 and len(action) == 1:
+            action = action[0]
+        if action.ndim != 2:
+            raise ConfigError(
+                f"{type(self).__name__}: one chunk (T, D) is expected, got shape {action.shape}"
+            )
+        scale = self._scale()
+        if action.shape[-1] < scale.dim:
+            raise ConfigError(
+                f"{type(self).__name__}: the model gives {action.shape[-1]} dimensions, "
+                f"the statistics describe {scale.dim}"
+            )
+        return scale.inverse(action[:, : scale.dim], data.get("states"))
+
+    def _scale(self) -> Affine:
+        if self._affine is None:
+            who = type(self).__name__
+            if self.norm_stats is None:
+                raise ConfigError(
+                    f"{who}: there are no statistics", next="give norm_stats, or load a checkpoint"
+                )
+            entries = _entry(self.norm_stats, self.statistic_name, who)
+            stats = _entry(entries, self.action_key, who)
+            affine = make_affine(stats, self.norm_type, who, self.std_floor, self.action_norm_mask)
+            if self.action_dim not in (None, affine.dim):
+                raise ConfigError(
+                    f"{who}: action_dim is {self.action_dim}, "
+                    f"the statistics describe {affine.dim} dimensions"
+                )
+            self._affine = affine
+        return self._affine
+
+
+def load_statistics(source: Mapping[str, Any] | str | Path) -> Mapping[str, Any]:
+    """Statistics given as a mapping, or as the path of a JSON file.
+
+    Raises:
+        ConfigError: the file is missing or no JSON.
+    """
+    if isinstance(source, Mapping):
+        return source
+    path = Path(source)
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"norm_stats: {path} does not exist",
+            next="a checkpoint carries it as dataset_statistics.json",
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"norm_stats: {path} cannot be read as JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"norm_stats: {path} holds a {type(found).__name__}, not a table")
+    return found
+
+
+def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:
+    if not isinstance(stats, Mapping) or key not in stats:
+        have = ", ".join(sorted(stats)) if isinstance(stats, Mapping) else "nothing"
+        raise ConfigError(f"{who}: the statistics have no entry {key!r}; they have {have}")
+    entry = stats[key]
+    if not isinstance(entry, Mapping):
+        raise ConfigError(f"{who}: the statistics' entry {key!r} is no table")
+    return entry
+
+
+def _check_width(what: str, values: Any, dim: int, key: str) -> None:
+    if np.ndim(values) == 0 or np.shape(values)[-1] != dim:
+        raise ConfigError(
+            f"NormalizeStatesAndActions: {what} have shape {np.shape(values)}, "
+            f"the statistics {key!r} describe {dim} dimensions",
+            cause="the statistics belong to another dataset or robot",
+        )

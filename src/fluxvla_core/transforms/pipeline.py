@@ -1,0 +1,93 @@
+"""Transforms one after the other, the same list for training and for the robot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluxvla_core.build import build_transform_from_cfg
+from fluxvla_core.errors import ConfigError
+
+Sample = dict[str, Any]
+INDEX = "processors.json"
+
+
+class Pipeline:
+    """Applies transforms in order.
+
+    A transform is ``t(sample) -> sample``; one with ``needs_rng = True`` is called as
+    ``t(sample, rng)``; one with ``training_only = True`` (augmentation, noise) is left out of
+    :meth:`inference`.
+
+    Args:
+        transforms: config tables or callables.
+        processors: a checkpoint's ``processors`` folder; tokenizers that were saved there are
+            loaded from there instead of from the path that the table names.
+    """
+
+    def __init__(
+        self,
+        transforms: Sequence[Mapping[str, Any] | Callable[..., Sample]],
+        processors: str | Path | None = None,
+    ) -> None:
+        saved = _saved(Path(processors)) if processors is not None else {}
+        self._named = {copy: path for path, copy in saved.items()}
+        self.transforms = [build_transform_from_cfg(_redirect(t, saved)) for t in transforms]
+
+    def __call__(self, sample: Sample, rng: np.random.Generator | None = None) -> Sample:
+        for transform in self.transforms:
+            if not getattr(transform, "needs_rng", False):
+                sample = transform(sample)
+                continue
+            if rng is None:
+                raise ConfigError(
+                    f"{type(transform).__name__} draws random numbers, which only training has",
+                    next="give it training_only = True, or take it out of this section",
+                )
+            sample = transform(sample, rng)
+        return sample
+
+    def inference(self) -> Pipeline:
+        """The same transforms without those that only training wants."""
+        kept = Pipeline([t for t in self.transforms if not getattr(t, "training_only", False)])
+        kept._named = self._named
+        return kept
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Save every tokenizer into ``folder``, under the path that its table named it by."""
+        root = Path(folder)
+        index: dict[str, str] = {}
+        for transform in self.transforms:
+            tokenizer = getattr(transform, "tokenizer", None)
+            path = getattr(tokenizer, "model_path", None)
+            if tokenizer is None or path is None:
+                continue
+            path = self._named.get(path, path)
+            if path in index:
+                continue
+            name = "tokenizer" if not index else f"tokenizer-{len(index) + 1}"
+            tokenizer.save_pretrained(root / name)
+            index[path] = name
+        if index:
+            (root / INDEX).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
+
+
+def _saved(folder: Path) -> dict[str, str]:
+    """Model path in a config -> folder that holds its saved copy."""
+    file = folder / INDEX
+    if not file.is_file():
+        return {}
+    names = json.loads(file.read_text(encoding="utf-8"))
+    return {path: str(folder / name) for path, name in names.items()}
+
+
+def _redirect(table: Any, saved: Mapping[str, str]) -> Any:
+    if not isinstance(table, Mapping) or not isinstance(table.get("tokenizer"), Mapping):
+        return table
+    tokenizer = table["tokenizer"]
+    path = saved.get(str(tokenizer.get("model_path")))
+    return table if path is None else {**table, "tokenizer": {**tokenizer, "model_path": path}}

@@ -35,11 +35,13 @@ def tests(session: nox.Session) -> None:
     with steps(session) as step:
         dev = dev_env(session)
         if session.posargs:
+            make_renderable(session, dev)
             step("pytest", lambda: dev.run("pytest", *session.posargs, env=rendering.VARIABLES))
             return
         step("lint", lambda: check_lint(dev))
         step("types", lambda: dev.run("mypy", cwd=ROOT))
         step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
+        make_renderable(session, dev)
         step("pytest", lambda: dev.run("pytest", *PYTEST, cwd=ROOT, env=rendering.VARIABLES))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
 
@@ -80,6 +82,7 @@ def bench(session: nox.Session) -> None:
     """Every benchmark of benchmarks/, or those named; results go to benchmarks/results/."""
     with steps(session) as step:
         dev = dev_env(session)
+        make_renderable(session, dev)
         named = session.posargs or sorted(p.stem for p in (ROOT / "benchmarks").glob("[!_]*.py"))
         for name in named:
             script = ROOT / "benchmarks" / f"{name}.py"
@@ -92,7 +95,7 @@ def check_lint(dev: envs.Env) -> None:
 
 
 def dev_env(session: nox.Session) -> envs.Env:
-    """.nox/dev: torch, the tools, and core and plugins in editable mode, able to render."""
+    """.nox/dev: torch, the tools, and core and plugins in editable mode."""
     env = envs.Env(ROOT / ".nox" / "dev")
     dists = project.distributions(ROOT)
     pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
@@ -109,7 +112,6 @@ def dev_env(session: nox.Session) -> envs.Env:
     # Sources are used in place; only what an installation reads makes it out of date.
     parts = {d.name: project.digest([d.path / "pyproject.toml"], relative_to=d.path) for d in dists}
     env.filled(base_of(needs), parts, lambda: install_base(session, env, needs), install)
-    make_renderable(session, env)
     return env
 
 

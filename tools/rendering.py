@@ -51,6 +51,8 @@ def ensure(env: Env, log: Callable[[str], None]) -> None:
     reason = probe(env)
     if reason is None:
         return
+    if "No module named" in reason:
+        raise CannotRender(f"{env.root} has no complete mujoco to render with: {reason}")
     rights = administrator()
     if shutil.which("apt-get") is None or rights is None:
         raise CannotRender(advice(reason, have_apt=shutil.which("apt-get") is not None))

@@ -1,0 +1,81 @@
+"""Commands run in sight of the user."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from tools import shell
+
+
+def test_output_is_kept_back_only_when_quiet(capfd: pytest.CaptureFixture[str]) -> None:
+    assert shell.run([sys.executable, "-c", "print('seen')"]) == ""
+    seen = capfd.readouterr().out
+    assert seen.splitlines()[0].startswith("$ ")
+    assert "seen" in seen.splitlines()
+    kept = shell.run([sys.executable, "-c", "print('kept')"], quiet=True, echo=False)
+    assert kept == "kept\n"
+    assert capfd.readouterr().out == ""
+
+
+def test_a_failing_command_is_named_with_its_status_and_output() -> None:
+    program = "import sys; print('the reason', file=sys.stderr); sys.exit(3)"
+    with pytest.raises(shell.StepFailed, match="exit status 3 from: ") as failure:
+        shell.run([sys.executable, "-c", program], quiet=True)
+    assert failure.value.status == 3
+    assert failure.value.output == "the reason\n"
+    assert failure.value.command[0] == sys.executable
+
+
+def test_a_program_that_is_not_there_is_status_127(tmp_path: Path) -> None:
+    with pytest.raises(shell.StepFailed, match="exit status 127") as failure:
+        shell.run([tmp_path / "no-such-program"])
+    assert "no-such-program" in failure.value.output
+
+
+def test_another_pythons_paths_do_not_reach_the_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/elsewhere")
+    monkeypatch.setenv("PYTHONHOME", "/elsewhere")
+    env = shell.child_environment({"EXTRA": "1"})
+    assert "PYTHONPATH" not in env
+    assert "PYTHONHOME" not in env
+    assert env["EXTRA"] == "1"
+    assert env["PATH"] == os.environ["PATH"]
+
+
+def test_ctrl_c_lets_the_child_finish_what_it_must(tmp_path: Path) -> None:
+    child = textwrap.dedent("""
+        import pathlib, sys, time
+        pathlib.Path("started").touch()
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            time.sleep(0.5)
+            pathlib.Path("saved").touch()
+            sys.exit(130)
+    """)
+    parent = (
+        "import sys; from tools import shell\n"
+        f"try: shell.run([sys.executable, '-c', {child!r}], echo=False)\n"
+        "except KeyboardInterrupt: sys.exit(7)"
+    )
+    root = str(Path(__file__).parents[2])
+    process = subprocess.Popen(
+        [sys.executable, "-c", parent],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": root},
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "started").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=30) == 7
+    assert (tmp_path / "saved").exists()

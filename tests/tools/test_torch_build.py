@@ -99,5 +99,5 @@ def test_else_the_default_build_with_a_line_that_says_why(monkeypatch: pytest.Mo
 
 def test_no_torch_at_all_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     shop = Shop(monkeypatch)
-    with pytest.raises(StepFailed, match="torch==2.13.0"):
+    with pytest.raises(StepFailed, match=r"torch==2\.13\.0"):
         shop.install()

@@ -1,0 +1,1 @@
+"""Simulated ALOHA and UR5e robots on MuJoCo, their experts, their operators, their evaluation."""

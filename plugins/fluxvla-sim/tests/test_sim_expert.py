@@ -1,0 +1,100 @@
+"""The scripted experts: success on seeds that nobody looked at, within the real arms' limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fluxvla_aloha.embodiment import aloha_spec
+from fluxvla_sim.aloha.expert import Expert, minimum_jerk
+from fluxvla_sim.aloha.ik import ArmIK
+from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, HOME, AlohaScene
+from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS, Facts
+
+CORNERS = [
+    np.array([x, y, 0.05, 1, 0, 0, 0])
+    for x in (CUBE_LOW[0], CUBE_HIGH[0])
+    for y in (CUBE_LOW[1], CUBE_HIGH[1])
+]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return AlohaScene()
+
+
+@pytest.fixture(scope="module")
+def expert(scene):
+    return Expert(scene.model)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_succeeds_wherever_the_cube_can_be(scene, expert, task):
+    seeds = range(7_000_000, 7_000_008)
+    other = next(name for name in TASKS if name != task)
+    for place in [*CORNERS, *seeds]:
+        scene.reset(place) if isinstance(place, int) else scene.reset_to(place)
+        facts = Facts()
+        for command in expert.plan(task, scene.cube):
+            scene.step(command)
+            facts = facts.after(scene)
+        assert TASKS[task].success(facts), (place, facts)
+        assert not TASKS[other].success(facts), (place, facts)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_commands_keep_the_embodiments_limits_with_room_to_spare(expert, task):
+    joints = aloha_spec(()).joints
+    speed_limit = np.array([j.velocity for j in joints])
+    acceleration_limit = np.array([j.acceleration for j in joints])
+    for cube in CORNERS:
+        plan = expert.plan(task, cube)
+        assert plan.shape == (MAX_STEPS, 14)
+        assert (plan >= [j.lower for j in joints]).all()
+        assert (plan <= [j.upper for j in joints]).all()
+        speed = np.diff(np.vstack([HOME, plan]), axis=0) * 50
+        acceleration = np.diff(np.vstack([np.zeros(14), speed]), axis=0) * 50
+        assert (np.abs(speed).max(0) <= 0.95 * speed_limit).all()
+        assert (np.abs(acceleration).max(0) <= 0.75 * acceleration_limit).all()
+
+
+def test_a_plan_is_a_function_of_the_cube_alone(scene, expert):
+    first = expert.plan("transfer_cube", CORNERS[0])
+    expert.plan("lift_hold", CORNERS[3])
+    np.testing.assert_array_equal(expert.plan("transfer_cube", CORNERS[0]), first)
+    np.testing.assert_array_equal(Expert(scene.model).plan("transfer_cube", CORNERS[0]), first)
+
+
+def test_wrist_and_forearm_of_the_picking_arm_never_roll(expert):
+    """A neighbouring cube never flips a roll joint by half a turn, which nothing could learn."""
+    for cube in CORNERS:
+        rolls = expert.plan("lift_hold", cube)[:, [10, 12]]
+        assert np.abs(rolls).max() < 1e-3
+
+
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_inverse_kinematics_finds_reachable_poses(scene, arm):
+    ik = ArmIK(scene.model, arm)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        wanted = HOME[:6] + rng.uniform(-0.3, 0.3, 6)
+        position, quaternion = ik.forward(wanted)
+        joints, error = ik.solve(HOME[:6], position, quaternion)
+        assert error < 1e-4
+        reached, turned = ik.forward(joints)
+        assert np.linalg.norm(reached - position) < 1e-4
+        assert abs(turned @ quaternion) > 1 - 1e-6
+
+
+def test_inverse_kinematics_says_how_far_off_it_stays(scene):
+    ik = ArmIK(scene.model, "left")
+    _, error = ik.solve(HOME[:6], np.array([5.0, 0.0, 0.0]), np.array([1.0, 0, 0, 0]))
+    assert error > 3.0
+
+
+def test_minimum_jerk_starts_and_ends_at_rest():
+    share = minimum_jerk(50)
+    assert share[-1] == 1.0
+    steps = np.diff(np.concatenate([[0.0], share]))
+    assert (steps > 0).all()
+    assert steps[0] < 1e-3
+    assert steps[-1] < 1e-3

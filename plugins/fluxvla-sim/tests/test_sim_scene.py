@@ -1,0 +1,154 @@
+"""The ALOHA scene against stock gym-aloha, and the tasks' facts."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from fluxvla_aloha.embodiment import aloha_spec
+from fluxvla_sim.aloha import scene as scene_module
+from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.scene import ARM_JOINTS, ARMS, AlohaScene, to_metres, to_normalized
+from fluxvla_sim.aloha.tasks import TASKS, Facts, get_task
+from fluxvla_sim.render import import_mujoco
+
+from fluxvla_core.errors import ConfigError, RunFailed
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = AlohaScene()
+    yield scene
+    scene.close()
+
+
+@pytest.fixture
+def stock(monkeypatch):
+    """gym-aloha's own environment, without the pictures that it draws after every step."""
+    import_mujoco()
+    gymnasium = pytest.importorskip("gymnasium")
+    import gym_aloha  # noqa: F401 - registers the environment
+    from gym_aloha.tasks import sim
+
+    def blind(self, physics):
+        picture = np.zeros((1, 1, 3), np.uint8)
+        return {"qpos": self.get_qpos(physics), "images": {"top": picture}}
+
+    monkeypatch.setattr(sim.BimanualViperXTask, "get_observation", blind)
+    made = gymnasium.make(
+        "gym_aloha/AlohaTransferCube-v0", obs_type="pixels_agent_pos", disable_env_checker=True
+    )
+    return made.unwrapped
+
+
+@pytest.mark.parametrize("seed", [0, 4_294_967_295])
+def test_is_bit_identical_to_gym_aloha(scene, stock, seed):
+    expert = Expert(scene.model)
+    observation, _ = stock.reset(seed=seed)
+    scene.reset(seed)
+    np.testing.assert_array_equal(scene.state, observation["agent_pos"])
+    # The expert's commands reach every reward; noise makes the arms bump into things too.
+    commands = expert.plan("transfer_cube", scene.cube)
+    commands[220:] += np.random.default_rng(seed).normal(0, 0.05, (80, 14)).cumsum(0)
+    rewards = set()
+    for command in commands:
+        observation, reward, *_ = stock.step(command)
+        scene.step(command)
+        physics = stock._env.physics.data
+        np.testing.assert_array_equal(scene.data.qpos, physics.qpos)
+        np.testing.assert_array_equal(scene.data.qvel, physics.qvel)
+        np.testing.assert_array_equal(scene.state, observation["agent_pos"])
+        assert scene.reward() == reward
+        rewards.add(reward)
+    assert {0, 2, 4} <= rewards
+
+
+def test_constants_are_gym_alohas():
+    constants = pytest.importorskip("gym_aloha.constants")
+    assert constants.PUPPET_GRIPPER_POSITION_CLOSE == scene_module.FINGER_CLOSED
+    assert constants.PUPPET_GRIPPER_POSITION_OPEN == scene_module.FINGER_OPEN
+    assert constants.DT * scene_module.CONTROL_HZ == 1.0
+    assert constants.START_ARM_POSE[:7] == [*scene_module.HOME_ARM, scene_module.HOME_FINGER]
+
+
+def test_gripper_scale_is_its_own_inverse():
+    assert to_normalized(to_metres(0.25)) == pytest.approx(0.25)
+    assert to_normalized(scene_module.FINGER_CLOSED) == 0.0
+    assert to_normalized(scene_module.FINGER_OPEN) == 1.0
+
+
+def test_limits_of_the_embodiment_are_within_the_models(scene):
+    joints = {joint.name: joint for joint in aloha_spec(()).joints}
+    for arm in ARMS:
+        for name in ARM_JOINTS:
+            lower, upper = scene.model.joint(f"vx300s_{arm}/{name}").range
+            joint = joints[f"{arm}_{name}"]
+            assert lower - 1e-4 <= joint.lower < joint.upper <= upper + 1e-4
+
+
+def test_state_has_the_embodiments_order(scene):
+    scene.reset(0)
+    names = aloha_spec(()).joint_names
+    for index, name in enumerate(names):
+        before = scene.state
+        arm, _, joint = name.partition("_")
+        target = "left_finger" if joint == "gripper" else joint
+        address = scene.model.joint(f"vx300s_{arm}/{target}").qposadr[0]
+        scene.data.qpos[address] += 0.01
+        changed = np.flatnonzero(scene.state != before)
+        assert changed.tolist() == [index]
+
+
+def test_pictures_have_any_size_up_to_the_buffer(scene):
+    scene.reset(0)
+    for size in ((33, 47), (480, 640)):
+        picture = scene.render("top", *size)
+        assert picture.shape == (*size, 3)
+        assert picture.dtype == np.uint8
+        red = (picture[..., 0] > 150) & (picture[..., 1] < 100)
+        assert red.any(), "the red cube is in sight"
+    with pytest.raises(ValueError, match="600x640 is larger than the buffer 480x640"):
+        scene.render("top", 600, 640)
+
+
+def test_an_unknown_camera_is_named_with_those_that_exist(scene):
+    with pytest.raises(ValueError, match=r"no camera 'head'; it has .*top.*left_wrist"):
+        scene.render("head", 48, 64)
+
+
+def test_a_missing_gym_aloha_is_named_with_its_install_command(monkeypatch):
+    monkeypatch.setattr(scene_module.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RunFailed, match="not installed") as caught:
+        scene_module.load_model()
+    assert "pip install gym-aloha" in str(caught.value)
+
+
+def test_loading_the_model_leaves_gymnasium_alone():
+    import subprocess
+
+    code = (
+        "import sys; from fluxvla_sim.aloha.scene import load_model; load_model();"
+        "print(sorted({'gymnasium', 'dm_control', 'torch'} & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_tasks_judge_facts():
+    transfer, lift = TASKS["transfer_cube"], TASKS["lift_hold"]
+    held = Facts(steps=300, best_reward=2, right_touches=True, height=0.2)
+    handed = Facts(steps=190, best_reward=4, left_touched=True, right_touches=True, height=0.2)
+    assert lift.success(held)
+    assert not lift.done(held)
+    assert not transfer.success(held)
+    assert transfer.success(handed)
+    assert transfer.done(handed)
+    assert not lift.success(handed), "the left gripper touched it"
+    assert not lift.success(Facts(right_touches=True, height=0.05)), "not high enough"
+    assert not lift.success(Facts(right_touches=False, height=0.2)), "thrown, not held"
+
+
+def test_an_unknown_task_is_refused_with_those_that_exist():
+    with pytest.raises(ConfigError, match="no task 'juggle'; there are transfer_cube, lift_hold"):
+        get_task("juggle")

@@ -41,6 +41,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         raw = entry_points.encode() if isinstance(entry_points, str) else entry_points
         (info / "entry_points.txt").write_bytes(raw)
         for name, text in (files or {}).items():
+            (site / name).parent.mkdir(parents=True, exist_ok=True)
             (site / name).write_text(text)
         _metadata.index.cache_clear()
         return info

@@ -81,7 +81,7 @@ def examine(config: Config, section: str | None = None) -> Checked:
             problems += _loader_problems(config, name)
     missing = walk.missing
     if section in sections:
-        needed = _needed(config, section, section in trains, sections)
+        needed = _needed(config, section, section not in walk.runs, sections)
         missing = [p for p in missing if p.key.partition(".")[0] in needed]
     order = {p: i for i, p in enumerate(keys.every(config.tree))}
     problems = sorted([*problems, *missing], key=lambda p: order.get(p.key, -1))
@@ -89,7 +89,11 @@ def examine(config: Config, section: str | None = None) -> Checked:
 
 
 def _needed(config: Config, section: str, trains: bool, sections: tuple[str, ...]) -> set[str]:
-    """Top-level names whose plugins must be there to run ``section``."""
+    """Top-level names whose plugins must be there to run ``section``.
+
+    Inference and evaluation take their model from a checkpoint or a server; training, or what may
+    be training because its runner is missing, needs the config's own.
+    """
     if not trains:
         return {section, "hooks"}
     return {name for name in config.tree if name == section or name not in sections}
@@ -113,6 +117,7 @@ class _Walk:
         self.missing: list[Problem] = []  # plugins that are not installed
         self.sections: list[str] = []
         self.trains: list[str] = []
+        self.runs: list[str] = []  # sections that are known not to train
         self.uses: list[Use] = []
 
     def add(self, key: str, what: str) -> None:
@@ -127,10 +132,7 @@ class _Walk:
             elif value is not None:
                 self.add(key, f"must be a table, got {value!r}")
         elif name in SLOTS:
-            if name in _NEEDS_TYPE and not isinstance(value, dict) and value is not None:
-                self.add(key, f"must be a table with type = '...', got {value!r}")
-            else:
-                self.value(key, value, SLOTS[name], whole=True)
+            self.value(key, value, name, whole=True)
         elif isinstance(value, dict) and "type" not in value:
             near = difflib.get_close_matches(name, _NAMED, 1, 0.8)
             if near:
@@ -141,28 +143,35 @@ class _Walk:
                 )
             self.children(key, value, whole=False)
         else:
-            self.value(key, value, None, whole=False)
+            self.value(key, value, name, whole=False)
 
     def children(self, key: str, table: dict[str, Any], whole: bool) -> None:
         for name, value in table.items():
             if name != "type":
-                self.value(keys.child(key, name), value, SLOTS.get(name), whole)
+                self.value(keys.child(key, name), value, name, whole)
 
-    def value(self, key: str, value: Any, registry: str | None, whole: bool) -> None:
-        """``whole`` is False in variables, which a config may complete elsewhere."""
+    def value(self, key: str, value: Any, slot: str, whole: bool) -> None:
+        """``slot`` is the name that ``value``, or the list that it is in, stands under.
+
+        ``whole`` is False in variables, which a config may complete elsewhere.
+        """
+        registry = SLOTS.get(slot)
         if isinstance(value, list):
             for index, item in enumerate(value):
-                self.value(keys.child(key, index), item, registry, whole)
+                self.value(keys.child(key, index), item, slot, whole)
         elif registry == "hooks" and isinstance(value, str):
             self.component(key, {"type": value}, registry, whole, at=key)
         elif isinstance(value, dict):
             if "type" in value:
                 self.component(key, value, registry, whole, at=keys.child(key, "type"))
                 return
-            slot = keys.split(key)[-1]
             if whole and slot in _NEEDS_TYPE and value:
                 self.add(key, f"this table needs type = '<one of fluxvla.{registry}>'")
             self.children(key, value, whole)
+        elif whole and value is not None and (slot == "transforms" or key in _NEEDS_TYPE):
+            self.add(
+                key, f"must be a table with type = '<one of fluxvla.{registry}>', got {value!r}"
+            )
 
     def component(
         self, key: str, table: dict[str, Any], registry: str | None, whole: bool, at: str
@@ -187,8 +196,8 @@ class _Walk:
             if found.registry == "runners" and "." not in key:
                 self.sections.append(key)
                 whole = True
-                if found.signature and found.signature.trains:
-                    self.trains.append(key)
+                if found.signature:
+                    (self.trains if found.signature.trains else self.runs).append(key)
             self.uses.append(Use(key, found))
             if found.signature is not None:
                 self.arguments(key, table, found.signature, whole)

@@ -35,6 +35,8 @@ def merge(base: Config, over: Config) -> Config:
 
     def walk(into: dict[str, Any], new: dict[str, Any], at: str) -> None:
         for name, value in new.items():
+            if name == DELETE:
+                continue
             key = keys.child(at, name)
             old = into.get(name)
             mark = value.get(DELETE) if isinstance(value, dict) else None

@@ -70,9 +70,10 @@ def parse_value(text: str) -> Any:
     except tomli.TOMLDecodeError as error:
         if text[:1] in {"[", "{", '"', "'"}:
             raise _BadOverride(f"{text!r} is no TOML value: {error.msg}") from error
-        if _is_number(text):
+        number = _number(text)
+        if number is not None:
             raise _BadOverride(
-                f"{text!r} is no TOML number; write it as {float(text)!r}, or '\"{text}\"' for text"
+                f"{text!r} is no TOML number; write it as {number}, or '\"{text}\"' for text"
             ) from error
         return text
     found: list[tuple[str, str]] = []
@@ -80,12 +81,13 @@ def parse_value(text: str) -> Any:
     return text if found else data  # TOML's dates and times: keep what was typed
 
 
-def _is_number(text: str) -> bool:
+def _number(text: str) -> float | int | None:
+    """What Python would read ``text`` as: silently a string is not what was meant."""
     try:
-        float(text)
+        number = float(text)
     except ValueError:
-        return False
-    return True
+        return None
+    return int(number) if number.is_integer() else number
 
 
 def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> str:

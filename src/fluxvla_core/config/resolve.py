@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from fluxvla_core.config import constructor
 from fluxvla_core.config.constructor import Signature
+from fluxvla_core.config.source import lacks
 from fluxvla_core.contracts.check import check_api
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
 from fluxvla_core.plugins import known
@@ -95,6 +96,11 @@ def installed(plugin: Plugin) -> Found:
             raise LoadFailed(
                 f"{plugin.origin} provides {plugin.name!r} but its module {plugin.module!r} is "
                 f"missing (a stale or orphaned install): reinstall {plugin.dist}"
+            )
+        if lacks(plugin.module, plugin.attribute):
+            raise LoadFailed(
+                f"{plugin.origin}: entry point {plugin.name} = {plugin.value!r} names an object "
+                "that does not exist"
             )
     elif signature.api is not None:
         check_api(registry, type(signature.name, (), {"api": signature.api}), plugin.origin)

@@ -104,14 +104,15 @@ def parse(name: str) -> Module | None:
 
 
 def _top(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Statements in the order in which a later one should win: fallbacks before the real thing."""
     for node in body:
         yield node
         if isinstance(node, ast.If):
-            yield from _top([*node.body, *node.orelse])
+            yield from _top([*node.orelse, *node.body])
         elif isinstance(node, ast.Try):
-            yield from _top([*node.body, *node.orelse, *node.finalbody])
             for handler in node.handlers:
                 yield from _top(handler.body)
+            yield from _top([*node.body, *node.orelse, *node.finalbody])
 
 
 def _absolute(node: ast.ImportFrom, module: str, path: Path) -> str:
@@ -200,6 +201,14 @@ def _elsewhere(
     if rest and parse(f"{parsed.name}.{first}") is not None:
         return find(f"{parsed.name}.{first}", rest, seen)
     return Opaque(first if hasattr(builtins, first) else whole)
+
+
+def lacks(module: str, dotted: str) -> bool:
+    """Whether ``module`` certainly defines nothing called ``dotted``."""
+    parsed = parse(module)
+    if parsed is None or parsed.stars or "__getattr__" in parsed.names:
+        return False
+    return dotted.partition(".")[0] not in parsed.names
 
 
 def dotted_name(node: ast.expr) -> str | None:

@@ -188,6 +188,15 @@ class Limiter:
         self._last = given
         return given.copy(), clamps
 
+    def snapshot(self) -> tuple[Array, Array, Array]:
+        """What the next command depends on; for ``restore``."""
+        return self.last, self._speed.copy(), self._target.copy()
+
+    def restore(self, snapshot: tuple[Array, Array, Array]) -> None:
+        """Go back to a ``snapshot``: what was formed since was never sent."""
+        last, speed, target = snapshot
+        self._last, self._speed, self._target = last.copy(), speed.copy(), target.copy()
+
     def run(self, wanted: npt.ArrayLike) -> tuple[Array, list[list[Clamp]]]:
         """``step`` for each row of ``(N, D)``; all rows are checked before the first is used."""
         rows = np.asarray(wanted, dtype=np.float64)

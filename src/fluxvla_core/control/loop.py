@@ -1,0 +1,211 @@
+"""One episode: observe, predict, join, send, until it is over; then hold.
+
+The thread that calls ``run`` alone sends commands, on the absolute deadlines of the path's rate. On
+a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
+policy never keeps a command from being sent: without a chunk the arm brakes and holds, and after
+``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still
+between commands, observing happens in the sending thread (renderers are bound to one).
+
+The answers to one chunk are played whole before the next is asked for (``Synchronous``), or the
+policy is asked again as soon as it is free while its last answer is being played (``LatestOnly``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.protocols import Clock
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.joining import Chunk, Joiner
+from fluxvla_core.control.path import CommandPath
+from fluxvla_core.control.worker import Worker
+from fluxvla_core.errors import SafetyStop
+from fluxvla_core.safety.settings import SafetySettings
+
+Array = npt.NDArray[np.float64]
+# How often a wait that may be long looks whether somebody wants it to end.
+_LOOK_S = 0.02
+
+
+class EpisodeOver(BaseException):
+    """Ends an episode from inside the beat. Not an error, and nobody's ``except Exception``."""
+
+    def __init__(self, outcome: str) -> None:
+        self.outcome = outcome
+        super().__init__(outcome)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """An observation for the policy, and the time that it is of, on the loop's clock."""
+
+    observation: Any
+    at: float
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What one episode is run with.
+
+    Args:
+        path: started at the arm's pose; sends every command.
+        joiner: makes one motion of the chunks.
+        observe: makes an observation; given the ``(D,)`` command that the arm has.
+        think: asks the policy; ``(T, D)`` keyframes, those to be played.
+        admit: checks the keyframes of an answer, and takes note of it.
+        keyframe_hz: keyframes a second.
+        clock: the operator's.
+        lockstep: whether time stands still between commands.
+        settings: ``starvation_s`` and ``first_chunk_s``.
+        worker: where the policy thinks.
+        interrupts: looked at while waiting; the beat looks at them too.
+    """
+
+    path: CommandPath
+    joiner: Joiner
+    observe: Callable[[Array], Seen]
+    think: Callable[[Seen], Any]
+    admit: Callable[[Seen, Any], Array]
+    keyframe_hz: float
+    clock: Clock
+    lockstep: bool
+    settings: SafetySettings
+    worker: Worker
+    interrupts: Interrupts
+
+    def run(self, whole_chunks: bool) -> str:
+        """Run until the beat says that the episode is over.
+
+        Args:
+            whole_chunks: hand a chunk's commands to the robot's loop in one piece, and ask for
+                the next chunk after the last of them.
+
+        Returns:
+            How it ended: the ``EpisodeOver``'s outcome.
+
+        Raises:
+            SafetyStop: no chunk came in time, or one was refused.
+            Exception: what observing, the policy or the robot raised.
+        """
+        self.joiner.reset()
+        try:
+            self._receive(*self._first())
+            if whole_chunks:
+                self._play_whole()
+            else:
+                self._play_streamed()
+        except EpisodeOver as over:
+            return over.outcome
+
+    def _play_whole(self) -> NoReturn:
+        while True:
+            self.path.play(self._targets())
+            self._receive(*self._wait(*self._ask()))
+
+    def _play_streamed(self) -> NoReturn:
+        period = self.path.rate.period
+        asked: tuple[Future[tuple[Seen, Any]], Array] | None = None
+        starved_since: float | None = None
+        while True:
+            now = self.clock.now()
+            if asked is not None and asked[0].done():
+                self._receive(asked[0].result(), asked[1])
+                asked = None
+            if asked is None and self.joiner.wants_chunk(now):
+                asked = self._ask()
+            target = self.joiner.target(now + period)
+            if target is not None:
+                starved_since = None
+                self.path.play(target[None])
+                continue
+            starved_since = now if starved_since is None else starved_since
+            self._check_starved(now - starved_since)
+            self.path.hold()
+
+    def _targets(self) -> Array:
+        """The joined chunk at every beat, as far as it reaches: ``(N, D)``."""
+        now, period = self.clock.now(), self.path.rate.period
+        rows: list[Array] = []
+        while (row := self.joiner.target(now + (len(rows) + 1) * period)) is not None:
+            rows.append(row)
+        if not rows:
+            raise SafetyStop(
+                f"a chunk at {self.keyframe_hz:g} Hz holds no command at "
+                f"{self.path.rate.hz:g} Hz: it is too short"
+            )
+        return np.array(rows)
+
+    def _ask(self) -> tuple[Future[tuple[Seen, Any]], Array]:
+        last = self.path.limiter.last
+        if self.lockstep:
+            seen = self.observe(last)
+            return self.worker.submit(lambda: (seen, self.think(seen))), last
+        return self.worker.submit(lambda: self._observe_and_think(last)), last
+
+    def _observe_and_think(self, last: Array) -> tuple[Seen, Any]:
+        seen = self.observe(last)
+        return seen, self.think(seen)
+
+    def _first(self) -> tuple[tuple[Seen, Any], Array]:
+        """The first answer: nothing moves yet, and the policy may have to warm up.
+
+        It is asked twice on a robot: by the time of a long first answer, what it saw is old.
+        """
+        answer, last = self._idle(*self._ask())
+        if not self.lockstep:
+            answer, last = self._idle(*self._ask())
+        return answer, last
+
+    def _idle(
+        self, future: Future[tuple[Seen, Any]], last: Array
+    ) -> tuple[tuple[Seen, Any], Array]:
+        until = time.monotonic() + self.settings.first_chunk_s
+        while True:
+            self.interrupts.check()
+            try:
+                return future.result(timeout=_LOOK_S), last
+            except NotYet:
+                # A policy may raise the same class; then the answer is there.
+                if future.done():
+                    raise
+            if time.monotonic() > until:
+                raise SafetyStop(
+                    f"the policy gave no chunk within {self.settings.first_chunk_s:g} s",
+                    cause="it hangs, or it is far slower than this robot needs",
+                    next="safety.first_chunk_s sets how long it may take to warm up",
+                )
+
+    def _wait(
+        self, future: Future[tuple[Seen, Any]], last: Array
+    ) -> tuple[tuple[Seen, Any], Array]:
+        """The next answer; on a robot the arm brakes and holds in the meantime."""
+        if self.lockstep:
+            return self._idle(future, last)
+        since = self.clock.now()
+        while not future.done():
+            self._check_starved(self.clock.now() - since)
+            self.path.hold()
+        # The arm may have been braking: the next chunk starts where it is commanded to be now.
+        return future.result(), self.path.limiter.last
+
+    def _receive(self, answer: tuple[Seen, Any], anchor: Array) -> None:
+        seen, keyframes = answer
+        admitted = self.admit(seen, keyframes)
+        self.joiner.add(Chunk(admitted, self.keyframe_hz, seen.at, anchor), self.clock.now())
+
+    def _check_starved(self, seconds: float) -> None:
+        if seconds > self.settings.starvation_s:
+            raise SafetyStop(
+                f"the robot waits for a chunk for {seconds:.2f} s, "
+                f"safety.starvation_s is {self.settings.starvation_s:g}",
+                cause="the policy hangs, or is slower than its chunks are long",
+                next="play longer chunks (execute_horizon), or use a faster policy",
+            )

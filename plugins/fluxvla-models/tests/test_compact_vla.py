@@ -9,7 +9,7 @@ from fluxvla_models.conv_encoder import ConvEncoder, SpatialSoftmax
 from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
-from fluxvla_core.processors.model_path import resolve_model_path
+from fluxvla_core.processors.resources import resolve_model_path
 
 SMALL = {
     "vision_backbone": {"type": "ConvEncoder", "image_size": (32, 48), "channels": (8, 8, 16)},

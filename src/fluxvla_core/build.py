@@ -13,12 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.config.check import INJECTED
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import BY_NAME, Registry
-
-INJECTED = ("cfg", "context")
-"""Parameters that the builder fills when a constructor names them; a config may not."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
-from fluxvla_sim.aloha.expert import Expert, minimum_jerk
-from fluxvla_sim.aloha.ik import ArmIK
+from fluxvla_sim.aloha.expert import Expert, arm_ik
 from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, HOME, AlohaScene
 from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS, Facts
+from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
 
 CORNERS = [
     np.array([x, y, 0.05, 1, 0, 0, 0])
@@ -73,7 +73,7 @@ def test_wrist_and_forearm_of_the_picking_arm_never_roll(expert):
 
 @pytest.mark.parametrize("arm", ["left", "right"])
 def test_inverse_kinematics_finds_reachable_poses(scene, arm):
-    ik = ArmIK(scene.model, arm)
+    ik = arm_ik(scene.model, arm)
     rng = np.random.default_rng(3)
     for _ in range(5):
         wanted = HOME[:6] + rng.uniform(-0.3, 0.3, 6)
@@ -86,7 +86,7 @@ def test_inverse_kinematics_finds_reachable_poses(scene, arm):
 
 
 def test_inverse_kinematics_says_how_far_off_it_stays(scene):
-    ik = ArmIK(scene.model, "left")
+    ik = arm_ik(scene.model, "left")
     _, error = ik.solve(HOME[:6], np.array([5.0, 0.0, 0.0]), np.array([1.0, 0, 0, 0]))
     assert error > 3.0
 
@@ -98,3 +98,11 @@ def test_minimum_jerk_starts_and_ends_at_rest():
     assert (steps > 0).all()
     assert steps[0] < 1e-3
     assert steps[-1] < 1e-3
+
+
+def test_quaternions_turn_the_right_way_round():
+    quarter = turn((0, 0, 1), 90)
+    half = quaternion_product(quarter, quarter)
+    np.testing.assert_allclose(half, turn((0, 0, 1), 180), atol=1e-12)
+    tilted = quaternion_product(turn((0, 0, 1), 180), turn((0, 1, 0), 60))
+    np.testing.assert_allclose(tilted, [0, -0.5, 0, np.sqrt(0.75)], atol=1e-12)

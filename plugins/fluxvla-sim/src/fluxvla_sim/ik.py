@@ -1,12 +1,12 @@
-"""Inverse kinematics of one ViperX arm: damped least squares on the pose of its fingertips."""
+"""Inverse kinematics of one arm: damped least squares on the pose of its fingertips."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluxvla_sim.aloha.scene import ARM_JOINTS
 from fluxvla_sim.render import import_mujoco
 
 if TYPE_CHECKING:
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
 
     Vector = npt.NDArray[np.float64]
 
-TIP = np.array([0.135, 0.0, 0.0])
-"""The point between the fingertips, in the gripper link's frame (metres)."""
-
 
 class ArmIK:
-    """Joint angles for a fingertip pose of ``arm`` (``left`` or ``right``).
+    """Joint angles for a pose of the fingertips.
 
     The step is ``J^T (J J^T + damping I)^-1 e``, the damped least squares of Wampler (1986) and
     Nakamura and Hanafusa (1986), with rotation weighted less than position.
 
-    Attributes:
-        base: ``(3,)`` where the arm stands, in metres, world frame.
+    Args:
+        model: ``mujoco.MjModel``.
+        joints: names of the arm's joints, from the base on.
+        body: name of the body that carries the fingers.
+        tip: ``(3,)`` the point between the fingertips in that body's frame, in metres.
     """
 
     DAMPING = 1e-4
@@ -34,16 +34,16 @@ class ArmIK:
     POSITION_TOLERANCE = 1e-6  # metres
     ROTATION_TOLERANCE = 1e-5  # radians
 
-    def __init__(self, model: Any, arm: str) -> None:
+    def __init__(self, model: Any, joints: Sequence[str], body: str, tip: Sequence[float]) -> None:
         self._mujoco = import_mujoco()
         self._model = model
         self._data = self._mujoco.MjData(model)
-        joints = [model.joint(f"vx300s_{arm}/{name}") for name in ARM_JOINTS]
-        self._body = model.body(f"vx300s_{arm}/gripper_link").id
-        self._dof = np.array([j.dofadr[0] for j in joints])
-        self._address = np.array([j.qposadr[0] for j in joints])
-        self._lower, self._upper = np.array([j.range for j in joints]).T
-        self.base: Vector = model.body(f"vx300s_{arm}").pos.copy()
+        self._body = model.body(body).id
+        self._tip = np.array(tip)
+        found = [model.joint(name) for name in joints]
+        self._dof = np.array([j.dofadr[0] for j in found])
+        self._address = np.array([j.qposadr[0] for j in found])
+        self._lower, self._upper = np.array([j.range for j in found]).T
 
     def forward(self, joints: Vector) -> tuple[Vector, Vector]:
         """Fingertip position ``(3,)`` in metres and quaternion wxyz ``(4,)``, world frame."""
@@ -51,7 +51,9 @@ class ArmIK:
         self._mujoco.mj_kinematics(self._model, self._data)
         self._mujoco.mj_comPos(self._model, self._data)
         rotation = self._data.xmat[self._body].reshape(3, 3)
-        return self._data.xpos[self._body] + rotation @ TIP, self._data.xquat[self._body].copy()
+        return self._data.xpos[self._body] + rotation @ self._tip, self._data.xquat[
+            self._body
+        ].copy()
 
     def solve(
         self, start: Vector, position: Vector, quaternion: Vector, iterations: int = 50
@@ -59,11 +61,11 @@ class ArmIK:
         """The solution near ``start``, and how far off its position is.
 
         Args:
-            start: ``(6,)`` joint angles to begin from; they choose the branch.
+            start: ``(n,)`` joint angles to begin from; they choose the branch.
             position, quaternion: the wanted fingertip pose, as :meth:`forward` gives it.
 
         Returns:
-            ``(6,)`` joint angles within the joint limits, and the position error in metres.
+            ``(n,)`` joint angles within the joint limits, and the position error in metres.
         """
         mujoco, joints = self._mujoco, np.array(start, dtype=np.float64)
         jacobian = np.zeros((6, self._model.nv))

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluxvla_sim.aloha.ik import ArmIK
-from fluxvla_sim.aloha.scene import ARMS, HOME, load_model
+from fluxvla_sim.aloha.scene import ARM_JOINTS, ARMS, HOME, load_model
 from fluxvla_sim.aloha.tasks import MAX_STEPS, get_task
+from fluxvla_sim.ik import ArmIK
+from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -27,6 +28,7 @@ HOLD = np.array([0.12, 0.5, 0.25])  # where the right arm holds it up
 GRASP_HEIGHT = 0.02
 OPEN, CLOSED = 1.0, 0.0
 HOME_OPENING = float(HOME[6])
+TIP = (0.135, 0.0, 0.0)  # between the fingertips, in the gripper link's frame, metres
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,6 @@ class ArmPlan:
     grips: tuple[Grip, ...]
 
 
-def _turn(axis: tuple[float, float, float], degrees: float) -> Vector:
-    half = np.deg2rad(degrees) / 2
-    return np.array([np.cos(half), *(np.sin(half) * np.array(axis))])
-
-
-def _product(a: Vector, b: Vector) -> Vector:
-    """Hamilton product of quaternions wxyz."""
-    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([w, *v])
-
-
 def _orientation(arm: str, tip: Vector, base: Vector) -> Vector:
     """Quaternion wxyz of the gripper of an arm that stands at ``base``, at ``tip``.
 
@@ -80,9 +71,9 @@ def _orientation(arm: str, tip: Vector, base: Vector) -> Vector:
     fingers pass the right ones above and below.
     """
     if arm == "left":
-        return _turn((1, 0, 0), 90)
+        return turn((1, 0, 0), 90)
     heading = np.arctan2(*(tip[:2] - base[:2])[::-1])
-    return _product(_turn((0, 0, 1), np.rad2deg(heading)), _turn((0, 1, 0), 60))
+    return quaternion_product(turn((0, 0, 1), np.rad2deg(heading)), turn((0, 1, 0), 60))
 
 
 # Where the solver starts for the first waypoint. At home the wrist is nearly straight, and there
@@ -127,12 +118,19 @@ def lift_plan(cube: Vector) -> dict[str, ArmPlan]:
 _PLANS = {"transfer_cube": transfer_plan, "lift_hold": lift_plan}
 
 
+def arm_ik(model: Any, arm: str) -> ArmIK:
+    """Inverse kinematics of ``arm`` (``left`` or ``right``)."""
+    joints = [f"vx300s_{arm}/{name}" for name in ARM_JOINTS]
+    return ArmIK(model, joints, f"vx300s_{arm}/gripper_link", TIP)
+
+
 class Expert:
     """Plans for the tasks of :mod:`fluxvla_sim.aloha.tasks`; knows the cube's true pose."""
 
     def __init__(self, model: Any = None) -> None:
         model = load_model() if model is None else model
-        self._ik = {arm: ArmIK(model, arm) for arm in ARMS}
+        self._ik = {arm: arm_ik(model, arm) for arm in ARMS}
+        self._base = {arm: model.body(f"vx300s_{arm}").pos.copy() for arm in ARMS}
 
     def plan(self, task: str, cube: Vector) -> Vector:
         """Commands for one episode.
@@ -150,32 +148,25 @@ class Expert:
 
     def _arm(self, arm: str, plan: ArmPlan) -> Vector:
         actions = np.tile(HOME[:7], (MAX_STEPS, 1))
-        ik = self._ik[arm]
+        ik, base = self._ik[arm], self._base[arm]
         joints, step = HOME[:6].copy(), 0
         for reach in plan.reaches:
-            steps = reach.until - step
+            share = minimum_jerk(reach.until - step)
             if reach.tip is not None and reach.straight:
                 tip, _ = ik.forward(joints)
-                for k, share in enumerate(minimum_jerk(steps)):
-                    at = tip + share * (reach.tip - tip)
-                    joints, _ = ik.solve(joints, at, _orientation(arm, at, ik.base))
+                for k, part in enumerate(share):
+                    at = tip + part * (reach.tip - tip)
+                    joints, _ = ik.solve(joints, at, _orientation(arm, at, base))
                     actions[step + k, :6] = joints
             elif reach.tip is not None:
-                goal, _ = ik.solve(_BRANCH[arm], reach.tip, _orientation(arm, reach.tip, ik.base))
-                actions[step : reach.until, :6] = joints + np.outer(
-                    minimum_jerk(steps), goal - joints
-                )
+                wanted = _orientation(arm, reach.tip, base)
+                goal, _ = ik.solve(_BRANCH[arm], reach.tip, wanted)
+                actions[step : reach.until, :6] = joints + np.outer(share, goal - joints)
                 joints = goal
-            actions[step + steps :, :6] = joints
             step = reach.until
+            actions[step:, :6] = joints
         actions[:, 6] = _gripper(plan.grips)
         return actions
-
-
-def minimum_jerk(steps: int) -> Vector:
-    """Share of the way after each of ``steps`` steps: ``10 s^3 - 15 s^4 + 6 s^5``, up to 1."""
-    s = np.arange(1, steps + 1) / steps
-    return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def _gripper(grips: tuple[Grip, ...]) -> Vector:

@@ -1,0 +1,191 @@
+"""What simulated robots share as operators: time, thread safety, refusals, frames."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.errors import NotReady, Rejected
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+
+class Scene(Protocol):
+    """A simulated robot in its surroundings; one :meth:`step` is one control period."""
+
+    def reset(self, seed: int) -> None: ...
+    def step(self, action: npt.NDArray[np.float64]) -> None: ...
+    @property
+    def state(self) -> npt.NDArray[np.float64]: ...
+    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]: ...
+    def close(self) -> None: ...
+
+
+class SimClock:
+    """Simulated seconds. Waiting on it lets the robot hold its last command meanwhile."""
+
+    def __init__(self, operator: SimOperator) -> None:
+        self._operator = operator
+
+    def now(self) -> float:
+        return self._operator.simulated_seconds
+
+    def sleep_until(self, deadline: float) -> None:
+        self._operator.hold_until(deadline)
+
+
+class SimOperator:
+    """One simulated robot behind the operator contract.
+
+    In simulated time (the default) a control period passes with each ``send_action``, and the
+    world waits while the policy thinks. With ``realtime`` the world goes on: periods pass with the
+    wall clock, and the last command holds until the next one. Either way the physics is stepped
+    only in multiples of the control period, in the calling thread.
+
+    Args:
+        embodiment: joints, limits, cameras and rate.
+        seed: of the first :meth:`reset`, which :meth:`connect` does.
+        realtime: follow the wall clock.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(self, embodiment: EmbodimentSpec, seed: int, realtime: bool) -> None:
+        self.embodiment = embodiment
+        self.seed = seed
+        self.realtime = realtime
+        self.clock: SimClock | None = None if realtime else SimClock(self)
+        self._period = 1.0 / embodiment.rate_hz
+        # Whole periods, so that time does not collect rounding errors.
+        self._periods = 0
+        self._started = 0.0
+        self._lock = threading.RLock()
+        self._scene: Any = None
+        self._target: npt.NDArray[np.float64] = np.zeros(embodiment.dim)
+
+    def _make_scene(self) -> Scene:
+        """The scene of this robot; heavy imports belong here."""
+        raise TypeError(f"{type(self).__name__} must say which scene it lives in")
+
+    def _after_step(self) -> None:
+        """Called after each control period."""
+
+    def connect(self) -> None:
+        """Build the scene and reset it to ``seed``; again after :meth:`close` if wanted."""
+        with self._lock:
+            if self._scene is None:
+                self._scene = self._make_scene()
+                self._periods, self._started = 0, time.monotonic()
+                self.reset(self.seed)
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode: robot at home, objects where ``seed`` puts them. Time goes on.
+
+        Raises:
+            NotReady: not connected.
+        """
+        with self._lock:
+            scene = self._connected()
+            self.seed = seed
+            scene.reset(seed)
+            self._target = self._measured()
+
+    @property
+    def simulated_seconds(self) -> float:
+        """Control time that the physics has lived through since :meth:`connect`."""
+        return self._periods * self._period
+
+    def hold_until(self, seconds: float) -> None:
+        """Let simulated time pass with the last command held, up to ``seconds``."""
+        with self._lock:
+            while self._scene is not None and self.simulated_seconds < seconds - self._period / 2:
+                self._step()
+
+    def get_frame(self) -> Frame:
+        """State and pictures of this moment.
+
+        Raises:
+            NotReady: not connected.
+        """
+        with self._lock:
+            scene = self._connected()
+            self._catch_up()
+            now = time.monotonic() if self.realtime else self.simulated_seconds
+            images = {
+                c.name: scene.render(c.name, c.height, c.width) for c in self.embodiment.cameras
+            }
+            stamps = dict.fromkeys((STATE, *images), now)
+            return Frame(state=np.array(scene.state), images=images, stamps=stamps)
+
+    def send_action(self, action: npt.NDArray[np.float64]) -> None:
+        """Command joint targets; in simulated time one control period passes.
+
+        Raises:
+            NotReady: not connected.
+            Rejected: wrong shape, non-finite, or outside the embodiment's position limits.
+        """
+        target = self._checked(action)
+        with self._lock:
+            self._connected()
+            self._catch_up()
+            self._target = target
+            if not self.realtime:
+                self._step()
+
+    def stop(self) -> None:
+        """Hold where the robot is; any state, any thread, any number of times."""
+        with self._lock:
+            if self._scene is not None:
+                self._target = self._measured()
+
+    def close(self) -> None:
+        """Free the scene; any number of times."""
+        with self._lock:
+            if self._scene is not None:
+                self._scene.close()
+                self._scene = None
+
+    def _connected(self) -> Any:
+        if self._scene is None:
+            raise NotReady(f"{type(self).__name__} is not connected", next="call connect() first")
+        return self._scene
+
+    def _step(self) -> None:
+        self._scene.step(self._target)
+        self._periods += 1
+        self._after_step()
+
+    def _catch_up(self) -> None:
+        if self.realtime:
+            due = int((time.monotonic() - self._started) / self._period)
+            while self._periods < due:
+                self._step()
+
+    def _measured(self) -> npt.NDArray[np.float64]:
+        lower = [j.lower for j in self.embodiment.joints]
+        upper = [j.upper for j in self.embodiment.joints]
+        return np.clip(np.asarray(self._scene.state, dtype=np.float64), lower, upper)
+
+    def _checked(self, action: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        target = np.array(action, dtype=np.float64)
+        spec = self.embodiment
+        if target.shape != (spec.dim,):
+            raise Rejected(
+                f"{type(self).__name__} takes actions of shape ({spec.dim},), got {target.shape}"
+            )
+        for joint, value in zip(spec.joints, target, strict=True):
+            if not np.isfinite(value):
+                raise Rejected(f"{joint.name}: the command is {value}, not a finite number")
+            if not joint.lower <= value <= joint.upper:
+                raise Rejected(
+                    f"{joint.name}: the command {value:.4g} {joint.unit} is outside "
+                    f"[{joint.lower:.4g}, {joint.upper:.4g}]"
+                )
+        return target

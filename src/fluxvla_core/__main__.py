@@ -1,0 +1,8 @@
+"""``python -m fluxvla_core`` is ``fluxvla``; ``torchrun -m fluxvla_core run …`` starts ranks."""
+
+import sys
+
+from fluxvla_core.cli.main import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""``fluxvla config show`` and ``fluxvla config check``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
+from fluxvla_core.cli.plugin_file import load_plugin_files
+from fluxvla_core.config import Config, apply_overrides, check_config, keys, load_config
+from fluxvla_core.config.check import Use
+
+
+class Show:
+    api = "1.0"
+    help = (
+        "Print the config as it resolves, one key a line, as --set takes them. A .py config is "
+        "executed."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("file", help="a .py, .toml or config.resolved.json")
+        parser.add_argument("--origin", action="store_true", help="add where each key is written")
+        add_overrides(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        config = apply_overrides(load_config(args.file), args.overrides)
+        print("\n".join(listing(config, origin=args.origin)))
+        return 0
+
+
+class Check:
+    api = "1.0"
+    help = (
+        "Check a config against the classes that it names: types, unknown and missing keys, all "
+        "problems at once. No plugin is imported; a .py config is executed."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("file", help="a .py, .toml or config.resolved.json")
+        parser.once("--section", help="what this section needs must be there; others may lack it")
+        add_overrides(parser)
+        add_plugin_files(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        load_plugin_files(args.plugin_files)
+        config = apply_overrides(load_config(args.file), args.overrides)
+        checked = check_config(config, args.section)
+        print(f"{config.file}: no problems; sections: {', '.join(checked.sections) or 'none'}")
+        print("\n".join(used(checked.uses)))
+        return 0
+
+
+def listing(config: Config, origin: bool) -> list[str]:
+    """``key = value`` lines; with ``origin`` each ends in its ``# file:line``."""
+    rows = [(key, f"{key} = {literal(value)}") for key, value in keys.leaves(config.tree)]
+    if not origin:
+        return [text for _, text in rows]
+    width = min(max((len(text) for _, text in rows), default=0), 60)
+    return [f"{text:{width}}  # {config.where(key)}" for key, text in rows]
+
+
+def literal(value: Any) -> str:
+    """``value`` as ``--set`` would take it."""
+    if value is None:
+        return "None"
+    if isinstance(value, list):
+        return f"[{', '.join(map(literal, value))}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k} = {literal(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (bool, str)):
+        return json.dumps(value, ensure_ascii=False)
+    return repr(value)
+
+
+def used(uses: Iterable[Use]) -> list[str]:
+    """A table of the classes that a config names and who provides them."""
+    rows = [(use.key, use.found.title, use.found.origin) for use in uses]
+    if not rows:
+        return []
+    widths = [max(len(row[i]) for row in rows) for i in range(2)]
+    return [f"  {key:{widths[0]}}  {name:{widths[1]}}  {origin}" for key, name, origin in rows]

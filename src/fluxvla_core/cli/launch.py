@@ -1,0 +1,134 @@
+"""``--nproc N``: N ranks of this command, started by torch's own elastic agent."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import signal
+import sys
+import tempfile
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.cli import ranks
+from fluxvla_core.errors import RunFailed, UsageError
+
+_GRACE_S = 60  # for a checkpoint, between asking ranks to stop and killing them
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+def launch(nproc: int, words: Sequence[str]) -> int:
+    """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
+
+    Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped, and the
+    words and the exit code of the one that failed first are this command's.
+
+    Raises:
+        UsageError: torch is not installed, or this process is itself a rank.
+        RunFailed: a rank was killed, or this command was.
+        KeyboardInterrupt: Ctrl-C; the ranks were given time to save.
+    """
+    if ranks.world_size() is not None:
+        raise UsageError(
+            "--nproc starts ranks, and this process is one already (torchrun set WORLD_SIZE)",
+            next="leave --nproc out under torchrun",
+        )
+    try:
+        from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
+        from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+        from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"--nproc needs {error.name}, which is not installed",
+            next="pip install 'fluxvla-core[train]'",
+        ) from error
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (cores or 1) // nproc)))
+    # Its agent reports failures in its own way; ours are in the ranks' own words.
+    logging.disable(logging.CRITICAL)
+    try:
+        with tempfile.TemporaryDirectory(prefix="fluxvla-ranks-") as folder:
+            os.environ[ranks.ERROR_DIR] = folder
+            os.environ[ranks.LAUNCHER] = str(os.getpid())
+            config = LaunchConfig(
+                min_nodes=1,
+                max_nodes=1,
+                nproc_per_node=nproc,
+                run_id=uuid.uuid4().hex,
+                rdzv_backend="c10d",
+                rdzv_endpoint="127.0.0.1:0",
+                local_addr="127.0.0.1",
+                max_restarts=0,
+                shutdown_timeout=_GRACE_S,
+                logs_specs=DefaultLogsSpecs(log_dir=folder),
+            )
+            agent = elastic_launch(config, sys.executable)
+            return _watch(agent, words, Path(folder), ChildFailedError)
+    finally:
+        for name in (ranks.ERROR_DIR, ranks.LAUNCHER):
+            os.environ.pop(name, None)
+        logging.disable(logging.NOTSET)
+
+
+def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) -> int:
+    from torch.distributed.elastic.multiprocessing import SignalException
+
+    try:
+        agent("-m", "fluxvla_core", "run", *words)
+    except SignalException as error:
+        said = ranks.failures(folder)
+        if error.sigval == signal.SIGINT:
+            raise KeyboardInterrupt(_after("interrupted", said)) from None
+        if said and said[0].expected:
+            return _tell(said[0])
+        raise RunFailed(f"stopped by {signal.Signals(error.sigval).name}") from None
+    except failed as error:
+        said = ranks.failures(folder)
+        if said:
+            return _tell(said[0])
+        rank, failure = error.get_first_failure()
+        raise RunFailed(
+            f"rank {rank} ended without a word: {_ending(failure.exitcode)}",
+            cause="killed from outside, most often for want of memory"
+            if failure.exitcode == -signal.SIGKILL
+            else None,
+        ) from None
+    return 0
+
+
+def _tell(failure: ranks.Failure) -> int:
+    """Say what the rank would have said."""
+    text = failure.text if failure.expected else f"rank {failure.rank} failed:\n{failure.text}"
+    print(text, file=sys.stderr)
+    return failure.code
+
+
+def _after(prefix: str, said: list[ranks.Failure]) -> str:
+    """What an interrupted rank added (where it saved), without the word itself."""
+    texts = [f.text.removeprefix(prefix).removeprefix(": ") for f in said if f.code == 130]
+    return texts[0] if texts else ""
+
+
+def _ending(code: int) -> str:
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    return f"exit code {code}"
+
+
+def die_with_parent() -> None:
+    """Make this rank end when its launcher does, however that ends.
+
+    After ``kill -9`` of the launcher, ranks that trained on would write into the work dir that
+    the next ``--resume auto`` reads.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if str(os.getppid()) != os.environ.get(ranks.LAUNCHER):  # it was gone before the call
+        raise RunFailed("the launcher of this rank has ended")

@@ -1,0 +1,131 @@
+"""What ``fluxvla run`` is going to do, decided and checked before anything heavy is imported."""
+
+from __future__ import annotations
+
+import difflib
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fluxvla_core.config import Checked, Config, apply_overrides, check_config, examine, load_config
+from fluxvla_core.config.check import Use
+from fluxvla_core.config.resolved import CONFIG_FILE
+from fluxvla_core.errors import ConfigError, UsageError
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One section of one checked config, and where its results go."""
+
+    config: Config
+    section: str
+    trains: bool
+    work_dir: Path
+    uses: tuple[Use, ...]
+
+
+def make_plan(
+    file: str | None,
+    section: str | None = None,
+    overrides: Iterable[str] = (),
+    work_dir: str | None = None,
+) -> Plan:
+    """Load, override and check a config, and choose the section.
+
+    Raises:
+        UsageError: no config is named, or the section is not one that can run.
+        ConfigError: whatever is wrong with the config.
+    """
+    if file is None:
+        raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
+    config = apply_overrides(load_config(file), overrides)
+    name = choose_section(config, examine(config), section)
+    checked = check_config(config, name)
+    place = Path(work_dir) if work_dir is not None else default_work_dir(Path(file))
+    return Plan(config, name, name in checked.trains, place, checked.uses)
+
+
+def _configs_here() -> str:
+    found = sorted(p for p in Path("configs").glob("*") if p.suffix in {".py", ".toml"})
+    if not found:
+        return "fluxvla run --help"
+    return "configs here: " + ", ".join(str(p) for p in found[:8])
+
+
+def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
+    """``wanted``, or the only runnable section.
+
+    Raises:
+        UsageError: ``wanted`` is not there or cannot run; or there are several, or none.
+        ConfigError: none, because the config has problems.
+    """
+    names = checked.sections
+    listed = ", ".join(f"{name} ({config.tree[name].get('type')})" for name in names)
+    if wanted is not None:
+        if wanted in names:
+            return wanted
+        if wanted in config.tree:
+            what = f"section {wanted!r} cannot be run: it is no table whose type is a runner"
+        else:
+            near = difflib.get_close_matches(wanted, names, 1)
+            what = f"no section {wanted!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+        raise UsageError(what, where=config.file, next=f"sections there: {listed or 'none'}")
+    if len(names) == 1:
+        return names[0]
+    if names:
+        raise UsageError(
+            f"several sections can be run: {listed}",
+            where=config.file,
+            next=f"name one: --section {names[0]}",
+        )
+    if checked.problems:
+        raise ConfigError.from_problems(checked.problems)
+    raise UsageError(
+        "nothing to run: no table at the top has a type that is a runner",
+        where=config.file,
+        next="write runner = dict(type='...'); fluxvla plugins list shows what is installed",
+    )
+
+
+def default_work_dir(file: Path) -> Path:
+    """``work_dirs/<name of the config>``; for a run's resolved config, that run's own folder."""
+    if file.name != CONFIG_FILE:
+        return Path("work_dirs") / file.stem
+    folder = file.parent
+    return folder.parent.parent if folder.parent.name == "checkpoints" else folder
+
+
+def prepare_work_dir(path: Path) -> None:
+    """Make the folder and try to write in it.
+
+    Raises:
+        UsageError: it cannot be made or written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path) as file:
+            file.write(b"x")
+    except OSError as error:
+        raise UsageError(
+            f"cannot write to the work dir: {error.strerror or error}",
+            where=str(path),
+            next="name another one: --work-dir DIR",
+        ) from error
+
+
+def refuse_overwriting(work_dir: Path) -> None:
+    """A fresh training must not land among the checkpoints of another.
+
+    Raises:
+        UsageError: there are checkpoints, with both ways on.
+    """
+    from fluxvla_core.train.checkpoint import folders, step_of
+
+    found = folders(work_dir)
+    if found:
+        raise UsageError(
+            f"the work dir already holds checkpoints, up to step {step_of(found[-1])}",
+            where=str(work_dir),
+            next="go on from there: --resume auto; or begin anew elsewhere: --work-dir DIR",
+        )

@@ -1,0 +1,62 @@
+"""What a process knows of being one of several, and how it tells its launcher why it failed.
+
+Each rank of ``fluxvla run --nproc N`` writes its error to a file instead of the terminal: when
+one fails the others fail of it, and only the first one's words help.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+ERROR_DIR = "FLUXVLA_ERROR_DIR"
+LAUNCHER = "FLUXVLA_LAUNCHER_PID"
+
+
+def rank() -> int:
+    """This process's global rank (``RANK``, set by torchrun); 0 when it is alone."""
+    return int(os.environ.get("RANK", "0"))
+
+
+def world_size() -> int | None:
+    """How many ranks there are (``WORLD_SIZE``); None when nobody launched ranks."""
+    text = os.environ.get("WORLD_SIZE")
+    return int(text) if text else None
+
+
+def launched() -> bool:
+    """Whether ``fluxvla run --nproc`` started this process."""
+    return ERROR_DIR in os.environ
+
+
+@dataclass(frozen=True)
+class Failure:
+    """How one rank ended. ``time`` is monotonic; ``expected`` means a FluxError."""
+
+    rank: int
+    time: float
+    text: str
+    code: int
+    expected: bool
+
+
+def record(text: str, code: int, *, expected: bool) -> bool:
+    """Leave an error for the launcher; False if there is none to read it."""
+    if not launched():
+        return False
+    failure = Failure(rank(), time.monotonic(), text, code, expected)
+    path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.json"
+    try:
+        path.write_text(json.dumps(asdict(failure)))
+    except OSError:  # the launcher is gone, or the disk is full: the terminal is what is left
+        return False
+    return True
+
+
+def failures(folder: Path) -> list[Failure]:
+    """What ranks recorded, the most telling first: FluxErrors, then by time."""
+    found = [Failure(**json.loads(path.read_text())) for path in folder.glob("rank-*.json")]
+    return sorted(found, key=lambda f: (not f.expected, f.time))

@@ -1,0 +1,243 @@
+"""``fluxvla run``: from a config to a running section."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.cli import ranks
+from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, positive
+from fluxvla_core.cli.plan import Plan, make_plan, prepare_work_dir, refuse_overwriting
+from fluxvla_core.cli.plugin_file import load_plugin_files
+from fluxvla_core.errors import RunFailed, UsageError
+
+
+class Run:
+    api = "1.0"
+    help = (
+        "Run one section of a config: train with its runner, evaluate, or drive a robot. The "
+        "config is checked as a whole first; a .py config is executed."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.once("--config", metavar="FILE", help="a .py, .toml or config.resolved.json")
+        parser.once("--section", metavar="NAME", help="which section, if several can run")
+        add_overrides(parser)
+        parser.once("--work-dir", metavar="DIR", help="default: work_dirs/<name of the config>")
+        parser.once(
+            "--resume", metavar="auto|PATH", help="go on from the newest, or this, checkpoint"
+        )
+        parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
+        parser.once("--nproc", type=positive, default=1, metavar="N", help="processes (default 1)")
+        add_plugin_files(parser)
+        parser.add_argument(
+            "--dry-run", action="store_true", help="check, print what would run, and stop"
+        )
+        parser.once(
+            "--log-format",
+            choices=("text", "json"),
+            default="text",
+            help="for people (default) or one JSON object a line",
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        if ranks.launched():
+            from fluxvla_core.cli.launch import die_with_parent
+
+            die_with_parent()
+        load_plugin_files(args.plugin_files)
+        plan = make_plan(args.config, args.section, args.overrides, args.work_dir)
+        _check_fit(args, plan)
+        if args.dry_run:
+            print(_outline(plan, args.log_format))
+            return 0
+        if ranks.rank() == 0 and not ranks.launched():
+            prepare_work_dir(plan.work_dir)
+            if plan.trains and args.resume is None:
+                refuse_overwriting(plan.work_dir)
+        if plan.trains and args.nproc > 1:
+            from fluxvla_core.cli.launch import launch
+
+            with _terminable():
+                return launch(args.nproc, _words(args))
+        with _terminable(), _disk_full(plan.work_dir):
+            _execute(plan, args)
+        return 0
+
+
+def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
+    """Options that this kind of section has no use for are slips."""
+    if plan.trains and args.task is not None:
+        raise UsageError(f"--task says what a robot is to do, and section {plan.section!r} trains")
+    if not plan.trains and args.resume is not None:
+        raise UsageError(f"--resume is for training, and section {plan.section!r} does not train")
+    if args.resume not in (None, "auto") and not Path(args.resume).exists():
+        raise UsageError(
+            f"--resume {args.resume}: there is no such checkpoint",
+            next="--resume auto takes the newest one of the work dir",
+        )
+
+
+def _words(args: argparse.Namespace) -> list[str]:
+    """This command's arguments again, for its ranks."""
+    words = ["--config", args.config]
+    for name in ("section", "work_dir", "resume"):
+        value = getattr(args, name)
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", value]
+    for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
+        words += [word for value in values for word in (name, value)]
+    return [*words, "--log-format", args.log_format]
+
+
+def _execute(plan: Plan, args: argparse.Namespace) -> None:
+    """Build the section's runner and run it, reporting."""
+    from fluxvla_core.build import RunContext, build_runner_from_cfg
+    from fluxvla_core.cli.reporters import make_reporter
+    from fluxvla_core.config import freeze
+    from fluxvla_core.contracts.reporter import SilentReporter
+
+    context = RunContext(
+        config=freeze(plan.config.tree),
+        section=plan.section,
+        work_dir=plan.work_dir,
+        resume=args.resume,
+        origins=plan.config.origins,
+        config_file=plan.config.file,
+        task=args.task,
+        nproc=ranks.world_size() or args.nproc,
+    )
+    if ranks.rank() != 0:
+        _run_section(plan, build_runner_from_cfg, replace(context, reporter=SilentReporter()))
+        return
+    _leave_records(plan)
+    reporter = make_reporter(args.log_format)
+    try:
+        reporter.event("start", section=plan.section, work_dir=plan.work_dir)
+        context = replace(context, reporter=reporter)
+        result = _run_section(plan, build_runner_from_cfg, context)
+        if isinstance(result, Mapping):
+            for name, value in result.items():
+                if isinstance(value, (bool, int, float, str)):
+                    reporter.info(
+                        f"{name}: {value:.6g}" if isinstance(value, float) else f"{name}: {value}"
+                    )
+            reporter.event("result", section=plan.section, result=result)
+        reporter.artifact("work dir", plan.work_dir)
+    except Exception as error:
+        reporter.event("error", type=type(error).__name__, text=str(error))
+        raise
+    finally:
+        reporter.close()
+
+
+def _run_section(plan: Plan, build: Any, context: Any) -> Any:
+    """The call order of the specification: construct, ``run_setup``, ``run``."""
+    from fluxvla_core.contracts.check import is_train_runner
+
+    runner = build(context.config[plan.section], context)
+    if not is_train_runner(type(runner)):
+        runner.run_setup()
+        return runner.run()
+    from fluxvla_core.build import build_dataset_from_cfg
+
+    dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
+    runner.run_setup(n_train_examples=len(dataset))
+    return runner.run(dataset)
+
+
+def _leave_records(plan: Plan) -> None:
+    """``config.resolved.json`` and ``environment.json``.
+
+    A training's own stay at the top of its work dir; what is evaluated there later leaves its
+    own in a folder of its section.
+    """
+    from fluxvla_core.config.resolved import (
+        CONFIG_FILE,
+        ENVIRONMENT_FILE,
+        environment,
+        write_json,
+        write_resolved,
+    )
+
+    folder = plan.work_dir
+    if not plan.trains and (folder / CONFIG_FILE).exists():
+        folder = folder / plan.section
+    folder.mkdir(parents=True, exist_ok=True)
+    write_resolved(folder / CONFIG_FILE, plan.config)
+    write_json(folder / ENVIRONMENT_FILE, environment())
+
+
+def _outline(plan: Plan, log_format: str) -> str:
+    """What ``--dry-run`` prints."""
+    from fluxvla_core.cli.config_commands import listing, used
+
+    if log_format == "json":
+        outline = {
+            "section": plan.section,
+            "trains": plan.trains,
+            "work_dir": str(plan.work_dir),
+            "plugins": [
+                {"key": u.key, "type": u.found.title, "provided_by": u.found.origin}
+                for u in plan.uses
+            ],
+            "config": plan.config.tree,
+            "origins": dict(plan.config.origins),
+        }
+        return json.dumps(outline)
+    lines = [
+        f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
+        f"work dir: {plan.work_dir}",
+        "plugins:",
+        *used(plan.uses),
+        "config:",
+        *(f"  {line}" for line in listing(plan.config, origin=True)),
+    ]
+    return "\n".join(lines)
+
+
+class _Terminated(BaseException):
+    """SIGTERM. Not an ``Exception``: nobody's ``except`` may swallow it."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM unwinds the stack as Ctrl-C does, so that everything that was opened is closed.
+
+    Loops that know better (a robot's, a training's) take the signal over while they run.
+    """
+
+    def handle(number: int, frame: Any) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, handle)
+    try:
+        yield
+    except _Terminated:
+        raise RunFailed("stopped by SIGTERM") from None
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+@contextmanager
+def _disk_full(work_dir: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise RunFailed(
+            f"no space left on the disk while writing {error.filename or work_dir}",
+            next="make room and run the same command again, training with --resume auto",
+        ) from error

@@ -1,0 +1,37 @@
+"""The commands of ``fluxvla``: names, help lines and where each is, so that only one is imported.
+
+A command is a class with ``help``, ``add_arguments(parser)`` and ``run(args) -> exit code``
+(``contracts.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Entry:
+    """``target`` is ``module:Class``."""
+
+    target: str
+    help: str
+
+
+COMMANDS: Mapping[str, Entry] = {
+    "run": Entry("fluxvla_core.cli.run:Run", "run a section of a config: train, evaluate, deploy"),
+    "config show": Entry(
+        "fluxvla_core.cli.config_commands:Show", "print the config as it resolves"
+    ),
+    "config check": Entry(
+        "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
+    ),
+    "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
+    "plugins show": Entry(
+        "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
+    ),
+    "plugins doctor": Entry(
+        "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"
+    ),
+    "version": Entry("fluxvla_core.cli.version:Version", "print the versions"),
+}

@@ -1,0 +1,173 @@
+"""Pictures to mp4: one encoder an episode, then episodes joined without encoding again.
+
+Every episode begins with a key frame and no frame refers across its end, so an episode is the
+same bytes whichever process encoded it, and can be moved between files by copying packets.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.data.optional import libav
+from fluxvla_core.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True)
+class Codec:
+    """An encoder of libav: its name, the name of what it makes, and its options."""
+
+    encoder: str
+    stream: str
+    options: Mapping[str, str]
+
+
+CODECS: Mapping[str, Codec] = {
+    # A key frame every second frame makes random access cheap (LeRobot's choice too). No
+    # B-frames: packets stay in the order they are shown in.
+    "h264": Codec("libx264", "h264", {"preset": "veryfast", "crf": "20", "g": "2", "bf": "0"}),
+    "libsvtav1": Codec("libsvtav1", "av1", {"preset": "10", "crf": "30", "g": "2"}),
+}
+
+
+def find_codec(name: str) -> Codec:
+    """The codec called ``name``.
+
+    Raises:
+        ConfigError: no such name, or this build of libav lacks the encoder.
+    """
+    av = libav()
+
+    codec = CODECS.get(name)
+    if codec is None:
+        raise ConfigError(f"video_codec {name!r} is none of {', '.join(CODECS)}")
+    if codec.encoder not in av.codecs_available:
+        have = [n for n, c in CODECS.items() if c.encoder in av.codecs_available]
+        raise ConfigError(
+            f"video_codec {name!r}: this PyAV has no encoder {codec.encoder}",
+            next=f"use one of: {', '.join(have) or 'none is available; reinstall av'}",
+        )
+    return codec
+
+
+class EpisodeEncoder:
+    """Writes one episode of one camera to ``path``.
+
+    Args:
+        height, width: of every picture, even numbers (the colour planes have half the size).
+        fps: frames per second.
+
+    Raises:
+        DataError: odd sizes.
+    """
+
+    def __init__(self, path: Path, height: int, width: int, fps: float, codec: Codec) -> None:
+        av = libav()
+
+        if height % 2 or width % 2:
+            raise DataError(
+                f"{path.stem}: pictures of {height} x {width} cannot be stored as video",
+                cause="height and width must be even",
+                next="crop or pad them by one pixel before add_frame",
+            )
+        if codec.encoder == "libsvtav1":
+            os.environ.setdefault("SVT_LOG", "1")  # errors only; it prints a page a stream
+        self.frames = 0
+        self._container: Any = av.open(str(path), "w")
+        rate = Fraction(fps).limit_denominator(1001)
+        self._stream = self._container.add_stream(codec.encoder, rate=rate)
+        self._stream.height, self._stream.width = height, width
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = dict(codec.options)
+        # Threads would make the bytes depend on the machine; collectors run side by side anyway.
+        self._stream.codec_context.thread_count = 1
+
+    def add(self, image: npt.NDArray[np.uint8]) -> None:
+        """Encode the next picture, ``(height, width, 3)`` uint8 RGB."""
+        av = libav()
+
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file; without it the file cannot be read."""
+        if self._container is not None:
+            self._container.mux(self._stream.encode(None))
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Let go of the file as it is."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """``frames`` pictures of ``path`` from ``start`` seconds on, and how many bytes they take."""
+
+    path: Path
+    frames: int
+    size: int
+    start: float = 0.0
+
+
+def join_clips(clips: Sequence[Clip], out: Path, fps: float) -> None:
+    """Write the clips one after the other into ``out``, copying packets.
+
+    Raises:
+        DataError: a clip has fewer frames than it should.
+    """
+    av = libav()
+
+    step = Fraction(1) / Fraction(fps).limit_denominator(1001)
+    with (
+        av.open(str(clips[0].path)) as first,
+        # The index at the front lets a reader open the file without seeking to its end.
+        av.open(str(out), "w", options={"movflags": "+faststart"}) as target,
+    ):
+        stream = target.add_stream_from_template(first.streams.video[0])
+        done = 0
+        for clip in clips:
+            for count, packet in enumerate(_packets(clip, step)):
+                ticks = round((done + count) * step / packet.time_base)
+                packet.pts, packet.dts = ticks, ticks
+                packet.stream = stream
+                target.mux(packet)
+            done += clip.frames
+
+
+def _packets(clip: Clip, step: Fraction) -> Iterator[Any]:
+    av = libav()
+
+    found = 0
+    try:
+        with av.open(str(clip.path)) as source:
+            stream = source.streams.video[0]
+            first = round(Fraction(clip.start).limit_denominator(10**6) / stream.time_base)
+            if first:
+                source.seek(first, stream=stream)
+            for packet in source.demux(stream):
+                if packet.pts is None or packet.pts < first - step / stream.time_base / 2:
+                    continue
+                if found == clip.frames:
+                    break
+                if packet.pts != packet.dts or (found == 0 and not packet.is_keyframe):
+                    raise DataError(
+                        f"{clip.path}: the episode at {clip.start:.3f} s cannot be copied",
+                        cause="its frames refer across its ends; another program wrote it",
+                    )
+                found += 1
+                yield packet
+    except av.error.FFmpegError as error:
+        raise DataError(f"{clip.path}: cannot be read as video ({error.strerror})") from error
+    if found != clip.frames:
+        raise DataError(f"{clip.path}: {clip.frames} frames expected, {found} found")

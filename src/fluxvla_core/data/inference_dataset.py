@@ -1,0 +1,122 @@
+"""One observation of a robot as a model's batch of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.data.lerobot_v3 import camera_name
+from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.transforms.images import stack
+from fluxvla_core.transforms.normalize import load_statistics
+from fluxvla_core.transforms.pipeline import Pipeline
+
+Sample = dict[str, Any]
+
+_KEYS = ("images", "img_masks", "lang_tokens", "lang_masks", "states", "embodiment_ids")
+
+
+class PrivateInferenceDataset:
+    """Callable: an observation becomes what the model's ``predict_action`` takes.
+
+    The same transforms as in training, without those that only training wants, give ``images``
+    ``(1, 3N, H, W)``, ``img_masks`` ``(1, N)`` all True, ``lang_tokens`` and ``lang_masks``
+    ``(1, L)``, ``states`` ``(1, D)`` float32 and, if set, ``embodiment_ids`` ``(1,)`` int64:
+    torch tensors on the CPU.
+
+    Args:
+        img_keys: cameras, as in training; ``observation.images.top`` and ``top`` mean the same.
+        transforms: tables of ``fluxvla.transforms``, or callables.
+        norm_stats: the statistics, or the path of ``dataset_statistics.json``.
+        embodiment_id: the robot's number in a model of several.
+        statistic_name: which of the statistics.
+        processors: a checkpoint's ``processors`` folder.
+    """
+
+    def __init__(
+        self,
+        img_keys: Sequence[str],
+        transforms: Sequence[Mapping[str, Any] | Callable[..., Sample]],
+        norm_stats: Mapping[str, Any] | str | Path | None = None,
+        embodiment_id: int | None = None,
+        statistic_name: str = "private",
+        processors: str | Path | None = None,
+    ) -> None:
+        self.img_keys = tuple(img_keys)
+        self.pipeline = Pipeline(transforms, processors).inference()
+        self.embodiment_id = embodiment_id
+        self.statistic_name = statistic_name
+        self.stats = None
+        if norm_stats is not None:
+            statistics = load_statistics(norm_stats)
+            if statistic_name not in statistics:
+                raise ConfigError(
+                    f"PrivateInferenceDataset: the statistics have no {statistic_name!r}; "
+                    f"they have {', '.join(sorted(statistics))}"
+                )
+            self.stats = statistics[statistic_name]
+
+    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Prepare one observation.
+
+        Args:
+            observation: ``qpos`` ``(D,)``, ``task_description``, and pictures ``(H, W, 3)`` uint8
+                RGB, either under ``images`` or flat, by camera.
+
+        Raises:
+            DataError: a picture or the state is missing or of another type.
+            ConfigError: there is no instruction, or a transform does not fit.
+        """
+        import torch
+
+        sample: Sample = {
+            "images": [self._image(observation, key) for key in self.img_keys],
+            "img_masks": np.ones(len(self.img_keys), np.bool_),
+            "states": _state(observation),
+        }
+        if "task_description" in observation:
+            sample["task_description"] = observation["task_description"]
+        if self.stats is not None:
+            sample["stats"] = self.stats
+        if self.embodiment_id is not None:
+            sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
+        sample = self.pipeline(sample)
+        sample["images"] = stack(sample["images"])
+        arrays = {key: np.ascontiguousarray(sample[key]) for key in _KEYS if key in sample}
+        return {key: torch.from_numpy(array)[None] for key, array in arrays.items()}
+
+    def _image(self, observation: Mapping[str, Any], key: str) -> npt.NDArray[np.uint8]:
+        nested = observation.get("images")
+        images = nested if isinstance(nested, Mapping) else observation
+        for name in (key, camera_name(key)):
+            image = images.get(name)
+            if image is not None:
+                return _chw(name, image)
+        have = sorted(k for k, v in images.items() if np.ndim(v) == 3)
+        raise DataError(
+            f"the observation has no picture of camera {camera_name(key)!r}; "
+            f"it has {', '.join(have) or 'none'}"
+        )
+
+
+def _chw(name: str, image: Any) -> npt.NDArray[np.uint8]:
+    array = np.asarray(image)
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+        raise DataError(
+            f"camera {name!r} gives {array.dtype} of shape {array.shape}; "
+            "uint8 of shape (height, width, 3) is expected"
+        )
+    return array.transpose(2, 0, 1)
+
+
+def _state(observation: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+    if observation.get("qpos") is None:
+        raise DataError(f"the observation has no 'qpos'; it has {', '.join(sorted(observation))}")
+    state = np.array(observation["qpos"], np.float32)
+    if state.ndim != 1 or not np.isfinite(state).all():
+        raise DataError(f"'qpos' must be one row of finite numbers, got {state.tolist()}")
+    return state

@@ -1,0 +1,269 @@
+"""Training samples from LeRobot datasets of version 3.0."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.data.frames import Frames
+from fluxvla_core.data.recording import Recorded, load_recorded
+from fluxvla_core.data.rng import sample_rng
+from fluxvla_core.data.sampler import SampleKey
+from fluxvla_core.data.statistics import as_lists, column_statistics
+from fluxvla_core.data.windows import action_statistics, differences, window
+from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.transforms.images import split
+from fluxvla_core.transforms.pipeline import Pipeline
+
+Sample = dict[str, Any]
+
+
+class ParquetDataset:
+    """Frames of LeRobot v3.0 datasets as training samples: map style, random access.
+
+    A sample begins as ``images`` (a list of ``(3, H, W)`` uint8, one a camera), ``img_masks``
+    ``(N,)`` bool, ``states`` ``(D,)`` float32, ``actions`` ``(T, D)`` float32, ``action_masks``
+    ``(T,)`` float32 (0 beyond the episode's end, where the last action is repeated),
+    ``task_description``, ``timestamp`` (seconds in the episode), ``sample_ids`` int64, ``stats``
+    and ``info``, and ends as the transforms leave it; pictures that are still a list are stacked
+    to ``(3N, H, W)``. What transforms draw follows from (``seed``, epoch, index) alone.
+
+    Args:
+        data_root_path: one dataset's folder, or several, one after the other.
+        transforms: tables of ``fluxvla.transforms``, or callables.
+        img_keys: cameras, by feature (``observation.images.top``) or short name (``top``).
+        action_window_size: T.
+        action_key, state_key: features; ``action_key`` may be the state, see
+            ``window_start_idx``.
+        window_start_idx: frames from the present one to the window's first action.
+        use_delta: actions are differences to the frame before.
+        relative_actions: normalisation counts actions from the present state: True for every
+            joint that is no gripper, or one truth value a joint. The statistics then say so
+            (``relative``), which is what ``NormalizeStatesAndActions`` and its inverse go by.
+        per_step_statistics: the action's statistics are ``(T, D)``, one row a step.
+        statistic_name: the key of :attr:`statistics`.
+        embodiment_id: added to every sample as ``embodiment_ids``, int64, if given.
+        cache_frames: decode everything once and keep it in memory as uint8.
+        seed: of everything random in a sample.
+        episodes: the ones to use, for one dataset a list, for several one list each.
+        processors: a checkpoint's ``processors`` folder.
+
+    Raises:
+        DataError: a dataset is missing, empty, of another version, damaged, or does not have
+            what is asked for. Files are checked here, before training begins.
+        SpecMismatch: the datasets were recorded with different robots.
+        ConfigError: parameters that make no sense.
+    """
+
+    def __init__(
+        self,
+        data_root_path: str | Sequence[str],
+        transforms: Sequence[Mapping[str, Any] | Callable[..., Sample]],
+        img_keys: Sequence[str],
+        action_window_size: int = 9,
+        action_key: str = "action",
+        state_key: str = "observation.state",
+        window_start_idx: int = 0,
+        use_delta: bool = False,
+        relative_actions: bool | Sequence[bool] = False,
+        per_step_statistics: bool = False,
+        statistic_name: str = "private",
+        embodiment_id: int | None = None,
+        cache_frames: bool = False,
+        seed: int = 42,
+        episodes: Sequence[Any] | None = None,
+        processors: str | None = None,
+    ) -> None:
+        if action_window_size < 1 or window_start_idx < 0:
+            raise ConfigError(
+                f"ParquetDataset: action_window_size {action_window_size} must be at least 1, "
+                f"window_start_idx {window_start_idx} at least 0"
+            )
+        roots = _roots(data_root_path)
+        chosen = _episode_lists(episodes, len(roots))
+        self.pipeline = Pipeline(transforms, processors)
+        self.recordings = [
+            load_recorded(root, img_keys, state_key, action_key, window_start_idx, which)
+            for root, which in zip(roots, chosen, strict=True)
+        ]
+        _check_alike(self.recordings)
+        if use_delta:
+            self.recordings = [differences(r) for r in self.recordings]
+        self.action_window_size = action_window_size
+        self.window_start_idx = window_start_idx
+        self.use_delta = use_delta
+        self.per_step_statistics = per_step_statistics
+        self.statistic_name = statistic_name
+        self.embodiment_id = embodiment_id
+        self.seed = seed
+        self.relative = _relative(relative_actions, self)
+        self._frames = Frames(self.recordings, cache_frames)
+        self._ends = np.cumsum([len(r.rows) for r in self.recordings])
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    @property
+    def fps(self) -> float:
+        """Frames, and so actions of a window, per second."""
+        return self.recordings[0].meta.fps
+
+    @property
+    def embodiment(self) -> EmbodimentSpec | None:
+        """The robot, when a dataset says which; with ``use_delta`` its actions are deltas."""
+        for recorded in self.recordings:
+            if recorded.meta.embodiment is not None:
+                spec = recorded.meta.embodiment
+                return replace(spec, action_mode="delta") if self.use_delta else spec
+        return None
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The instructions of the frames in use."""
+        texts = [r.meta.tasks[i] for r in self.recordings for i in np.unique(r.task[r.rows])]
+        return tuple(dict.fromkeys(texts))
+
+    @cached_property
+    def statistics(self) -> dict[str, Any]:
+        """``{statistic_name: {"proprio": {...}, "action": {...}}}``: exact, of the frames in use.
+
+        Each has mean, std, min, max, q01, q10, q50, q90, q99 and count, as lists.
+        """
+        states = np.concatenate([r.states[r.chosen] for r in self.recordings])
+        action = action_statistics(
+            self.recordings,
+            self.action_window_size,
+            self.window_start_idx,
+            self.relative,
+            self.per_step_statistics,
+        )
+        proprio = as_lists(column_statistics(states))
+        return {self.statistic_name: {"proprio": proprio, "action": action}}
+
+    def prepare(self, reporter: Reporter | None = None) -> None:
+        """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""
+        self._frames.prepare(reporter or SilentReporter())
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.get_sample(index, 0)
+
+    def get_sample(self, index: int, epoch: int) -> Sample:
+        """Sample ``index`` as ``epoch`` sees it."""
+        return self.get_samples([SampleKey(epoch, index)])[0]
+
+    def get_samples(self, keys: Sequence[SampleKey]) -> list[Sample]:
+        """Several samples at once; their pictures are read in the order of the files."""
+        self.prepare()
+        places = [self._place(key.index) for key in keys]
+        pictures = self._frames.read(places)
+        return [
+            self._finish(self._raw(key.index, place, images), key)
+            for key, place, images in zip(keys, places, pictures, strict=True)
+        ]
+
+    def _place(self, index: int) -> tuple[int, int]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        part = int(np.searchsorted(self._ends, index, side="right"))
+        before = int(self._ends[part - 1]) if part else 0
+        return part, int(self.recordings[part].rows[index - before])
+
+    def _raw(
+        self, index: int, place: tuple[int, int], images: list[npt.NDArray[np.uint8]]
+    ) -> Sample:
+        recorded, row = self.recordings[place[0]], place[1]
+        first, end = row + self.window_start_idx, int(recorded.end[row])
+        actions, masks = window(recorded.actions, first, end, self.action_window_size)
+        sample: Sample = {
+            "images": images,
+            "img_masks": np.ones(len(images), np.bool_),
+            "states": recorded.states[row].copy(),
+            "actions": actions,
+            "action_masks": masks,
+            "task_description": recorded.meta.tasks[recorded.task[row]],
+            "timestamp": np.asarray(recorded.timestamp[row], np.float32),
+            "sample_ids": np.asarray(index, np.int64),
+            "stats": self.statistics[self.statistic_name],
+            "info": {
+                "dataset": str(recorded.meta.root),
+                "episode_index": int(recorded.episode[row]),
+                "frame_index": row - int(recorded.start[row]),
+            },
+        }
+        if self.embodiment_id is not None:
+            sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
+        return sample
+
+    def _finish(self, sample: Sample, key: SampleKey) -> Sample:
+        sample = self.pipeline(sample, sample_rng(self.seed, key.epoch, key.index))
+        images = sample.get("images")
+        if isinstance(images, list) and len({image.shape for image in images}) == 1:
+            sample["images"] = np.concatenate(split(images))
+        return sample
+
+
+def _roots(given: str | Path | Sequence[str | Path]) -> list[Path]:
+    paths = [given] if isinstance(given, str | Path) else list(given)
+    if not paths:
+        raise ConfigError("ParquetDataset: data_root_path names no dataset")
+    return [Path(path).expanduser() for path in paths]
+
+
+def _episode_lists(episodes: Sequence[Any] | None, count: int) -> list[Sequence[int] | None]:
+    if episodes is None:
+        return [None] * count
+    if count == 1 and all(isinstance(e, int) for e in episodes):
+        return [episodes]
+    if len(episodes) != count or any(isinstance(e, int) for e in episodes):
+        raise ConfigError(
+            f"ParquetDataset: episodes must be one list for each of {count} datasets, "
+            f"got {len(episodes)} entries"
+        )
+    return list(episodes)
+
+
+def _check_alike(recordings: Sequence[Recorded]) -> None:
+    first = recordings[0]
+    for other in recordings[1:]:
+        one, two = first.meta, other.meta
+        if one.embodiment is not None and two.embodiment is not None:
+            check_match(one.embodiment, two.embodiment, str(one.root), str(two.root), ())
+        for what, left, right in (
+            ("fps", one.fps, two.fps),
+            ("width of the state", first.states.shape[1], other.states.shape[1]),
+            ("width of the action", first.actions.shape[1], other.actions.shape[1]),
+        ):
+            if left != right:
+                raise DataError(
+                    f"{one.root} and {two.root} do not go together: {what}: {left} / {right}"
+                )
+
+
+def _relative(
+    wanted: bool | Sequence[bool], dataset: ParquetDataset
+) -> npt.NDArray[np.bool_] | None:
+    """Which dimensions are counted from the state, ``(D,)``; None for none."""
+    if wanted is False:
+        return None
+    recorded = dataset.recordings[0]
+    width = recorded.actions.shape[1]
+    if recorded.states.shape[1] < width:
+        raise ConfigError("ParquetDataset: relative_actions need a state for every action")
+    spec = dataset.embodiment
+    if wanted is True:
+        kinds = [j.kind for j in spec.joints] if spec is not None else ["revolute"] * width
+        wanted = [kind != "gripper" for kind in kinds]
+    mask = np.asarray(wanted, np.bool_)
+    if mask.shape != (width,):
+        raise ConfigError(
+            f"ParquetDataset: relative_actions has {mask.size} entries, actions have {width}"
+        )
+    return mask

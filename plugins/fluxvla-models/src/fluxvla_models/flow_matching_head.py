@@ -48,7 +48,7 @@ class FlowMatchingHead(nn.Module):
         self,
         horizon: int,
         action_dim: int,
-        context_dim: int,
+        context_dim: int | None = None,
         width: int = 384,
         blocks: int = 3,
         expand: int = 2,
@@ -56,6 +56,8 @@ class FlowMatchingHead(nn.Module):
         time_features: int = 64,
     ) -> None:
         super().__init__()
+        if context_dim is None:
+            raise ValueError("FlowMatchingHead needs context_dim, the width of the projector's vector")
         self.horizon, self.action_dim = horizon, action_dim
         self.num_steps, self.time_features = num_steps, time_features
         self.time = nn.Sequential(

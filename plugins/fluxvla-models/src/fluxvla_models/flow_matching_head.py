@@ -57,7 +57,9 @@ class FlowMatchingHead(nn.Module):
     ) -> None:
         super().__init__()
         if context_dim is None:
-            raise ValueError("FlowMatchingHead needs context_dim, the width of the projector's vector")
+            raise ValueError(
+                "FlowMatchingHead needs context_dim, the width of the projector's vector"
+            )
         self.horizon, self.action_dim = horizon, action_dim
         self.num_steps, self.time_features = num_steps, time_features
         self.time = nn.Sequential(

@@ -1,0 +1,100 @@
+"""What starts in a blink: nothing heavy is imported before it is needed."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+CORE = Path(__file__).parents[2] / "src" / "fluxvla_core"
+HEAVY = {
+    *("torch", "numpy", "cv2", "pyarrow", "av", "rich", "transformers", "mujoco", "jinja2"),
+    *("rclpy", "asyncio", "multiprocessing", "concurrent", "http", "unittest"),
+}
+# Rooms that are about a heavy package may import it at the top of a module.
+AT_HOME = {
+    "torch": {"train", "data", "infer", "testing"},
+    "numpy": {
+        *("safety", "control", "transforms", "data", "infer", "evaluate", "record", "testing"),
+        *("train", "metrics", "processors", "ros2"),
+    },
+    "av": {"data", "record"},
+    "pyarrow": {"data"},
+    "cv2": {"transforms", "data"},
+    "rclpy": {"ros2"},
+}
+
+
+def modules_after(code: str) -> set[str]:
+    program = f"{code}\nimport sys; print(*{{m.split('.')[0] for m in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--help"], ["--version"], ["plugins", "list"], ["run", "--help"], ["config", "--help"]],
+    ids=" ".join,
+)
+def test_a_command_that_only_looks_imports_nothing_heavy(words: list[str]) -> None:
+    loaded = modules_after(f"from fluxvla_core.cli.main import main\nassert main({words}) == 0")
+    assert loaded & HEAVY == set()
+
+
+def test_checking_a_config_imports_no_torch(tmp_path: Path) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text('[inference]\ntype = "AlohaInferenceRunner"\n')
+    code = (
+        "from fluxvla_core.cli.main import main\n"
+        f"main(['config', 'check', '--config', {str(config)!r}])"
+    )
+    assert modules_after(code) & {"torch", "transformers", "mujoco", "rclpy"} == set()
+
+
+def test_importing_the_package_runs_nothing() -> None:
+    assert modules_after("import fluxvla_core") & HEAVY == set()
+    assert modules_after("from fluxvla_core import RUNNERS") & HEAVY == set()
+
+
+def top_level_imports(path: Path) -> Iterator[str]:
+    """Names of the packages that importing the module imports at once."""
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+            continue
+        if isinstance(node, ast.Import):
+            yield from (name.name.split(".")[0] for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield (node.module or "").split(".")[0]
+        waiting += ast.iter_child_nodes(node)
+
+
+@pytest.mark.parametrize("package", ["torch", "numpy", "av", "pyarrow", "cv2", "rclpy", "rich"])
+def test_heavy_packages_stay_in_the_rooms_that_are_about_them(package: str) -> None:
+    home = AT_HOME.get(package, set())
+    elsewhere = [
+        str(path.relative_to(CORE))
+        for path in sorted(CORE.rglob("*.py"))
+        if path.relative_to(CORE).parts[0] not in home and package in top_level_imports(path)
+    ]
+    # rich's reporter is a module that is imported when a person is to see progress.
+    assert [p for p in elsewhere if p != "cli/rich_reporter.py"] == []
+
+
+def test_top_level_imports_are_told_from_others(tmp_path: Path) -> None:
+    module = tmp_path / "m.py"
+    module.write_text(
+        "import a.b\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import c\n"
+        "try:\n    import d\nexcept ImportError:\n    d = None\n"
+        "def f():\n    import e\nclass G:\n    from h.i import j\nfrom . import k\n"
+    )
+    assert set(top_level_imports(module)) == {"a", "typing", "d", "h"}

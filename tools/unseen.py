@@ -1,0 +1,174 @@
+"""A plugin that the repository has never seen, and broken ones, made from text when asked for.
+
+They stand for what a third party publishes: a wheel with entry points, installed beside the core.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from tools.envs import Env
+
+PYPROJECT = """
+[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+[project]
+name = "{name}"
+version = "4.2"
+requires-python = ">=3.10"
+dependencies = ["fluxvla-core>=0.1,<0.2"]
+[project.entry-points."fluxvla.operators"]
+{operator} = "{package}.robot:{operator}"
+[project.entry-points."fluxvla.runners"]
+{runner} = "{package}.robot:{runner}"
+[tool.hatch.build.targets.wheel]
+packages = ["{package}"]
+"""
+
+ROBOT = '''
+"""An arm with one joint that lives in memory, and an evaluation that drives it."""
+
+import json
+
+import numpy as np
+
+from fluxvla_core import EmbodimentSpec, Frame, Joint, build_operator_from_cfg
+
+
+class AcmeOperator:
+    api = "1.0"
+
+    def __init__(self, start: float = 0.0):
+        self.embodiment = EmbodimentSpec(
+            name="acme",
+            joints=(Joint("elbow", "rad", -2.0, 2.0, velocity=1.0, acceleration=10.0),),
+            rate_hz=10.0,
+        )
+        self.position = start
+        self.steps = 0
+
+    def connect(self):
+        self.steps = 0
+
+    def get_frame(self):
+        stamps = {"state": self.steps / 10.0}
+        return Frame(state=np.array([self.position]), images={}, stamps=stamps)
+
+    def send_action(self, action):
+        self.position = float(action[0])
+        self.steps += 1
+
+    def stop(self):
+        return
+
+    def close(self):
+        return
+
+
+class AcmeEvalRunner:
+    api = "1.0"
+
+    def __init__(self, operator: dict, episodes: int = 3, goal: float = 1.0, context=None):
+        self.operator = build_operator_from_cfg(operator)
+        self.episodes = episodes
+        self.goal = goal
+        self.work_dir = context.work_dir
+
+    def run_setup(self):
+        self.operator.connect()
+
+    def run(self):
+        for _ in range(self.episodes):
+            self.operator.send_action(np.array([self.goal]))
+        reached = self.operator.get_frame().state[0] == self.goal
+        result = {"episodes": self.episodes, "steps": self.operator.steps, "reached": bool(reached)}
+        (self.work_dir / "acme.json").write_text(json.dumps(result))
+        self.operator.close()
+        return result
+'''
+
+CONFIG = """
+[eval]
+type = "AcmeEvalRunner"
+episodes = 5
+goal = 0.5
+[eval.operator]
+type = "AcmeOperator"
+start = -1.0
+"""
+
+BROKEN = '''
+"""A robot whose vendor package is not installed."""
+
+import acme_vendor_sdk_that_is_not_there
+
+
+class BrokenOperator:
+    sdk = acme_vendor_sdk_that_is_not_there
+
+
+BrokenRunner = 7
+'''
+
+
+def write_project(folder: Path, name: str, operator: str, runner: str, module: str) -> Path:
+    """A source tree of a plugin distribution; returns it."""
+    package = name.replace("-", "_")
+    source = folder / name / package
+    source.mkdir(parents=True)
+    text = PYPROJECT.format(name=name, package=package, operator=operator, runner=runner)
+    (folder / name / "pyproject.toml").write_text(text, encoding="utf-8")
+    (source / "__init__.py").write_text("", encoding="utf-8")
+    (source / "robot.py").write_text(module, encoding="utf-8")
+    return folder / name
+
+
+def good(folder: Path) -> Path:
+    """``fluxvla-acme``: an operator and an evaluation runner that work, without torch."""
+    return write_project(folder, "fluxvla-acme", "AcmeOperator", "AcmeEvalRunner", ROBOT)
+
+
+def failing(folder: Path) -> Path:
+    """``fluxvla-broken``: its module does not import, and its runner would be no class."""
+    return write_project(folder, "fluxvla-broken", "BrokenOperator", "BrokenRunner", BROKEN)
+
+
+def mistyped(folder: Path) -> Path:
+    """``fluxvla-typo``: imports, but its entry points name what is no class, or is not there."""
+    module = "AcmeTypo = 7\n"
+    return write_project(folder, "fluxvla-typo", "NobodyOperator", "AcmeTypo", module)
+
+
+def corrupt(env: Env) -> Path:
+    """The metadata of an installation whose ``entry_points.txt`` cannot be parsed; returns it."""
+    code = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = Path(env.run("python", "-c", code, quiet=True, echo=False).strip())
+    info = site / "fluxvla_corrupt-1.0.dist-info"
+    info.mkdir()
+    metadata = "Metadata-Version: 2.1\nName: fluxvla-corrupt\nVersion: 1.0\n"
+    (info / "METADATA").write_text(metadata, encoding="utf-8")
+    text = "[fluxvla.operators]\nthis line has no equals sign\n"
+    (info / "entry_points.txt").write_text(text, encoding="utf-8")
+    return info
+
+
+def wheel(project: Path, folder: Path, builder: Env | None = None) -> Path:
+    """Build the wheel of a source tree with the build backend of ``builder`` (this Python's)."""
+    env = builder or Env(Path(sys.prefix))
+    words = ["-q", "--no-deps", "--no-build-isolation", "-w", str(folder), str(project)]
+    env.run("python", "-m", "pip", "wheel", *words, quiet=True, echo=False)
+    (made,) = folder.glob(f"{project.name.replace('-', '_')}-*.whl")
+    return made
+
+
+def install(env: Env, *wheels: Path) -> None:
+    """Install wheels into ``env`` without looking anywhere for what they depend on."""
+    words = ["-q", "--no-deps", "--no-index", "--disable-pip-version-check", *map(str, wheels)]
+    env.run("python", "-m", "pip", "install", *words, quiet=True, echo=False)
+
+
+def remove(env: Env, *names: str) -> None:
+    """Uninstall distributions again."""
+    env.run("python", "-m", "pip", "uninstall", "-q", "-y", *names, quiet=True, echo=False)

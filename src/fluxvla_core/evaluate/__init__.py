@@ -1,0 +1,1 @@
+"""Evaluation: episodes in worker processes, results that do not depend on how many there were."""

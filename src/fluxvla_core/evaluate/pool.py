@@ -1,0 +1,292 @@
+"""Jobs for worker processes that may crash.
+
+A worker is built once per process by a factory and then called with one job after another. A
+process that dies or hangs is replaced. The job that it had, or one that raised, is tried once more;
+if that fails too it is an error of that job, and the others go on. What cannot get better by
+trying again (a ``FluxError`` that means bad input) ends the run at once.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
+
+Work = Callable[[Any], Any]
+Factory = Callable[[], Work]
+
+ONE_THREAD: Mapping[str, str] = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "LP_NUM_THREADS": "1",
+}
+"""Environment of workers: each is one of several, and sums must not depend on a thread count.
+``LP_NUM_THREADS`` is the software renderer's."""
+
+_GRACE_S = 5.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one job.
+
+    Args:
+        index: the job's place in the sequence that was given.
+        result: what the worker returned; None after an error.
+        error: why there is no result, with the worker's traceback if it raised.
+        attempts: how many times it was tried.
+    """
+
+    index: int
+    result: Any
+    error: str | None
+    attempts: int
+
+
+def run_jobs(
+    factory: Factory,
+    jobs: Sequence[Any],
+    workers: int,
+    retries: int = 1,
+    timeout_s: float | None = None,
+) -> Generator[Outcome, None, None]:
+    """Outcomes of ``jobs`` in the order in which they end.
+
+    Closing the iterator, or an exception in the loop over it, ends the workers.
+
+    Args:
+        factory: makes the worker, in its process; it, the jobs and the results are pickled.
+        jobs: given out in this order.
+        workers: processes; never more than there are jobs.
+        retries: how often a job that failed is tried again.
+        timeout_s: how long one attempt may take before its process is ended.
+
+    Raises:
+        RunFailed: a worker cannot be started.
+        FluxError: one that means bad input, from the factory or a job, as it was raised.
+        ValueError: ``workers`` is below 1.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, got {workers}")
+    pool = _Pool(factory, jobs, retries, timeout_s)
+    try:
+        yield from pool.run(min(workers, len(jobs)))
+    finally:
+        pool.stop()
+
+
+class _Worker:
+    """One process and the job that it has."""
+
+    def __init__(self, factory: Factory) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        arguments = (theirs, factory, _plugin_files())
+        self.process = context.Process(target=_serve, args=arguments, daemon=True)
+        with _environment(ONE_THREAD):
+            self.process.start()
+        theirs.close()
+        self.ready = False
+        self.job: int | None = None
+        self.deadline: float | None = None
+
+    def give(self, index: int, job: Any, timeout_s: float | None) -> None:
+        self.job = index
+        self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        with suppress(OSError):  # it died since; its end of the pipe tells so when it is read
+            self.connection.send(job)
+
+    def end(self, grace_s: float = 0.0) -> None:
+        with suppress(OSError):
+            self.connection.close()
+        self.process.join(grace_s)
+        if self.process.is_alive():
+            self.process.terminate()
+            self.process.join(_GRACE_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+
+
+class _Pool:
+    def __init__(
+        self, factory: Factory, jobs: Sequence[Any], retries: int, timeout_s: float | None
+    ) -> None:
+        self._factory = factory
+        self._jobs = jobs
+        self._retries = retries
+        self._timeout_s = timeout_s
+        self._waiting = deque(range(len(jobs)))
+        self._attempts = [0] * len(jobs)
+        self._workers: list[_Worker] = []
+        self._failed_starts = 0
+
+    def run(self, workers: int) -> Iterator[Outcome]:
+        self._workers = [_Worker(self._factory) for _ in range(workers)]
+        left = len(self._jobs)
+        while left:
+            for outcome in self._wait():
+                left -= 1
+                yield outcome
+
+    def stop(self) -> None:
+        # Idle workers leave by themselves when their pipe closes; busy ones are ended.
+        for worker in self._workers:
+            with suppress(OSError):
+                worker.connection.close()
+        for worker in self._workers:
+            worker.end(0.0 if worker.job is not None else _GRACE_S)
+        self._workers = []
+
+    def _wait(self) -> list[Outcome]:
+        readable = wait([w.connection for w in self._workers], timeout=self._patience())
+        ended = []
+        for worker in list(self._workers):
+            if worker.connection in readable:
+                outcome = self._receive(worker)
+            elif worker.deadline is not None and time.monotonic() > worker.deadline:
+                outcome = self._lost(worker, f"took longer than {self._timeout_s:g} s")
+            else:
+                continue
+            if outcome is not None:
+                ended.append(outcome)
+        return ended
+
+    def _patience(self) -> float | None:
+        deadlines = [w.deadline for w in self._workers if w.deadline is not None]
+        return max(0.0, min(deadlines) - time.monotonic()) + 0.01 if deadlines else None
+
+    def _receive(self, worker: _Worker) -> Outcome | None:
+        try:
+            kind, value = worker.connection.recv()
+        except (EOFError, OSError):
+            worker.process.join(_GRACE_S)
+            return self._lost(worker, f"its process died ({_cause(worker.process.exitcode)})")
+        if kind == "refused":
+            raise value
+        index, worker.job, worker.deadline = worker.job, None, None
+        if kind == "unusable":
+            raise RunFailed(f"a worker process could not be set up:\n{value}")
+        worker.ready = True
+        self._next(worker)
+        if index is None:
+            return None
+        if kind == "raised":
+            return self._again(index, str(value))
+        return Outcome(index, value, None, self._attempts[index])
+
+    def _next(self, worker: _Worker) -> None:
+        if self._waiting:
+            index = self._waiting.popleft()
+            self._attempts[index] += 1
+            worker.give(index, self._jobs[index], self._timeout_s)
+
+    def _lost(self, worker: _Worker, why: str) -> Outcome | None:
+        """Replace a worker that is gone, or must go, and settle the job that it had."""
+        index, ready = worker.job, worker.ready
+        self._workers.remove(worker)
+        worker.end()
+        if not ready:
+            self._failed_starts += 1
+            if self._failed_starts > len(self._workers) + 1:
+                raise RunFailed(
+                    f"worker processes die before they have begun: {why}",
+                    cause="out of memory, or a library that crashes while it is loaded",
+                    next="try again with workers=1",
+                )
+        self._workers.append(_Worker(self._factory))
+        return None if index is None else self._again(index, why)
+
+    def _again(self, index: int, why: str) -> Outcome | None:
+        if self._attempts[index] > self._retries:
+            return Outcome(index, None, why, self._attempts[index])
+        self._waiting.appendleft(index)
+        for worker in self._workers:
+            if worker.ready and worker.job is None:
+                self._next(worker)
+                break
+        return None
+
+
+def _cause(exitcode: int | None) -> str:
+    if exitcode is None:
+        return "no exit code"
+    if exitcode < 0:
+        with suppress(ValueError):
+            return signal.Signals(-exitcode).name
+    return f"exit code {exitcode}"
+
+
+@contextmanager
+def _environment(extra: Mapping[str, str]) -> Iterator[None]:
+    """``extra`` in this process's environment while a child is started, for it to inherit."""
+    before = {name: os.environ.get(name) for name in extra}
+    os.environ.update(extra)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _plugin_files() -> list[tuple[str, str]]:
+    """Files given as ``--plugin``: what they registered must be there in the workers too."""
+    found = [(n, m) for n, m in sys.modules.items() if n.startswith("fluxvla_plugin_")]
+    return [(name, str(module.__file__)) for name, module in found if module.__file__]
+
+
+def _serve(connection: Connection, factory: Factory, plugins: list[tuple[str, str]]) -> None:
+    """A worker process's life: build the worker, answer jobs until the pipe closes."""
+    # Ctrl-C reaches the whole group; the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
+        try:
+            for name, file in plugins:
+                _load(name, file)
+            work = factory()
+        except FluxError as error:
+            connection.send(("refused", error))
+            return
+        except Exception:  # noqa: BLE001 - whatever it is belongs to the parent
+            connection.send(("unusable", traceback.format_exc()))
+            return
+        connection.send(("ready", None))
+        while True:
+            connection.send(_answer(work, connection.recv()))
+
+
+def _answer(work: Work, job: Any) -> tuple[str, Any]:
+    try:
+        return "done", work(job)
+    except FluxError as error:
+        if error.exit_code == EXIT_BAD_INPUT:
+            return "refused", error
+        return "raised", str(error)
+    except Exception:  # noqa: BLE001 - an episode's crash is counted, not raised
+        return "raised", traceback.format_exc()
+
+
+def _load(name: str, file: str) -> None:
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise RunFailed(f"{file} cannot be loaded in a worker process")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)

@@ -1,0 +1,1 @@
+"""Data-parallel training with a whole model on every process."""

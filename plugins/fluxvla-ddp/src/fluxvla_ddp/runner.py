@@ -1,0 +1,45 @@
+"""``DDPTrainRunner``: a whole model on every process, gradients averaged between them."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from fluxvla_core.train.base_runner import BaseTrainRunner
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+class DDPTrainRunner(BaseTrainRunner):
+    """Data-parallel training; on one process it is ``BaseTrainRunner``.
+
+    Args:
+        find_unused_parameters: for models whose forward pass leaves out trainable parameters;
+            costs a walk over the graph in every step.
+        kwargs: the settings of ``BaseTrainRunner``.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(self, *, find_unused_parameters: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.find_unused_parameters = find_unused_parameters
+
+    def _wrap_model(self, vla: nn.Module) -> nn.Module:
+        """Move the model to its device and keep its copies equal from there on."""
+        from torch.nn.parallel import DistributedDataParallel
+
+        device = self.world.device
+        vla = vla.to(device)
+        if self.world.size == 1:
+            return vla
+        return DistributedDataParallel(
+            vla,
+            device_ids=[device.index] if device.type == "cuda" else None,
+            find_unused_parameters=self.find_unused_parameters,
+            gradient_as_bucket_view=True,
+        )
+
+    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
+        return nullcontext() if last or self.world.size == 1 else self.vla.no_sync()

@@ -1,0 +1,185 @@
+"""Where numbers of a run go. A tracker may fail; the run that it watches may not."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import ConfigError
+
+Values = Mapping[str, float]
+
+
+class Tracker(Protocol):
+    """Receives the values of each step, in order."""
+
+    def log(self, step: int, values: Values) -> None:
+        """Take the values of optimizer step ``step``."""
+
+    def sync(self) -> None:
+        """Make everything so far survive a crash of the machine."""
+
+    def close(self) -> None:
+        """Finish; nothing follows."""
+
+
+class JsonlTracker:
+    """One JSON object a line in ``<run_dir>/metrics.jsonl``.
+
+    A run that resumes after ``step`` drops the lines of later steps, so that the file is that of
+    a run that was never interrupted.
+    """
+
+    def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
+        path = run_dir / "metrics.jsonl"
+        kept = [line for line in _lines(path) if _step(line) <= step]
+        aside = path.with_name(f".{path.name}.{os.getpid()}")
+        run_dir.mkdir(parents=True, exist_ok=True)
+        aside.write_text("".join(kept), encoding="utf-8")
+        os.replace(aside, path)
+        self._file = path.open("a", encoding="utf-8")
+
+    def log(self, step: int, values: Values) -> None:
+        self._file.write(json.dumps({"step": step, **values}) + "\n")
+        self._file.flush()
+
+    def sync(self) -> None:
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class TensorboardTracker:
+    """TensorBoard event files in ``<run_dir>/tensorboard`` (or ``TENSORBOARD_LOG_PATH``)."""
+
+    def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        place = os.environ.get("TENSORBOARD_LOG_PATH") or str(run_dir / "tensorboard")
+        # Steps that a resumed run does again replace what was shown for them.
+        self._writer: Any = SummaryWriter(place, purge_step=step + 1 if step else None)
+
+    def log(self, step: int, values: Values) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(f"train/{name}", value, step)
+
+    def sync(self) -> None:
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class WandbTracker:
+    """Weights & Biases; ``WANDB_PROJECT``, ``WANDB_ENTITY`` and ``WANDB_MODE`` as it reads them."""
+
+    def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
+        import wandb
+
+        self._run: Any = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "fluxvla"),
+            name=run_id,
+            id=run_id,
+            resume="allow",
+            dir=str(run_dir),
+            config=dict(hparams),
+        )
+
+    def log(self, step: int, values: Values) -> None:
+        self._run.log({f"train/{name}": value for name, value in values.items()}, step=step)
+
+    def sync(self) -> None:
+        return
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+_KINDS: Mapping[str, tuple[Callable[..., Tracker], str | None]] = {
+    "jsonl": (JsonlTracker, None),
+    "tensorboard": (TensorboardTracker, "tensorboard"),
+    "wandb": (WandbTracker, "wandb"),
+}
+
+
+def check_trackers(names: tuple[str, ...]) -> None:
+    """Refuse, before training, trackers that do not exist or whose package is not installed.
+
+    Raises:
+        ConfigError: names the package.
+    """
+    import difflib
+    import importlib.util
+
+    for name in names:
+        if name not in _KINDS:
+            near = difflib.get_close_matches(name, _KINDS, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(_KINDS)}"
+            raise ConfigError(f"active_trackers has no {name!r}; {hint}")
+        package = _KINDS[name][1]
+        if package is not None and importlib.util.find_spec(package) is None:
+            raise ConfigError(
+                f"tracker {name!r} needs the package {package}, which is not installed",
+                next=f"pip install {package}",
+            )
+
+
+class Guarded:
+    """Passes calls on to a tracker until one fails; that is said once, and the run goes on."""
+
+    def __init__(self, name: str, reporter: Reporter, make: Callable[[], Tracker]) -> None:
+        self._name, self._reporter = name, reporter
+        self._tracker: Tracker | None = None
+        self._guard(lambda: setattr(self, "_tracker", make()))
+
+    def log(self, step: int, values: Values) -> None:
+        if self._tracker is not None:
+            self._guard(partial(self._tracker.log, step, values))
+
+    def sync(self) -> None:
+        if self._tracker is not None:
+            self._guard(self._tracker.sync)
+
+    def close(self) -> None:
+        if self._tracker is not None:
+            self._guard(self._tracker.close)
+        self._tracker = None
+
+    def _guard(self, call: Callable[[], object]) -> None:
+        try:
+            call()
+        except Exception as error:  # noqa: BLE001 - watching a run must not end it
+            self._tracker = None
+            self._reporter.warn(
+                f"tracker {self._name} failed and is left out for the rest of the run: "
+                f"{type(error).__name__}: {error}"
+            )
+
+
+def open_tracker(
+    name: str, reporter: Reporter, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]
+) -> Guarded:
+    """The tracker ``name``, guarded; ``step`` steps of the run have been done before."""
+    make = _KINDS[name][0]
+    return Guarded(name, reporter, lambda: make(run_dir, run_id, step, hparams))
+
+
+def _lines(path: Path) -> list[str]:
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8")
+    # A killed process may leave half a line at the end.
+    return [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _step(line: str) -> float:
+    try:
+        return float(json.loads(line)["step"])
+    except (KeyError, TypeError, ValueError):
+        return float("inf")

@@ -1,0 +1,283 @@
+"""A model, a dataset and a launcher small enough to prove a training strategy with.
+
+A new train runner is right when ``run_ranks(2, train, settings)`` killed at any moment and run
+again with ``resume="auto"`` leaves the folder of a run that was never killed: ``differences`` of
+the two must be empty. The runners of FluxVLA are tested with exactly this.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.rng import sample_rng
+from fluxvla_core.metrics.vla_metric import WALL_CLOCK
+from fluxvla_core.plugins.registry import RUNNERS, VLAS
+from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.train.base_runner import BaseTrainRunner
+from fluxvla_core.train.checkpoint import folders
+from fluxvla_core.train.disk import Disk
+
+STATES, HORIZON, ACTIONS = 6, 2, 3
+KEYS = ("states", "actions", "noise", "sample_ids")
+PRELOAD = ("fluxvla_core.testing.training", "fluxvla_core.train.loop", "torch.distributed.fsdp")
+
+
+class Block(nn.Module):
+    """Residual layer with dropout, so that a lost random state shows in the weights."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.linear = nn.Linear(width, width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(B, width)`` -> ``(B, width)``."""
+        out: Tensor = x + self.dropout(torch.relu(self.linear(self.norm(x))))
+        return out
+
+
+@VLAS.register_module()
+class TinyVLA(nn.Module):
+    """A frozen encoder, two blocks, a head, and a buffer that training changes."""
+
+    def __init__(self, width: int = 8, dropout: float = 0.1, bad_sample: int = -1) -> None:
+        super().__init__()
+        self.encoder = nn.Linear(STATES, width).requires_grad_(False)
+        self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(2))
+        self.head = nn.Linear(width, HORIZON * ACTIONS)
+        self.bad_sample = bad_sample
+        self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
+
+    def forward(
+        self, states: Tensor, actions: Tensor, noise: Tensor, sample_ids: Tensor
+    ) -> dict[str, Tensor]:
+        """``(B, 6)``, ``(B, 2, 3)``, ``(B, 2, 3)``, ``(B,)`` -> ``{"loss": scalar}``."""
+        x = self.encoder(states)
+        for block in self.blocks:
+            x = block(x)
+        found = self.head(x).unflatten(1, (HORIZON, ACTIONS))
+        loss = (found - actions - 0.1 * noise).square().mean()
+        if self.bad_sample >= 0:
+            loss = loss + torch.where(sample_ids == self.bad_sample, torch.nan, 0.0).sum()
+        self.batches += 1
+        return {"loss": loss}
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """``(T, D)`` of a chunk."""
+        return HORIZON, ACTIONS
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """The blocks."""
+        return list(self.blocks)
+
+
+@RUNNERS.register_module()
+class OneProcessRunner(BaseTrainRunner):
+    """The base class as it is."""
+
+
+class TinyDataset:
+    """``length`` samples whose noise follows from (seed, epoch, index)."""
+
+    fps = 10.0
+    statistics = {"private": {"action": {"mean": [0.0] * ACTIONS, "std": [1.0] * ACTIONS}}}
+    embodiment = EmbodimentSpec(
+        "tiny", tuple(Joint(f"j{i}", "rad", -1.0, 1.0, 1.0, 1.0) for i in range(ACTIONS)), (), 10.0
+    )
+
+    def __init__(self, length: int = 37) -> None:
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def get_sample(self, index: int, epoch: int) -> dict[str, Any]:
+        """One sample; keys are :data:`KEYS`."""
+        fixed = np.random.default_rng(index)
+        noise = sample_rng(42, epoch, index).standard_normal((HORIZON, ACTIONS))
+        return {
+            "states": fixed.standard_normal(STATES).astype(np.float32),
+            "actions": fixed.standard_normal((HORIZON, ACTIONS)).astype(np.float32),
+            "noise": noise.astype(np.float32),
+            "sample_ids": np.int64(index),
+        }
+
+
+def tiny_config(runner: Mapping[str, Any], batch: int = 4, **model: Any) -> dict[str, Any]:
+    """A whole config around ``runner``, with ``batch`` samples per process."""
+    collator = {"type": "DictCollator", "keys": list(KEYS)}
+    return {
+        "model": {"type": "TinyVLA", **model},
+        "train_dataloader": {"per_device_batch_size": batch},
+        "runner": {"learning_rate": 1e-2, "collator": collator, **runner},
+    }
+
+
+class Notes(SilentReporter):
+    """Writes what a run says to people into ``said.txt`` of its work dir."""
+
+    def __init__(self, work_dir: Path) -> None:
+        self.path = work_dir / "said.txt"
+
+    def info(self, text: str) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a") as file:
+            file.write(text + "\n")
+
+    def warn(self, text: str) -> None:
+        self.info(f"warning: {text}")
+
+
+def train(settings: Mapping[str, Any]) -> Any:
+    """One training run in this process; gives the runner.
+
+    Args:
+        settings: ``work_dir`` and ``config``; ``resume`` (None), ``length`` of the dataset (37),
+            ``kill_batch`` (rank, n): SIGKILL when the rank collates its n-th batch;
+            ``kill_write`` n: SIGKILL before the n-th file operation of checkpoints.
+    """
+    config = settings["config"]
+    context = RunContext(
+        config=config,
+        section="runner",
+        work_dir=Path(settings["work_dir"]),
+        resume=settings.get("resume"),
+        reporter=Notes(Path(settings["work_dir"])),
+    )
+    table = dict(config["runner"])
+    if settings.get("kill_batch"):
+        rank, number = settings["kill_batch"]
+        if rank == int(os.environ.get("RANK", "0")):
+            table["collator"] = KillingCollator(number)
+    if settings.get("kill_write"):
+        kill_at_operation(settings["kill_write"])
+    runner = build_runner_from_cfg(table, context)
+    dataset = TinyDataset(settings.get("length", 37))
+    runner.run_setup(len(dataset))
+    runner.run(dataset)
+    return runner
+
+
+class KillingCollator(DictCollator):
+    """Ends this process by SIGKILL instead of giving the ``number``-th batch."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(KEYS)
+        self.left = number
+
+    def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        self.left -= 1
+        if self.left <= 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(samples)
+
+
+def kill_at_operation(number: int) -> None:
+    """End this process by SIGKILL before the ``number``-th file operation of its checkpoints."""
+    left = [number]
+    for name in [n for n in vars(Disk) if not n.startswith("_")]:
+        setattr(Disk, name, _counted(getattr(Disk, name), left))
+
+
+def _counted(operation: Callable[..., Any], left: list[int]) -> Callable[..., Any]:
+    def run(*args: Any) -> Any:
+        left[0] -= 1
+        if left[0] <= 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return operation(*args)
+
+    return run
+
+
+def run_ranks(
+    ranks: int, function: Callable[..., Any], *args: Any, timeout: float = 120.0
+) -> list[int | None]:
+    """Call ``function(*args)`` in ``ranks`` new processes that form one group on the loopback.
+
+    The processes are forked from a server that has torch imported already, so that a start takes
+    a tenth of a second. One that is still alive after ``timeout`` seconds is killed.
+
+    Returns:
+        The exit code of each: 0, 1 after an exception, ``-9`` after SIGKILL.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(PRELOAD))
+    port = _free_port() if ranks > 1 else 0
+    processes = [
+        context.Process(target=_rank, args=(rank, ranks, port, function, args))
+        for rank in range(ranks)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(timeout)
+        if process.is_alive():
+            process.kill()
+            process.join()
+    return [process.exitcode for process in processes]
+
+
+def _rank(
+    rank: int, ranks: int, port: int, function: Callable[..., Any], args: tuple[Any, ...]
+) -> None:
+    torch.set_num_threads(1)
+    if ranks > 1:
+        os.environ.update(
+            RANK=str(rank),
+            LOCAL_RANK=str(rank),
+            WORLD_SIZE=str(ranks),
+            LOCAL_WORLD_SIZE=str(ranks),
+            MASTER_ADDR="127.0.0.1",
+            MASTER_PORT=str(port),
+        )
+    function(*args)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def differences(left: Path, right: Path) -> list[str]:
+    """How two work dirs differ: names of checkpoint files whose bytes do, and of metric lines.
+
+    Compares every checkpoint that both should have, and ``metrics.jsonl`` without its wall-clock
+    fields.
+    """
+    found = []
+    names = [[p.name for p in folders(d)] for d in (left, right)]
+    if names[0] != names[1]:
+        found.append(f"checkpoints: {names[0]} / {names[1]}")
+    for a, b in zip(folders(left), folders(right), strict=False):
+        files = {p.relative_to(d) for d in (a, b) for p in d.rglob("*") if p.is_file()}
+        for name in sorted(files):
+            pair = [(d / name).read_bytes() if (d / name).is_file() else None for d in (a, b)]
+            if pair[0] != pair[1]:
+                found.append(f"{a.name}/{name}")
+    records = [_records(d / "metrics.jsonl") for d in (left, right)]
+    if records[0] != records[1]:
+        found.append("metrics.jsonl")
+    return found
+
+
+def _records(path: Path) -> list[dict[str, Any]]:
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]

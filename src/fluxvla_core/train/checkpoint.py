@@ -1,0 +1,258 @@
+"""A saved checkpoint as one object, and the checkpoints of a work dir as a list.
+
+Nothing here needs torch or a runner until weights are asked for: a command that lists checkpoints
+and a robot that reads an embodiment use the same door as the trainer.
+
+    <work_dir>/checkpoints/step-000000100/
+        manifest.json            sizes and SHA-256 of everything below
+        model.safetensors        weights and buffers, but for frozen ones that the model brings
+        ema.safetensors          averaged weights, when they are kept
+        optimizer.safetensors    optimizer state by parameter name, whole (not per rank)
+        optimizer.json           its groups and scalars
+        trainer.json             step, epoch, cursor, scheduler, last loss
+        rng/rank-00000.safetensors
+        policy.json embodiment.json dataset_statistics.json
+        config.resolved.json environment.json processors/
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.train.manifest import NAME as MANIFEST
+from fluxvla_core.train.manifest import Manifest, hash_file, read_manifest
+
+if TYPE_CHECKING:
+    import torch
+
+    from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+FOLDER = "checkpoints"
+MODEL = "model.safetensors"
+EMA = "ema.safetensors"
+OPTIMIZER = "optimizer.safetensors"
+OPTIMIZER_META = "optimizer.json"
+TRAINER = "trainer.json"
+POLICY = "policy.json"
+EMBODIMENT = "embodiment.json"
+STATISTICS = "dataset_statistics.json"
+CONFIG = "config.resolved.json"
+ENVIRONMENT = "environment.json"
+PROCESSORS = "processors"
+
+_STEP = re.compile(r"step-(\d{9,})")
+
+
+def step_name(step: int) -> str:
+    """Folder name of a step's checkpoint; sorts by step."""
+    return f"step-{step:09d}"
+
+
+def step_of(path: Path) -> int | None:
+    """The step in a checkpoint folder's name; None for any other name."""
+    match = _STEP.fullmatch(path.name)
+    return int(match[1]) if match else None
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One whole checkpoint folder; ``open`` it rather than constructing it."""
+
+    path: Path
+    manifest: Manifest
+
+    @classmethod
+    def open(cls, path: str | Path) -> Checkpoint:
+        """Read the manifest in ``path``; a work dir or its checkpoints folder gives its newest.
+
+        Sizes and sums are looked at by :meth:`verify`, not here.
+
+        Raises:
+            CheckpointError: there is nothing, no folder, no manifest, or a damaged one.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise CheckpointError(
+                f"there is no checkpoint at {path}",
+                next=_offer(path.parent),
+            )
+        if not path.is_dir():
+            raise CheckpointError(
+                f"{path} is a file; a checkpoint is a folder like {FOLDER}/{step_name(100)}"
+            )
+        if not (path / MANIFEST).exists() and (found := latest(path)) is not None:
+            return found
+        try:
+            return cls(path, read_manifest(path))
+        except CheckpointError as error:
+            error.next = error.next or _offer_previous(path)
+            raise
+
+    @property
+    def step(self) -> int:
+        """Optimizer steps done when it was saved."""
+        return self.manifest.step
+
+    @property
+    def epoch(self) -> int:
+        """Whole epochs done when it was saved."""
+        return self.manifest.epoch
+
+    def verify(self) -> None:
+        """Compare every file with the manifest, reading all of them.
+
+        Raises:
+            CheckpointError: names the first file that is missing, cut short or changed, and
+                offers the newest earlier checkpoint that is whole.
+        """
+        problem = self._damage()
+        if problem:
+            raise CheckpointError(
+                problem,
+                where=str(self.path),
+                cause="it was changed, or the disk lost a part of it, after it was saved",
+                next=_offer_previous(self.path),
+            )
+
+    def _damage(self) -> str | None:
+        for name, entry in sorted(self.manifest.files.items()):
+            path = self.path / name
+            if not path.is_file():
+                return f"{name} is missing from the checkpoint"
+            size = path.stat().st_size
+            if size != entry.size:
+                return f"{name} is damaged: {size} bytes instead of {entry.size}"
+            found = hash_file(path)
+            if found != entry.sha256:
+                return f"{name} is damaged: SHA-256 {found[:12]}… instead of {entry.sha256[:12]}…"
+        return None
+
+    def is_whole(self) -> bool:
+        """Whether :meth:`verify` would pass."""
+        return self._damage() is None
+
+    def has(self, name: str) -> bool:
+        """Whether the checkpoint has the file ``name``."""
+        return name in self.manifest.files
+
+    def json(self, name: str) -> dict[str, Any]:
+        """The JSON object in file ``name``.
+
+        Raises:
+            CheckpointError: the file is not there or holds something else.
+        """
+        if not self.has(name):
+            raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
+        try:
+            value = json.loads((self.path / name).read_text())
+        except (OSError, ValueError) as error:
+            where = str(self.path)
+            raise CheckpointError(f"{name} cannot be read: {error}", where=where) from error
+        if not isinstance(value, dict):
+            raise CheckpointError(f"{name} holds no JSON object", where=str(self.path))
+        return value
+
+    def config(self) -> dict[str, Any]:
+        """The resolved config tree of the run that saved it: data, never executed."""
+        tree: dict[str, Any] = self.json(CONFIG)["config"]
+        return tree
+
+    def statistics(self) -> dict[str, Any]:
+        """Dataset statistics: ``{"private": {"proprio": {...}, "action": {...}}}``."""
+        return self.json(STATISTICS)
+
+    def policy(self) -> dict[str, Any]:
+        """``action_rate_hz`` (Hz) and ``horizon`` (actions per chunk), null where unknown."""
+        return self.json(POLICY)
+
+    def embodiment(self) -> EmbodimentSpec | None:
+        """The robot that it was trained for; None when the dataset named none."""
+        from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+        return EmbodimentSpec.from_dict(self.json(EMBODIMENT)) if self.has(EMBODIMENT) else None
+
+    @property
+    def processors(self) -> Path:
+        """Folder of the tokenizer and other processors; may not exist."""
+        return self.path / PROCESSORS
+
+    def tensors(self, name: str) -> dict[str, torch.Tensor]:
+        """All tensors of a safetensors file by name, on the CPU.
+
+        Raises:
+            CheckpointError: the file is not there or cannot be read.
+        """
+        from fluxvla_core.train.tensors import read_tensors
+
+        if not self.has(name):
+            raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
+        return read_tensors(self.path / name)
+
+    def inference_weights(self) -> dict[str, torch.Tensor]:
+        """Weights to act with: the saved ones, with the averaged ones in their place if kept."""
+        weights = self.tensors(MODEL)
+        if self.has(EMA):
+            weights.update(self.tensors(EMA))
+        return weights
+
+
+def folders(place: str | Path) -> list[Path]:
+    """Checkpoint folders of a work dir (or of its checkpoints folder), oldest step first.
+
+    Half-written ones have other names and are never listed.
+    """
+    root = Path(place)
+    root = root / FOLDER if (root / FOLDER).is_dir() else root
+    if not root.is_dir():
+        return []
+    found = sorted((step, path) for path in root.iterdir() if (step := step_of(path)) is not None)
+    return [path for _, path in found if (path / MANIFEST).is_file()]
+
+
+def latest(place: str | Path) -> Checkpoint | None:
+    """The newest checkpoint of a work dir, None when there is none yet.
+
+    Raises:
+        CheckpointError: the newest one's manifest is damaged; the one before it is offered.
+    """
+    found = folders(place)
+    return Checkpoint.open(found[-1]) if found else None
+
+
+def newest_whole(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointError]]:
+    """The newest checkpoint that passes :meth:`Checkpoint.verify`, and why newer ones do not."""
+    refused: list[CheckpointError] = []
+    for folder in reversed(folders(place)):
+        try:
+            checkpoint = Checkpoint.open(folder)
+            checkpoint.verify()
+        except CheckpointError as error:
+            refused.append(error)
+        else:
+            return checkpoint, refused
+    return None, refused
+
+
+def _offer_previous(path: Path) -> str | None:
+    """What to say about the newest whole checkpoint before ``path``."""
+    step = step_of(path)
+    for folder in reversed(folders(path.parent)):
+        if step is None or (step_of(folder) or 0) >= step:
+            continue
+        try:
+            whole = Checkpoint(folder, read_manifest(folder)).is_whole()
+        except CheckpointError:
+            continue
+        if whole:
+            return f"the one before it is whole: {folder}"
+    return None
+
+
+def _offer(place: Path) -> str | None:
+    found = folders(place)
+    return f"the newest one there is {found[-1]}" if found else None

@@ -1,0 +1,208 @@
+"""The processes that train together: who is here, what they agree on, how they part.
+
+Tensors of the model travel over NCCL on GPUs and gloo on CPUs. Everything small that the host
+decides with (a stop, an error, a path) travels over a gloo group of its own, so that it never
+waits for a device.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from fluxvla_core import errors
+from fluxvla_core.errors import ConfigError, FluxError, RunFailed
+
+_LOST = (
+    "connection closed",
+    "connection reset",
+    "connection refused",
+    "broken pipe",
+    "timed out",
+    "nccl error",
+    "socket",
+)
+
+
+@dataclass(frozen=True)
+class World:
+    """This process among those that train together.
+
+    Args:
+        rank, size: global rank and number of processes.
+        local_rank: rank on this machine, which is the index of its GPU.
+        device: where the model lives.
+        owned: whether :func:`start` made the process group, and :func:`stop` has to end it.
+        control: gloo group for small host-side values; None for a single process.
+    """
+
+    rank: int
+    size: int
+    local_rank: int
+    device: torch.device
+    owned: bool = False
+    control: Any = None
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes and talks."""
+        return self.rank == 0
+
+
+def start(device: str = "auto", group_of_one: bool = False) -> World:
+    """Join the process group that torchrun's environment describes; one process needs none.
+
+    Args:
+        device: ``auto`` (this rank's GPU if there is one), ``cpu`` or ``cuda``.
+        group_of_one: make a process group for a single process too, as sharding needs.
+
+    Raises:
+        ConfigError: ``cuda`` without a GPU, or an unknown device.
+    """
+    rank, size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    place = _device(device, local_rank)
+    owned = False
+    if not dist.is_initialized() and (size > 1 or group_of_one):
+        backend = "nccl" if place.type == "cuda" else "gloo"
+        if size > 1:
+            dist.init_process_group(backend)
+        else:
+            store = dist.HashStore()  # type: ignore[attr-defined]
+            dist.init_process_group(backend, store=store, rank=0, world_size=1)
+        owned = True
+    if dist.is_initialized():
+        rank, size = dist.get_rank(), dist.get_world_size()
+    control = dist.new_group(backend="gloo") if size > 1 else None
+    return World(rank, size, local_rank, place, owned, control)
+
+
+def _device(name: str, local_rank: int) -> torch.device:
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"device {name!r} is none of 'auto', 'cpu', 'cuda'")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device is 'cuda', but torch finds no GPU here", next="fluxvla doctor")
+    if name == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    torch.cuda.set_device(local_rank)
+    return torch.device("cuda", local_rank)
+
+
+def stop(world: World, failed: bool = False) -> None:
+    """Leave the process group.
+
+    After success all ranks wait for each other, so that none closes connections that another
+    still reads from. After a failure waiting would hang.
+    """
+    if not (world.owned and dist.is_initialized()):
+        return
+    if not failed:
+        dist.barrier(group=world.control)
+    dist.destroy_process_group()
+
+
+def exit_now(code: int) -> NoReturn:
+    """End a worker process at once, with everything it said written out.
+
+    gloo's threads can outlive the interpreter and then abort it ("terminate called without an
+    active exception") after all work is done; leaving this way gives them no chance to.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def agree(world: World, value: int) -> int:
+    """The largest ``value`` of all ranks: every rank leaves with the same."""
+    if world.size == 1:
+        return value
+    box = torch.tensor([value], dtype=torch.int64)
+    dist.all_reduce(box, dist.ReduceOp.MAX, group=world.control)
+    return int(box)
+
+
+def total(world: World, values: Tensor) -> Tensor:
+    """Sum of CPU ``values`` over all ranks, in place."""
+    if world.size > 1:
+        dist.all_reduce(values, group=world.control)
+    return values
+
+
+def gather(world: World, tensor: Tensor) -> list[Tensor]:
+    """The CPU ``tensor`` of each rank, of one shape, on the first rank; elsewhere nothing."""
+    if world.size == 1:
+        return [tensor]
+    boxes = [torch.empty_like(tensor) for _ in range(world.size)] if world.first else None
+    dist.gather(tensor.contiguous(), boxes, dst=0, group=world.control)
+    return boxes or []
+
+
+def share_text(world: World, text: str) -> str:
+    """The first rank's ``text`` on every rank."""
+    if world.size == 1:
+        return text
+    data = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8) if text else None
+    length = torch.tensor([0 if data is None else len(data)])
+    dist.broadcast(length, 0, group=world.control)
+    box = data if world.first and data is not None else torch.empty(int(length), dtype=torch.uint8)
+    if length:
+        dist.broadcast(box, 0, group=world.control)
+    return bytes(box.tolist()).decode()
+
+
+def texts(world: World, text: str) -> list[str]:
+    """Every rank's ``text`` (cut to 2000 bytes) on every rank."""
+    if world.size == 1:
+        return [text]
+    mine = torch.zeros(2000, dtype=torch.uint8)
+    data = text.encode()[:2000]
+    if data:
+        mine[: len(data)] = torch.frombuffer(bytearray(data), dtype=torch.uint8)
+    boxes = [torch.empty_like(mine) for _ in range(world.size)]
+    dist.all_gather(boxes, mine, group=world.control)
+    return [bytes(b.tolist()).rstrip(b"\0").decode(errors="replace") for b in boxes]
+
+
+def on_first(world: World, work: Callable[[], str]) -> str:
+    """Do ``work`` on the first rank only; every rank gets its answer, or raises its error.
+
+    Without this a rank whose peer failed would wait for it in the next collective operation.
+    """
+    failure: FluxError | None = None
+    answer = ""
+    if world.first:
+        try:
+            answer = json.dumps({"answer": work()})
+        except FluxError as error:
+            failure = error
+            fields = [error.what, error.where, error.cause, error.next]
+            answer = json.dumps({"error": type(error).__name__, "fields": fields})
+    told = json.loads(share_text(world, answer))
+    if failure is not None:
+        raise failure
+    if "error" in told:
+        what, where, cause, advice = told["fields"]
+        raise getattr(errors, told["error"], FluxError)(what, where=where, cause=cause, next=advice)
+    return str(told["answer"])
+
+
+def explain(error: RuntimeError, world: World, step: int) -> RunFailed | None:
+    """What a broken collective operation means; None if ``error`` is about something else."""
+    text = str(error).lower()
+    if world.size == 1 or not any(sign in text for sign in _LOST):
+        return None
+    return RunFailed(
+        f"rank {world.rank} of {world.size} lost another rank during step {step}",
+        cause="another process of this run ended; its own message says why ("
+        + str(error).strip().splitlines()[0][:200]
+        + ")",
+        next="mend what that message names, then run the same command with --resume auto",
+    )

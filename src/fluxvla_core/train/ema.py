@@ -1,0 +1,48 @@
+"""Averaged weights, which act more steadily than the last ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
+
+from fluxvla_core.train.tensors import check_names, copy_whole
+
+
+class Ema:
+    """Exponential moving average of the trainable weights, sharded as they are.
+
+    The decay of the ``n``-th update is ``min(decay, (1 + n) / (10 + n))``: early averages then
+    forget the random start (as tf.train.ExponentialMovingAverage does with ``num_updates``).
+    """
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
+        self.decay = decay
+        self._parameters = parameters
+        self.shadow = {name: p.detach().clone() for name, p in parameters.items()}
+
+    def update(self, step: int) -> None:
+        """Move towards the weights after optimizer step ``step`` (from 1)."""
+        decay = min(self.decay, (1 + step) / (10 + step))
+        with torch.no_grad():
+            torch._foreach_lerp_(
+                [_local(t) for t in self.shadow.values()],
+                [_local(p.detach()) for p in self._parameters.values()],
+                1.0 - decay,
+            )
+
+    def load(self, tensors: Mapping[str, Tensor], where: str) -> None:
+        """Take the full averages in ``tensors``.
+
+        Raises:
+            CheckpointError: names or sizes are not those of this model.
+        """
+        check_names(tensors, self.shadow, "the averaged weights", where)
+        for name, average in self.shadow.items():
+            copy_whole(average, tensors[name])
+
+
+def _local(tensor: Tensor) -> Tensor:
+    return tensor.to_local() if isinstance(tensor, DTensor) else tensor

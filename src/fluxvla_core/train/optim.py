@@ -1,0 +1,131 @@
+"""AdamW with weight decay where it belongs, and optimizer state by parameter name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.train.schedule import Schedule
+from fluxvla_core.train.tensors import like
+
+NamedState = dict[str, Tensor]
+
+
+def trainable(model: nn.Module) -> dict[str, nn.Parameter]:
+    """Parameters that are trained, by name; a tied one once, under its first name."""
+    return {name: p for name, p in model.named_parameters() if p.requires_grad}
+
+
+def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Two groups: matrices with ``weight_decay``; biases, norms and other vectors without.
+
+    Raises:
+        ConfigError: nothing is trainable.
+    """
+    parameters = trainable(model)
+    if not parameters:
+        raise ConfigError(
+            "the model has no trainable parameter", cause="all of its parts are frozen"
+        )
+    decayed = {n: p for n, p in parameters.items() if p.ndim > 1 and not n.endswith("bias")}
+    rest = [p for n, p in parameters.items() if n not in decayed]
+    groups = [
+        {"params": list(decayed.values()), "weight_decay": weight_decay},
+        {"params": rest, "weight_decay": 0.0},
+    ]
+    return [group for group in groups if group["params"]]
+
+
+def make_adamw(model: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
+    """AdamW over :func:`decay_groups`, in one fused kernel (CPU and CUDA have one)."""
+    return torch.optim.AdamW(decay_groups(model, weight_decay), lr=learning_rate, fused=True)
+
+
+def named_state(
+    model: nn.Module, optimizer: torch.optim.Optimizer
+) -> tuple[NamedState, dict[str, Any]]:
+    """An optimizer's state as tensors ``<parameter>/<key>`` and a JSON description of the rest."""
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    tensors: NamedState = {}
+    scalars: dict[str, Any] = {}
+    for parameter, state in optimizer.state.items():
+        for key, value in state.items():
+            place = f"{names[id(parameter)]}/{key}"
+            (tensors if isinstance(value, Tensor) else scalars)[place] = value
+    groups = [
+        {
+            **{k: v for k, v in group.items() if k != "params"},
+            "params": [names[id(p)] for p in group["params"]],
+        }
+        for group in optimizer.param_groups
+    ]
+    return tensors, {"type": type(optimizer).__name__, "groups": groups, "scalars": scalars}
+
+
+def torch_state(
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    tensors: NamedState,
+    described: Mapping[str, Any],
+    where: str,
+) -> dict[str, Any]:
+    """The inverse of :func:`named_state`, in the form that ``load_state_dict`` takes.
+
+    Hyperparameters are the present config's, apart from the learning rate, which the scheduler
+    goes on with; state is sharded as the parameters are.
+
+    Raises:
+        CheckpointError: other parameters, sizes, groups or another optimizer.
+    """
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    ours = [[names[id(p)] for p in group["params"]] for group in optimizer.param_groups]
+    theirs = [group["params"] for group in described["groups"]]
+    if described["type"] != type(optimizer).__name__ or ours != theirs:
+        raise CheckpointError(
+            f"the optimizer of the checkpoint ({described['type']}, groups of "
+            f"{[len(g) for g in theirs]} parameters) is not this run's "
+            f"({type(optimizer).__name__}, {[len(g) for g in ours]})",
+            where=where,
+            cause="the model or the optimizer settings of the config have changed",
+            next="resume with the config that made it: config.resolved.json in its folder",
+        )
+    parameters = {names[id(p)]: p for group in optimizer.param_groups for p in group["params"]}
+    index = {name: i for i, name in enumerate(name for group in ours for name in group)}
+    state: dict[int, dict[str, Any]] = {}
+    for place, value in {**tensors, **described["scalars"]}.items():
+        name, _, key = place.rpartition("/")
+        if isinstance(value, Tensor) and value.shape == parameters[name].shape:
+            value = like(parameters[name], value)
+        state.setdefault(index[name], {})[key] = value
+    groups, first = [], 0
+    for mine, saved in zip(optimizer.param_groups, described["groups"], strict=True):
+        kept = {k: saved[k] for k in ("lr", "initial_lr") if k in saved}
+        group = {**{k: v for k, v in mine.items() if k != "params"}, **kept}
+        group["params"] = list(range(first, first + len(mine["params"])))
+        first += len(mine["params"])
+        groups.append(group)
+    return {"state": state, "param_groups": groups}
+
+
+class ScheduledLR(torch.optim.lr_scheduler.LRScheduler):
+    """Sets every group's rate to ``schedule(step)``; its state is the step alone."""
+
+    def __init__(self, optimizer: torch.optim.Optimizer, schedule: Schedule) -> None:
+        self.schedule = schedule
+        super().__init__(optimizer)
+
+    def get_lr(self) -> list[float | torch.Tensor]:
+        return [self.schedule(self.last_epoch)] * len(self.optimizer.param_groups)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"step": self.last_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.last_epoch = state_dict["step"]
+        for group, rate in zip(self.optimizer.param_groups, self.get_lr(), strict=True):
+            group["lr"] = rate
+        self._last_lr = [group["lr"] for group in self.optimizer.param_groups]

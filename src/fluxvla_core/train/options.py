@@ -1,0 +1,159 @@
+"""What a train runner can be told, checked before anything is built."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.train.schedule import make_schedule
+
+DTYPES = ("bf16",)
+SAVE_STEPS = 10_000
+"""``save_iter_interval`` of step-based runs that do not set it."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """The runner's plain settings; ``BaseTrainRunner`` says what each means."""
+
+    learning_rate: float
+    max_epochs: int | None
+    max_steps: int | None
+    weight_decay: float
+    max_grad_norm: float | None
+    sampler: str | None
+    save_epoch_interval: int
+    save_iter_interval: int | None
+    max_keep_ckpts: int
+    lr_scheduler_type: str
+    lr_schedule: Mapping[Any, float] | None
+    warmup_ratio: float
+    grad_accumulation_steps: int
+    enable_mixed_precision_training: bool
+    mixed_precision_dtype: str
+    enable_gradient_checkpointing: bool
+    ema_decay: float | None
+    seed: int
+    resume_from: str | None
+    log_iter_interval: int
+    device: str
+
+    def check(self, context: RunContext) -> None:
+        """Refuse values that cannot be meant.
+
+        Raises:
+            ConfigError: every finding, with the place of its key.
+        """
+        found = [
+            Problem(context.origins.get(f"{context.section}.{key}", ""), key, what)
+            for key, what in self._problems()
+        ]
+        if found:
+            raise ConfigError.from_problems(tuple(found))
+
+    def _problems(self) -> list[tuple[str, str]]:
+        found: list[tuple[str, str]] = []
+
+        def need(key: str, fine: bool, rule: str) -> None:
+            if not fine:
+                found.append((key, f"{rule}, got {getattr(self, key)!r}"))
+
+        if (self.max_epochs is None) == (self.max_steps is None):
+            given = "both" if self.max_steps is not None else "none"
+            found.append(("max_epochs", f"give max_epochs or max_steps, got {given}"))
+        for key in ("max_epochs", "max_steps", "save_iter_interval"):
+            value = getattr(self, key)
+            need(key, value is None or _count(value, 1), "must be a whole number above 0")
+        for key in ("save_epoch_interval", "grad_accumulation_steps", "log_iter_interval"):
+            need(key, _count(getattr(self, key), 1), "must be a whole number above 0")
+        need("max_keep_ckpts", _count(self.max_keep_ckpts, 0), "must be 0 (keep all) or more")
+        need("seed", _count(self.seed, 0), "must be a whole number from 0 up")
+        need("learning_rate", _positive(self.learning_rate), "must be a positive number")
+        need(
+            "weight_decay",
+            self.weight_decay == 0 or _positive(self.weight_decay),
+            "must be a number from 0 up",
+        )
+        need(
+            "max_grad_norm",
+            self.max_grad_norm is None or _positive(self.max_grad_norm),
+            "must be positive, or None for no clipping",
+        )
+        need(
+            "ema_decay",
+            self.ema_decay is None or (_positive(self.ema_decay) and self.ema_decay < 1),
+            "must be above 0 and below 1, or None",
+        )
+        need("sampler", self.sampler in (None, "distributed"), "must be None or 'distributed'")
+        need("mixed_precision_dtype", self.mixed_precision_dtype in DTYPES, f"must be in {DTYPES}")
+        for key in ("enable_mixed_precision_training", "enable_gradient_checkpointing"):
+            need(key, isinstance(getattr(self, key), bool), "must be true or false")
+        try:
+            make_schedule(self.lr_scheduler_type, 1.0, 100, self.warmup_ratio, self.lr_schedule)
+        except ConfigError as error:
+            found.append(("lr_scheduler_type", error.what))
+        return found
+
+    @property
+    def save_steps(self) -> int | None:
+        """Steps between checkpoints; None when only epochs count."""
+        if self.save_iter_interval is None and self.max_steps is not None:
+            return SAVE_STEPS
+        return self.save_iter_interval
+
+
+@dataclass(frozen=True)
+class LoaderOptions:
+    """``train_dataloader`` of the config, without its dataset."""
+
+    per_device_batch_size: int
+    per_device_num_workers: int = 0
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any], context: RunContext) -> LoaderOptions:
+        """Take and check the table.
+
+        Raises:
+            ConfigError: it is missing, has unknown keys, or values that cannot be meant.
+        """
+        section = "train_dataloader"
+        table = config.get(section)
+        if not isinstance(table, Mapping):
+            raise ConfigError(
+                f"the config has no table {section!r}, which training needs",
+                where=context.config_file,
+                next=f"{section} = dict(per_device_batch_size=…, dataset=dict(type=…))",
+            )
+        known = ("per_device_batch_size", "per_device_num_workers", "dataset")
+        found: list[tuple[str, str]] = []
+        for key in table:
+            if key not in known:
+                near = difflib.get_close_matches(key, known, 1)
+                hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+                found.append((key, f"unknown key{hint}"))
+        size, workers = table.get(known[0]), table.get(known[1], 0)
+        if not _count(size, 1):
+            found.append((known[0], f"must be a whole number above 0, got {size!r}"))
+        if not _count(workers, 0):
+            found.append((known[1], f"must be a whole number from 0 up, got {workers!r}"))
+        if found:
+            raise ConfigError.from_problems(
+                tuple(
+                    Problem(context.origins.get(f"{section}.{k}", ""), f"{section}.{k}", what)
+                    for k, what in found
+                )
+            )
+        return cls(int(table[known[0]]), int(workers))
+
+
+def _count(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _positive(value: object) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and 0 < float(value) < float("inf")  # type: ignore[arg-type]

@@ -1,0 +1,40 @@
+"""Where a training run stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from fluxvla_core.train.batches import Cursor
+
+
+@dataclass
+class Progress:
+    """What advances from step to step, and what a checkpoint's ``trainer.json`` says of it.
+
+    Args:
+        step: optimizer steps done.
+        cursor: the next sample.
+        loss: mean loss of the last step that was fetched.
+        saved: the step of the last checkpoint, -1 when there is none.
+    """
+
+    step: int = 0
+    cursor: Cursor = field(default_factory=Cursor)
+    loss: float | None = None
+    saved: int = -1
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values; :meth:`from_dict` is the inverse."""
+        return {
+            "global_step": self.step,
+            "epoch": self.cursor.epoch,
+            "cursor": {"epoch": self.cursor.epoch, "samples": self.cursor.samples},
+            "train_loss": self.loss,
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Progress:
+        """The progress that a checkpoint was saved with."""
+        cursor = Cursor(data["cursor"]["epoch"], data["cursor"]["samples"])
+        return cls(data["global_step"], cursor, data["train_loss"], data["global_step"])

@@ -1,0 +1,172 @@
+"""Choosing the checkpoint that a run goes on from, and refusing one that it cannot go on from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.train.batches import StepPlan
+from fluxvla_core.train.checkpoint import (
+    EMA,
+    MODEL,
+    OPTIMIZER,
+    OPTIMIZER_META,
+    TRAINER,
+    Checkpoint,
+    folders,
+    newest_whole,
+)
+from fluxvla_core.train.distributed import World, on_first
+from fluxvla_core.train.optim import torch_state
+from fluxvla_core.train.progress import Progress
+from fluxvla_core.train.saving import rng_file
+from fluxvla_core.train.shelf import clear_leftovers, prepare, set_aside_later
+from fluxvla_core.train.state import rank_seed, seed_all, set_rng_state
+from fluxvla_core.train.weights import LeftOut, check_model_tensors
+
+if TYPE_CHECKING:
+    from fluxvla_core.train.strategy import Strategy
+
+AUTO = "auto"
+
+
+def choose(world: World, context: RunContext, resume: str | None) -> Checkpoint | None:
+    """The verified checkpoint to go on from, None to start afresh; the same on every rank.
+
+    Also makes the work dir's ``checkpoints`` folder and clears what killed saves left there.
+
+    Args:
+        resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
+            path (refused if damaged), or None (refused if there are checkpoints already).
+
+    Raises:
+        CheckpointError: the one at the path is missing or damaged.
+        UsageError: the work dir cannot be written, or has checkpoints of another run.
+    """
+    found = on_first(world, lambda: _choose(context, resume))
+    return Checkpoint.open(found) if found else None
+
+
+def _choose(context: RunContext, resume: str | None) -> str:
+    prepare(context.work_dir)
+    clear_leftovers(context.work_dir)
+    reporter = context.reporter
+    if resume is None:
+        _refuse_existing(context.work_dir)
+        return ""
+    if resume == AUTO:
+        checkpoint, refused = newest_whole(context.work_dir)
+        if checkpoint is None and refused:
+            raise refused[0]
+        for error in refused:
+            reporter.warn(f"not resuming from a damaged checkpoint: {error.where}: {error.what}")
+        if checkpoint is None:
+            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts afresh")
+            return ""
+    else:
+        checkpoint = Checkpoint.open(resume)
+        checkpoint.verify()
+    if checkpoint.path.resolve().parent.parent == context.work_dir.resolve():
+        for moved in set_aside_later(context.work_dir, checkpoint.step):
+            reporter.warn(f"a later checkpoint is set aside as {moved.name}")
+    else:
+        _refuse_existing(context.work_dir)
+    reporter.info(f"resuming from {checkpoint.path} (step {checkpoint.step})")
+    return str(checkpoint.path)
+
+
+def _refuse_existing(work_dir: Path) -> None:
+    existing = folders(work_dir)
+    if existing:
+        raise UsageError(
+            f"{work_dir} already has checkpoints, up to {existing[-1].name}",
+            next="go on from there with --resume auto, or name another --work-dir",
+        )
+
+
+def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str | None:
+    """Refuse to go on with other data or another seed; a changed batch or world only is said.
+
+    Returns:
+        One line to warn with when steps will use other numbers of samples than before, or None.
+
+    Raises:
+        CheckpointError: another seed or number of samples, under which the order would change.
+    """
+    for key, ours, what in (
+        ("seed", plan.seed, "seed"),
+        ("n_train_examples", plan.length, "number of samples in the dataset"),
+    ):
+        if saved[key] != ours:
+            raise CheckpointError(
+                f"the {what} is {ours}, the checkpoint's run had {saved[key]}",
+                where=where,
+                cause="the rest of its epoch would be another one's",
+                next="set it back, or start a new run in another --work-dir",
+            )
+    if saved["step_samples"] != plan.step_samples:
+        return (
+            f"steps use {plan.step_samples} samples now and {saved['step_samples']} in the "
+            "checkpoint's run: the order of samples stays, the result will differ"
+        )
+    if saved["world_size"] != plan.world:
+        return (
+            f"{plan.world} processes now and {saved['world_size']} in the checkpoint's run: the "
+            "order of samples stays, results agree only to rounding"
+        )
+    return None
+
+
+def restore(run: Strategy, checkpoint: Checkpoint) -> None:
+    """Put everything but the random generators back to where ``checkpoint`` was saved.
+
+    Raises:
+        CheckpointError: it is of another model, optimizer, dataset, seed, or kept no averages.
+    """
+    where = str(checkpoint.path)
+    saved = checkpoint.json(TRAINER)
+    warning = check_same_run(saved, run.plan, where)
+    if warning and run.world.first:
+        run.context.reporter.warn(warning)
+    tensors = checkpoint.tensors(MODEL)
+    check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
+    run._load_model_state(tensors)
+    state = torch_state(
+        run.model,
+        run.optimizer,
+        checkpoint.tensors(OPTIMIZER),
+        checkpoint.json(OPTIMIZER_META),
+        where,
+    )
+    if run._load_optimizer_state(state) is False:
+        raise CheckpointError(
+            f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
+        )
+    run.lr_scheduler.load_state_dict(saved["scheduler"])
+    if run.ema is not None:
+        if not checkpoint.has(EMA):
+            raise CheckpointError(
+                "ema_decay is set, and the checkpoint's run kept no averaged weights",
+                where=where,
+                next="resume without ema_decay, or start a new run in another --work-dir",
+            )
+        run.ema.load(checkpoint.tensors(EMA), where)
+    run.metric.load_state_dict(saved["metric"])
+    run.progress = Progress.from_dict(saved)
+
+
+def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
+    """Give this rank the random states it was saved with, or fresh ones of its own.
+
+    On another number of ranks than before there is none to go on with: each rank then draws from
+    a state that follows from the seed, its rank and the step.
+    """
+    if checkpoint is None:
+        seed_all(rank_seed(seed, world.rank))
+        return
+    seed_all(rank_seed(seed, world.rank, checkpoint.step))
+    if checkpoint.json(TRAINER)["world_size"] == world.size:
+        set_rng_state(checkpoint.tensors(rng_file(world.rank)))

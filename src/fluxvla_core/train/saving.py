@@ -1,0 +1,175 @@
+"""What goes into a checkpoint, and how the ranks write it together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.config.load import FORMAT
+from fluxvla_core.config.resolved import environment
+from fluxvla_core.train import checkpoint as ckpt
+from fluxvla_core.train.distributed import World, gather, on_first
+from fluxvla_core.train.ema import Ema
+from fluxvla_core.train.optim import named_state
+from fluxvla_core.train.shelf import rotate
+from fluxvla_core.train.state import rng_state
+from fluxvla_core.train.tensors import save_tensors
+from fluxvla_core.train.weights import LeftOut, model_tensors
+from fluxvla_core.train.writer import CheckpointWriter
+
+if TYPE_CHECKING:
+    from fluxvla_core.train.strategy import Strategy
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One moment of a run: the tensors as they are in memory, everything else as JSON values.
+
+    Args:
+        model: unwrapped of what trains it.
+        left_out: frozen weights that are not saved.
+        trainer: ``trainer.json``.
+        documents: file name -> JSON object, fixed for the run.
+        folders: folder name -> what fills it.
+    """
+
+    model: nn.Module
+    optimizer: torch.optim.Optimizer
+    trainer: Mapping[str, Any]
+    left_out: LeftOut = field(default_factory=LeftOut)
+    ema: Ema | None = None
+    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    folders: Mapping[str, Callable[[Path], Any]] = field(default_factory=dict)
+
+
+def save_snapshot(
+    world: World,
+    work_dir: Path,
+    step: int,
+    epoch: int,
+    snapshot: Snapshot,
+    keep: int,
+    warn: Callable[[str], None],
+) -> Path:
+    """Write the checkpoint of ``step``, then remove all but the ``keep`` newest (0: keep all).
+
+    Every rank calls this; the first one writes. Old ones that cannot be removed are only warned
+    of.
+
+    Raises:
+        RunFailed: it could not be written; on every rank, with the earlier ones as they were.
+    """
+    writer = CheckpointWriter(work_dir, step, epoch) if world.first else None
+    with writer or nullcontext():
+        save_tensors(writer, ckpt.MODEL, model_tensors(snapshot.model, snapshot.left_out.names))
+        if snapshot.ema is not None:
+            save_tensors(writer, ckpt.EMA, snapshot.ema.shadow)
+        tensors, described = named_state(snapshot.model, snapshot.optimizer)
+        save_tensors(writer, ckpt.OPTIMIZER, tensors)
+        _save_rng(world, writer)
+
+        def finish() -> str:
+            assert writer is not None
+            writer.write_json(ckpt.OPTIMIZER_META, described)
+            writer.write_json(ckpt.TRAINER, snapshot.trainer)
+            for name, document in snapshot.documents.items():
+                writer.write_json(name, document)
+            for name, fill in snapshot.folders.items():
+                writer.write_folder(name, fill)
+            path = writer.commit()
+            try:
+                rotate(work_dir, keep)
+            except OSError as error:
+                warn(f"old checkpoints could not be removed: {error}")
+            return str(path)
+
+        return Path(on_first(world, finish))
+
+
+def rng_file(rank: int) -> str:
+    """Name of a rank's file of random states."""
+    return f"rng/rank-{rank:05d}.safetensors"
+
+
+def _save_rng(world: World, writer: CheckpointWriter | None) -> None:
+    gathered = {key: gather(world, tensor) for key, tensor in sorted(rng_state().items())}
+    if writer is not None:
+        for rank in range(world.size):
+            save_tensors(
+                writer, rng_file(rank), {key: ranks[rank] for key, ranks in gathered.items()}
+            )
+
+
+def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool) -> Snapshot:
+    """The runner's present moment.
+
+    Args:
+        only_trainable: leave out frozen weights that the model brings itself.
+    """
+    without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
+    trainer = {
+        **run.progress.to_dict(),
+        "train_loss": train_loss,
+        "scheduler": run.lr_scheduler.state_dict(),
+        "metric": run.metric.state_dict(),
+        "seed": run.plan.seed,
+        "n_train_examples": run.plan.length,
+        "step_samples": run.plan.step_samples,
+        "world_size": run.plan.world,
+        "left_out": without.to_dict(),
+    }
+    return Snapshot(
+        run.model,
+        run.optimizer,
+        trainer,
+        without,
+        run.ema,
+        run_documents(run.context, run.dataset, run.model) if run.world.first else {},
+        run_folders(run.dataset, run.tokenizer),
+    )
+
+
+def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
+    """The JSON files that are the same in every checkpoint of a run.
+
+    ``policy.json``: ``action_rate_hz`` is the dataset's ``fps`` (Hz), ``horizon`` the first of
+    the model's ``action_shape``, else the dataset's ``action_window_size``; null where unknown.
+    """
+    shape = getattr(model, "action_shape", None)
+    horizon = shape[0] if shape else getattr(dataset, "action_window_size", None)
+    rate = getattr(dataset, "fps", None)
+    config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
+    documents: dict[str, dict[str, Any]] = {
+        # A config made in Python may hold objects; they are described rather than lost.
+        ckpt.CONFIG: json.loads(json.dumps(config, default=repr)),
+        ckpt.ENVIRONMENT: environment(),
+        ckpt.POLICY: {
+            "action_rate_hz": None if rate is None else float(rate),
+            "horizon": None if horizon is None else int(horizon),
+        },
+        ckpt.STATISTICS: dict(getattr(dataset, "statistics", None) or {}),
+    }
+    embodiment = getattr(dataset, "embodiment", None)
+    if embodiment is not None:
+        documents[ckpt.EMBODIMENT] = embodiment.to_dict()
+    return documents
+
+
+def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]]:
+    """What fills the checkpoint's ``processors``: the dataset's pipeline, else the tokenizer."""
+    for owner in (getattr(dataset, "pipeline", None), getattr(dataset, "transforms", None)):
+        save = getattr(owner, "save_pretrained", None)
+        if save is not None:
+            return {ckpt.PROCESSORS: save}
+    save = getattr(tokenizer, "save_pretrained", None)
+    if save is None:
+        return {}
+    return {ckpt.PROCESSORS: lambda folder: save(folder / "tokenizer")}

@@ -1,0 +1,80 @@
+"""Being asked to stop: all ranks leave at the same step, with a checkpoint behind them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from types import FrameType, TracebackType
+from typing import Any
+
+from fluxvla_core.errors import FluxError, RunFailed
+from fluxvla_core.train.distributed import World, agree
+
+_NOTICE_S = 0.5
+_SECOND_S = 1.0
+
+
+class StopRequest:
+    """Notices SIGINT and SIGTERM while it is entered as a context manager.
+
+    The first signal asks for a stop at the end of a step; a second SIGINT more than a second later
+    ends at once (a terminal and a launcher may both pass on the first one). Ranks compare notes
+    every few steps, often enough to notice within about half a second.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._signal = 0
+        self._since = 0.0
+        self._previous: dict[int, Any] = {}
+        self._every = 1
+
+    def __enter__(self) -> StopRequest:
+        # Only the main thread may set handlers; elsewhere whoever runs that decides.
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)
+        self._previous = {}
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and self._signal and time.monotonic() - self._since > _SECOND_S:
+            raise KeyboardInterrupt
+        if not self._signal:
+            self._signal, self._since = number, time.monotonic()
+
+    def pace(self, step_time: float) -> None:
+        """Choose how often ranks compare notes; ``step_time`` (s) must be equal on all ranks."""
+        self._every = max(1, int(_NOTICE_S / step_time)) if step_time > 0 else 1
+
+    def wanted(self, step: int) -> int:
+        """The signal that some rank got, or 0; every rank gets the same answer."""
+        if self._world.size > 1 and step % self._every:
+            return 0
+        return agree(self._world, self._signal)
+
+
+def stopped(number: int, place: str) -> BaseException:
+    """What a run that was asked to stop, and saved, ends with.
+
+    SIGINT ends as an interrupted command does (exit code 130), SIGTERM as one that could not
+    finish (1): whoever restarts failed jobs then restarts this one.
+    """
+    if number == signal.SIGINT:
+        return KeyboardInterrupt(place)
+    stop: FluxError = RunFailed(
+        "training was stopped by SIGTERM",
+        cause=f"all is saved: {place}",
+        next="go on with the same command and --resume auto",
+    )
+    return stop

@@ -1,0 +1,62 @@
+"""A train runner as the modules of this room see it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+    from fluxvla_core.build import RunContext
+    from fluxvla_core.hooks import HookCaller
+    from fluxvla_core.train.batches import StepPlan
+    from fluxvla_core.train.checkpoint import Checkpoint
+    from fluxvla_core.train.distributed import World
+    from fluxvla_core.train.ema import Ema
+    from fluxvla_core.train.forward import ForwardArguments
+    from fluxvla_core.train.options import LoaderOptions, TrainOptions
+    from fluxvla_core.train.progress import Progress
+    from fluxvla_core.train.weights import LeftOut
+
+
+class Strategy(Protocol):
+    """The parts of ``BaseTrainRunner`` that loop, saving and resuming work with."""
+
+    options: TrainOptions
+    loader_options: LoaderOptions
+    collator: Any
+    vla: Any
+    context: RunContext
+    optimizer: torch.optim.Optimizer
+    lr_scheduler: Any
+    plan: StepPlan
+    progress: Progress
+    ema: Ema | None
+    left_out: LeftOut | None
+    dataset: Any
+    tokenizer: Any
+    metric: Any
+    hooks: HookCaller
+    _arguments: ForwardArguments | None
+    _checkpoint: Checkpoint | None
+
+    @property
+    def world(self) -> World: ...
+    @property
+    def model(self) -> nn.Module: ...
+    @property
+    def total_steps(self) -> int: ...
+    def _load_model_state(self, state: Mapping[str, Tensor]) -> None: ...
+    def _load_optimizer_state(self, state: dict[str, Any]) -> bool: ...
+    def _plan(self, samples: int) -> StepPlan: ...
+    def resume(self) -> int: ...
+    def _training_step(self, batch: dict[str, Any]) -> Tensor: ...
+    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]: ...
+    def clip_grad_norm(self) -> Tensor | None: ...
+    def save_checkpoint(
+        self, run_dir: Path, global_step: int, epoch: int, train_loss: float | None = None
+    ) -> Any: ...

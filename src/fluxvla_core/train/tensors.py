@@ -1,0 +1,157 @@
+"""Named tensors to and from safetensors files, whole whatever way they are sharded in memory.
+
+The format (https://huggingface.co/docs/safetensors, 'Format'): eight bytes little-endian header
+length, a JSON header ``{name: {dtype, shape, data_offsets}}``, then the raw little-endian bytes.
+It is written here rather than by the library so that tensors can be gathered, summed and written
+one by one: no process ever holds a second copy of the model.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributed.tensor import DTensor, distribute_tensor
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.train.writer import CheckpointWriter
+
+_DTYPES: Mapping[torch.dtype, str] = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.float16: "F16",
+    torch.bfloat16: "BF16",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+_ALIASES = "aliases"
+
+
+def whole(tensor: Tensor) -> Tensor:
+    """The full tensor, gathered from all ranks if it is sharded: every rank must call this."""
+    tensor = tensor.detach()
+    return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
+
+
+def copy_whole(target: Tensor, source: Tensor) -> None:
+    """Copy the full ``source`` into ``target``, into this rank's part of it if it is sharded."""
+    with torch.no_grad():
+        target.copy_(like(target, source))
+
+
+def like(target: Tensor, source: Tensor) -> Tensor:
+    """The full ``source`` on the device of ``target``, sharded as it is; nothing is sent."""
+    if not isinstance(target, DTensor):
+        return source.to(target.device)
+    # Each rank cuts its own part: all have read the same verified file.
+    return distribute_tensor(
+        source.to(target.device), target.device_mesh, target.placements, src_data_rank=None
+    )
+
+
+def save_tensors(writer: CheckpointWriter | None, name: str, tensors: Mapping[str, Tensor]) -> None:
+    """Write ``tensors`` as file ``name``; all ranks call it, the first one has the writer.
+
+    Two names for one tensor (tied weights) are stored once, with the other name in the header.
+
+    Raises:
+        CheckpointError: a dtype that the format does not have.
+    """
+    owner: dict[int, str] = {}
+    aliases: dict[str, str] = {}
+    for key, tensor in tensors.items():
+        first = owner.setdefault(id(tensor), key)
+        if first != key:
+            aliases[key] = first
+    # Widest first keeps every tensor aligned to its own width.
+    order = sorted(owner.values(), key=lambda key: (-tensors[key].element_size(), key))
+    header = _header([(key, tensors[key]) for key in order], aliases)
+    if writer is None:
+        for key in order:
+            whole(tensors[key])
+        return
+    with writer.open(name) as file:
+        file.write(struct.pack("<Q", len(header)) + header)
+        for key in order:
+            file.write(_bytes(whole(tensors[key])))
+
+
+def _header(entries: Sequence[tuple[str, Tensor]], aliases: Mapping[str, str]) -> bytes:
+    table: dict[str, Any] = {"__metadata__": {"format": "pt", _ALIASES: json.dumps(aliases)}}
+    begin = 0
+    for key, tensor in entries:
+        if tensor.dtype not in _DTYPES:
+            raise CheckpointError(f"tensor {key} has dtype {tensor.dtype}, which cannot be saved")
+        end = begin + tensor.numel() * tensor.element_size()
+        table[key] = {
+            "dtype": _DTYPES[tensor.dtype],
+            "shape": list(tensor.shape),
+            "data_offsets": [begin, end],
+        }
+        begin = end
+    text = json.dumps(table).encode()
+    return text + b" " * (-len(text) % 8)
+
+
+def _bytes(tensor: Tensor) -> memoryview:
+    flat = tensor.cpu().contiguous().reshape(-1)
+    return memoryview(flat.view(torch.uint8).numpy().data if flat.numel() else b"")
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """All tensors of a safetensors file, on the CPU.
+
+    Raises:
+        CheckpointError: the file cannot be read as that format.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            aliases = json.loads((file.metadata() or {}).get(_ALIASES, "{}"))
+    except (OSError, ValueError, SafetensorError) as error:
+        raise CheckpointError(f"{path.name} cannot be read: {error}", where=str(path)) from error
+    return tensors | {key: tensors[first] for key, first in aliases.items()}
+
+
+def check_names(
+    found: Mapping[str, Tensor], wanted: Mapping[str, Tensor], what: str, where: str
+) -> None:
+    """Refuse tensors that are not those of this model.
+
+    Raises:
+        CheckpointError: lists missing, unexpected and mis-sized names, a few of each.
+    """
+    missing = sorted(set(wanted) - set(found))
+    unexpected = sorted(set(found) - set(wanted))
+    sizes = [
+        f"{name}: {tuple(found[name].shape)} in the checkpoint, {tuple(wanted[name].shape)} here"
+        for name in sorted(set(found) & set(wanted))
+        if found[name].shape != wanted[name].shape
+    ]
+    lines = [
+        f"    {len(items)} {kind}: {'; '.join(items[:4])}{' …' if len(items) > 4 else ''}"
+        for kind, items in (
+            ("missing in the checkpoint", missing),
+            ("unexpected in the checkpoint", unexpected),
+            ("of another size", sizes),
+        )
+        if items
+    ]
+    if lines:
+        raise CheckpointError(
+            f"{what} of the checkpoint are not this model's:\n" + "\n".join(lines),
+            where=where,
+            cause="it was made by another model, or by another version of this one",
+            next="resume with the config that made it: config.resolved.json in its folder",
+        )

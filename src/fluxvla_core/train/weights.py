@@ -1,0 +1,135 @@
+"""A model's weights in a checkpoint: which are in it, and whether they are this model's."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.train.checkpoint import MODEL, TRAINER, Checkpoint
+from fluxvla_core.train.tensors import check_names, like
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Frozen weights that are not saved because the model brings them itself.
+
+    A module says so by ``frozen_source``: where its frozen weights come from when it is built
+    (a package, a file). ``sha256`` proves on loading that they are still the same.
+    """
+
+    sources: Mapping[str, str] = field(default_factory=dict)
+    names: frozenset[str] = frozenset()
+    sha256: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {"sources": dict(self.sources), "sha256": self.sha256}
+
+
+def left_out(model: nn.Module) -> LeftOut:
+    """What :class:`LeftOut` there is in ``model``; reads those weights once to sum them up."""
+    sources = {
+        name: str(source)
+        for name, module in model.named_modules()
+        if (source := getattr(module, "frozen_source", None)) is not None
+    }
+    state = model.state_dict(keep_vars=True)
+    names = frozenset(
+        name
+        for name, tensor in state.items()
+        if not tensor.requires_grad and any(_inside(name, prefix) for prefix in sources)
+    )
+    digest = hashlib.sha256()
+    for name in sorted(names):
+        flat = state[name].detach().cpu().contiguous().reshape(-1)
+        digest.update(name.encode() + str(tuple(state[name].shape)).encode())
+        digest.update(memoryview(flat.view(torch.uint8).numpy()) if flat.numel() else b"")
+    return LeftOut(sources, names, digest.hexdigest() if names else "")
+
+
+def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
+    """Parameters and persistent buffers by name, but for those in ``without``.
+
+    Raises:
+        CheckpointError: the model keeps extra state that is no tensor.
+    """
+    skipped = set(without)
+    state = model.state_dict(keep_vars=True)
+    other = sorted(name for name, value in state.items() if not isinstance(value, Tensor))
+    if other:
+        raise CheckpointError(
+            f"the model's state_dict holds other than tensors: {', '.join(other)}",
+            next="keep such state in buffers, or in the config",
+        )
+    return {name: tensor for name, tensor in state.items() if name not in skipped}
+
+
+def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
+    state = model_tensors(model)
+    # strict=False only for what is left out of checkpoints: names and sizes have been checked.
+    model.load_state_dict(
+        {name: like(state[name].detach(), tensor) for name, tensor in tensors.items()},
+        strict=False,
+    )
+
+
+def check_model_tensors(
+    model: nn.Module,
+    tensors: Mapping[str, Tensor],
+    brings: LeftOut,
+    saved: Mapping[str, Any],
+    where: str,
+) -> None:
+    """Refuse weights that are not all of this model's, or that other frozen parts go with.
+
+    Args:
+        tensors: the checkpoint's weights.
+        brings: what the model says that it brings itself.
+        saved: what was left out of the checkpoint (``left_out`` of ``trainer.json``).
+
+    Raises:
+        CheckpointError: lists what differs.
+    """
+    brings = brings if saved.get("sha256") else LeftOut()
+    check_left_out(brings, saved, where)
+    check_names(tensors, model_tensors(model, brings.names), "the weights", where)
+
+
+def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
+    """Refuse frozen weights other than those that the checkpoint was trained with.
+
+    Raises:
+        CheckpointError: names where they come from.
+    """
+    if ours.sha256 != saved.get("sha256", ""):
+        places = {**saved.get("sources", {}), **ours.sources}
+        listed = "; ".join(f"{name or 'the model'} from {place}" for name, place in places.items())
+        raise CheckpointError(
+            f"frozen weights differ from those that the checkpoint was trained with ({listed})",
+            where=where,
+            cause="another version of the package or file that they come from is installed",
+            next="environment.json in the checkpoint's folder has the versions that made it",
+        )
+
+
+def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
+    """Put a checkpoint's weights (the averaged ones if kept) into a freshly built ``model``.
+
+    Raises:
+        CheckpointError: they are not this model's, or frozen parts have changed.
+    """
+    tensors = checkpoint.inference_weights()
+    saved = checkpoint.json(TRAINER)["left_out"]
+    check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
+    put_model_tensors(model, tensors)
+
+
+def _inside(name: str, prefix: str) -> bool:
+    return not prefix or name.startswith(prefix + ".")

@@ -1,0 +1,138 @@
+"""What the last steps gave, kept on the device until somebody looks.
+
+Fetching a loss makes the host wait for the device. The numbers of every step are kept as tensors
+and fetched together every few steps, then summed over the ranks in one operation.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.train.distributed import World, texts, total
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One step over all ranks: mean loss, gradient norm (None without clipping), and times.
+
+    ``data_wait`` and ``step_time`` are seconds, means over the ranks; ``lr`` is the rate used.
+    """
+
+    step: int
+    epoch: float
+    loss: float
+    grad_norm: float | None
+    lr: float
+    step_time: float
+    data_wait: float
+    samples_per_s: float
+
+
+@dataclass
+class _Pending:
+    step: int
+    epoch: float
+    lr: float
+    losses: list[Tensor]
+    ids: list[Any]
+    norm: Tensor | None
+    samples: int
+    wait: float
+    ended: float
+
+
+@dataclass
+class Window:
+    """Collects steps until :meth:`fetch`. All ranks fetch at the same steps."""
+
+    world: World
+    began: float = field(default_factory=time.perf_counter)
+    _pending: list[_Pending] = field(default_factory=list)
+
+    def restart_clock(self) -> None:
+        """Leave what happened since the last step (a save) out of the next step's time."""
+        self.began = time.perf_counter()
+
+    def add(
+        self,
+        step: int,
+        epoch: float,
+        lr: float,
+        losses: list[Tensor],
+        ids: list[Any],
+        norm: Tensor | None,
+        samples: int,
+        wait: float,
+    ) -> None:
+        """Keep one step: a loss and the sample ids of each micro-batch, all still on the device.
+
+        ``samples`` is over all ranks; ``wait`` the seconds spent waiting for data.
+        """
+        now = time.perf_counter()
+        self._pending.append(_Pending(step, epoch, lr, losses, ids, norm, samples, wait, now))
+
+    def fetch(self) -> list[StepRecord]:
+        """Everything since the last fetch, averaged over ranks; the host waits for the device.
+
+        Raises:
+            RunFailed: a loss or gradient norm is not finite; names step, rank and samples.
+        """
+        steps, self._pending = self._pending, []
+        if not steps:
+            return []
+        # float64 sums of float32 losses are exact, whatever order the ranks are added in.
+        losses = torch.stack([torch.stack(s.losses).double().mean() for s in steps]).cpu()
+        zero = torch.zeros((), device=self.world.device)
+        norms = torch.stack([zero if s.norm is None else s.norm.detach() for s in steps]).cpu()
+        ends = [self.began, *(s.ended for s in steps)]
+        self.began = ends[-1]
+        times = torch.tensor([b - a for a, b in pairwise(ends)], dtype=torch.float64)
+        waits = torch.tensor([s.wait for s in steps], dtype=torch.float64)
+        mean = total(self.world, torch.stack([losses, norms.double(), times, waits]).clone())
+        mean /= self.world.size
+        if not bool(torch.isfinite(mean[:2]).all()):
+            raise self._not_finite(steps, losses, mean)
+        return [
+            StepRecord(
+                step=s.step,
+                epoch=s.epoch,
+                loss=loss,
+                grad_norm=None if s.norm is None else norm,
+                lr=s.lr,
+                step_time=seconds,
+                data_wait=wait,
+                samples_per_s=s.samples / seconds if seconds > 0 else 0.0,
+            )
+            for s, loss, norm, seconds, wait in zip(steps, *mean.tolist(), strict=True)
+        ]
+
+    def _not_finite(self, steps: list[_Pending], losses: Tensor, mean: Tensor) -> RunFailed:
+        bad = int((~torch.isfinite(mean[:2])).any(dim=0).nonzero()[0])
+        step, loss, norm = steps[bad], mean[0, bad].item(), mean[1, bad].item()
+        named = ""
+        if not math.isfinite(losses[bad].item()):
+            for value, ids in zip(step.losses, step.ids, strict=True):
+                if not math.isfinite(value.item()):
+                    listed = ids.tolist() if isinstance(ids, Tensor) else ids
+                    which = "a batch without sample_ids" if ids is None else f"samples {listed}"
+                    named = f"rank {self.world.rank}: loss {value.item()} on {which}"
+                    break
+        lines = [text for text in texts(self.world, named) if text]
+        if math.isfinite(loss):
+            what = f"the gradient norm is {norm} at step {step.step}, with loss {loss:.6g}"
+        else:
+            what = f"the loss is {loss} at step {step.step}"
+        return RunFailed(
+            "\n".join([what, *(f"    {line}" for line in lines)]),
+            cause="a learning rate that is too high, or samples with wrong or huge values",
+            next="look at those samples, or lower the learning rate, and resume from the last "
+            "checkpoint, which was saved before this",
+        )

@@ -1,0 +1,199 @@
+"""Saving a checkpoint so that a kill at any moment leaves the ones before it as they were.
+
+A checkpoint is written into a folder with another name, every file flushed to the device, the
+manifest last; then the folder gets its final name in one rename. Readers only look at final names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, TypeVar
+
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.train.checkpoint import FOLDER, step_name
+from fluxvla_core.train.disk import Disk, aside, files_below
+from fluxvla_core.train.manifest import NAME as MANIFEST
+from fluxvla_core.train.manifest import FileEntry, Manifest, hash_file
+from fluxvla_core.train.shelf import PARTIAL
+
+_FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+T = TypeVar("T")
+
+
+class CheckpointWriter:
+    """Collects one checkpoint's files and makes them a checkpoint in :meth:`commit`.
+
+    Use as a context manager: leaving it by an exception removes what was written. The first
+    OSError is kept and everything after it skipped until ``commit`` raises it, because the other
+    ranks take part in gathering tensors and must not be left waiting in the middle.
+
+    Args:
+        work_dir: the run's folder; the checkpoint goes to ``checkpoints/step-…`` in it.
+        step, epoch: what the checkpoint says of itself.
+        disk: the file operations.
+    """
+
+    def __init__(self, work_dir: Path, step: int, epoch: int, disk: Disk | None = None) -> None:
+        self.disk = disk or Disk()
+        self.step, self.epoch = step, epoch
+        self.final = work_dir / FOLDER / step_name(step)
+        self.folder = self.final.with_name(self.final.name + PARTIAL)
+        self.files: dict[str, FileEntry] = {}
+        self._error: OSError | None = None
+
+    def __enter__(self) -> CheckpointWriter:
+        if self.folder.exists():
+            self.attempt(self.disk.remove_folder, self.folder)
+        self.attempt(self.disk.make_folder, self.folder)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            self._discard()
+
+    def attempt(self, operation: Callable[..., T], *arguments: Any) -> T | None:
+        """``operation(*arguments)``, or None if it or anything before it failed."""
+        if self._error is None:
+            try:
+                return operation(*arguments)
+            except OSError as error:
+                self._error = error
+        return None
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[HashedFile]:
+        """A new file ``name`` (``/`` between parts) to write bytes into."""
+        file = HashedFile(self, name)
+        try:
+            yield file
+        finally:
+            file.close()
+
+    def write_bytes(self, name: str, data: bytes) -> None:
+        """A file with ``data`` in it."""
+        with self.open(name) as file:
+            file.write(data)
+
+    def write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        """A file with ``value`` as JSON; floats keep every bit, NaN is refused.
+
+        Raises:
+            RunFailed: something in ``value`` is no JSON value.
+        """
+        try:
+            text = json.dumps(value, indent=1, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise RunFailed(
+                f"{name} of the checkpoint cannot be written as JSON: {error}",
+                cause="the state of the scheduler or metric holds more than plain values",
+            ) from error
+        self.write_bytes(name, (text + "\n").encode())
+
+    def write_folder(self, name: str, save: Callable[[Path], Any]) -> None:
+        """A folder that ``save`` fills by itself, as ``save_pretrained`` does."""
+        self.attempt(self._fill_folder, self.folder / name, save)
+
+    def _fill_folder(self, folder: Path, save: Callable[[Path], Any]) -> None:
+        self.disk.make_folder(folder)
+        save(folder)
+        for path in files_below(folder):
+            self.disk.finish(path.open("rb+"))
+            self.files[path.relative_to(self.folder).as_posix()] = FileEntry(
+                path.stat().st_size, hash_file(path)
+            )
+
+    def commit(self) -> Path:
+        """Give the folder its final name and return it.
+
+        Raises:
+            RunFailed: a file could not be written; the half-written folder is removed and every
+                earlier checkpoint is as it was.
+        """
+        self.write_bytes(MANIFEST, Manifest(self.step, self.epoch, self.files).to_bytes())
+        self.attempt(self._put_in_place)
+        if self._error is not None:
+            self._discard()
+            raise _failure(self._error, self.step, self.final) from self._error
+        return self.final
+
+    def _put_in_place(self) -> None:
+        for folder in sorted({(self.folder / name).parent for name in self.files}):
+            self.disk.sync_folder(folder)
+        self.disk.sync_folder(self.folder)
+        if self.final.exists():
+            self.disk.rename(self.final, aside(self.final))
+        self.disk.rename(self.folder, self.final)
+        self.disk.sync_folder(self.final.parent)
+
+    def _discard(self) -> None:
+        # A partial folder that cannot be removed either does no harm: readers ignore its name,
+        # and the next save of this step removes it.
+        with contextlib.suppress(OSError):
+            if self.folder.exists():
+                self.disk.remove_folder(self.folder)
+
+
+class HashedFile:
+    """One file of a checkpoint; its size and sum are known when it is closed."""
+
+    def __init__(self, writer: CheckpointWriter, name: str) -> None:
+        self._writer, self._name = writer, name
+        self._digest, self._size = hashlib.sha256(), 0
+        self._file: BinaryIO | None = writer.attempt(self._create, writer.folder / name)
+
+    def _create(self, path: Path) -> BinaryIO:
+        if not path.parent.exists():
+            self._writer.disk.make_folder(path.parent)
+        return self._writer.disk.create(path)
+
+    def write(self, data: bytes | memoryview) -> None:
+        """Append ``data``; nothing happens once the writer has failed."""
+        self._writer.attempt(self._append, data)
+
+    def _append(self, data: bytes | memoryview) -> None:
+        if self._file is not None:
+            self._writer.disk.write(self._file, data)
+            self._digest.update(data)
+            self._size += memoryview(data).nbytes
+
+    def close(self) -> None:
+        """Flush to the device and enter the file in the manifest."""
+        if self._file is None:
+            return
+        self._writer.attempt(self._finish, self._file)
+        if not self._file.closed:
+            with contextlib.suppress(OSError):
+                self._file.close()
+
+    def _finish(self, file: BinaryIO) -> None:
+        self._writer.disk.finish(file)
+        if self._name != MANIFEST:
+            self._writer.files[self._name] = FileEntry(self._size, self._digest.hexdigest())
+
+
+def _failure(error: OSError, step: int, path: Path) -> RunFailed:
+    full = error.errno in _FULL
+    if full:
+        what = f"the disk is full: the checkpoint of step {step} could not be saved"
+        mend = "make room, then run the same command with --resume auto"
+    else:
+        what = f"the checkpoint of step {step} could not be saved: {error}"
+        mend = "mend the disk or the folder, then run the same command with --resume auto"
+    return RunFailed(
+        what,
+        where=str(path),
+        cause=f"{error.strerror}, or a quota or a limit on file sizes" if full else None,
+        next=f"{mend}; the checkpoints before it are as they were",
+    )

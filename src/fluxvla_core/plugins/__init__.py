@@ -1,6 +1,9 @@
-"""Plugins: found by metadata, loaded by name."""
+"""Plugins: found by metadata, loaded by name.
+
+Only the index is imported here; ``plugins.registry`` brings the contracts with it, and a command
+that lists what is installed needs none of them.
+"""
 
 from fluxvla_core.plugins._metadata import Index, Plugin, index
-from fluxvla_core.plugins.registry import BY_NAME, Registry
 
-__all__ = ["BY_NAME", "Index", "Plugin", "Registry", "index"]
+__all__ = ["Index", "Plugin", "index"]

@@ -8,13 +8,14 @@ import os
 import signal
 import sys
 import tempfile
+import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from fluxvla_core.cli import ranks
-from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.errors import EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
 
 _GRACE_S = 60  # for a checkpoint, between asking ranks to stop and killing them
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -80,36 +81,50 @@ def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) ->
     try:
         agent("-m", "fluxvla_core", "run", *words)
     except SignalException as error:
-        said = ranks.failures(folder)
+        said = list(ranks.failures(folder).values())
         if error.sigval == signal.SIGINT:
             raise KeyboardInterrupt(_after("interrupted", said)) from None
-        if said and said[0].expected:
-            return _tell(said[0])
+        if said:
+            return _tell(ranks.root_cause(said))
         raise RunFailed(f"stopped by {signal.Signals(error.sigval).name}") from None
     except failed as error:
-        said = ranks.failures(folder)
-        if said:
-            return _tell(said[0])
-        rank, failure = error.get_first_failure()
-        raise RunFailed(
-            f"rank {rank} ended without a word: {_ending(failure.exitcode)}",
-            cause="killed from outside, most often for want of memory"
-            if failure.exitcode == -signal.SIGKILL
-            else None,
-        ) from None
+        said = _all(error.failures, ranks.failures(folder))
+        return _tell(ranks.root_cause(said))
     return 0
+
+
+def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ranks.Failure]:
+    """What each rank that failed said, or how it ended."""
+    now = time.monotonic()
+    first = min((f.time for f in said.values()), default=now)
+    found = []
+    for rank, process in ended.items():
+        if rank in said:
+            found.append(said[rank])
+            continue
+        # SIGTERM came from us, and so did SIGKILL to one that did not answer it in time.
+        late = process.exitcode == -signal.SIGKILL and now - first >= _GRACE_S
+        ours = late or process.exitcode == -signal.SIGTERM
+        text = f"ended without a word: {_ending(process.exitcode)}"
+        if process.exitcode == -signal.SIGKILL:
+            text += "\n  likely cause: killed from outside, most often for want of memory"
+        found.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=ours, wordless=True))
+    return found
 
 
 def _tell(failure: ranks.Failure) -> int:
     """Say what the rank would have said."""
-    text = failure.text if failure.expected else f"rank {failure.rank} failed:\n{failure.text}"
+    join = " " if failure.wordless else " failed:\n"
+    text = failure.text if failure.expected else f"rank {failure.rank}{join}{failure.text}"
     print(text, file=sys.stderr)
     return failure.code
 
 
 def _after(prefix: str, said: list[ranks.Failure]) -> str:
     """What an interrupted rank added (where it saved), without the word itself."""
-    texts = [f.text.removeprefix(prefix).removeprefix(": ") for f in said if f.code == 130]
+    texts = [
+        f.text.removeprefix(prefix).removeprefix(": ") for f in said if f.code == EXIT_INTERRUPTED
+    ]
     return texts[0] if texts else ""
 
 

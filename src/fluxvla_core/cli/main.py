@@ -5,11 +5,9 @@ Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -58,6 +56,8 @@ def report(error: BaseException) -> int:
 
 
 def _trace(error: BaseException) -> str:
+    import traceback
+
     return "".join(traceback.format_exception(type(error), error, error.__traceback__))
 
 
@@ -104,11 +104,17 @@ def _group(words: list[str], inside: list[str]) -> int:
     if len(words) == 1 or words[1] in {"-h", "--help"}:
         print("\n".join(_rows(inside)))
         return EXIT_DONE
-    near = difflib.get_close_matches(words[1], [name.split()[1] for name in inside], 1)
+    near = _close(words[1], [name.split()[1] for name in inside])
     hint = f"; did you mean 'fluxvla {words[0]} {near[0]}'?" if near else ""
     raise UsageError(
         f"fluxvla {words[0]} has no {words[1]!r}{hint}", next=f"fluxvla {words[0]} --help"
     )
+
+
+def _close(word: str, names: list[str]) -> list[str]:
+    import difflib  # with traceback above, a tenth of what `fluxvla --help` may take
+
+    return difflib.get_close_matches(word, names, 1)
 
 
 def _unknown(word: str, names: list[str]) -> UsageError:
@@ -116,7 +122,7 @@ def _unknown(word: str, names: list[str]) -> UsageError:
         return UsageError(
             f"unknown argument {word!r}: the command comes first", next="fluxvla run --help"
         )
-    near = difflib.get_close_matches(word, [*names, "config", "plugins"], 1)
+    near = _close(word, [*names, "config", "plugins"])
     hint = f"; did you mean 'fluxvla {near[0]}'?" if near else ""
     return UsageError(f"no command {word!r}{hint}", next="fluxvla --help")
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -34,20 +35,31 @@ def launched() -> bool:
 
 @dataclass(frozen=True)
 class Failure:
-    """How one rank ended. ``time`` is monotonic; ``expected`` means a FluxError."""
+    """How one rank ended.
+
+    Args:
+        time: monotonic seconds, which all processes of a machine share.
+        expected: a FluxError, whose text says everything.
+        asked: it was stopped from outside, because another rank had failed.
+        wordless: it left no record: killed, or crashed below Python.
+    """
 
     rank: int
     time: float
     text: str
     code: int
-    expected: bool
+    expected: bool = False
+    asked: bool = False
+    wordless: bool = False
 
 
 def record(text: str, code: int, *, expected: bool) -> bool:
     """Leave an error for the launcher; False if there is none to read it."""
     if not launched():
         return False
-    failure = Failure(rank(), time.monotonic(), text, code, expected)
+    # What training, robot loops and this command line say of a SIGTERM.
+    asked = "stopped by SIGTERM" in text
+    failure = Failure(rank(), time.monotonic(), text, code, expected, asked)
     path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.json"
     try:
         path.write_text(json.dumps(asdict(failure)))
@@ -56,7 +68,16 @@ def record(text: str, code: int, *, expected: bool) -> bool:
     return True
 
 
-def failures(folder: Path) -> list[Failure]:
-    """What ranks recorded, the most telling first: FluxErrors, then by time."""
+def failures(folder: Path) -> dict[int, Failure]:
+    """What ranks recorded, by rank."""
     found = [Failure(**json.loads(path.read_text())) for path in folder.glob("rank-*.json")]
-    return sorted(found, key=lambda f: (not f.expected, f.time))
+    return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
+
+
+def root_cause(found: Sequence[Failure]) -> Failure:
+    """The failure that the others followed from, as well as can be told.
+
+    A rank that was asked to stop never is. A FluxError names a cause; a rank that was killed
+    explains the broken connections of the others; else the earliest is.
+    """
+    return min(found, key=lambda f: (f.asked, not f.expected, not f.wordless, f.time))

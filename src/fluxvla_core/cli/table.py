@@ -7,11 +7,10 @@ A command is a class with ``help``, ``add_arguments(parser)`` and ``run(args) ->
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """``target`` is ``module:Class``."""
 
     target: str
@@ -26,9 +25,9 @@ COMMANDS: Mapping[str, Entry] = {
     "config check": Entry(
         "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
     ),
-    "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
+    "plugins list": Entry("fluxvla_core.cli.plugin_list:List", "list what is installed"),
     "plugins show": Entry(
-        "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
+        "fluxvla_core.cli.plugin_show:Show", "show one class: its keys, its origin"
     ),
     "plugins doctor": Entry(
         "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"

@@ -1,43 +1,19 @@
-"""``fluxvla plugins list`` and ``fluxvla plugins show``: what is installed, nothing imported."""
+"""``fluxvla plugins show NAME``: what a config may say to a class, read from its source."""
 
 from __future__ import annotations
 
 import argparse
 import difflib
-import json
-import sys
-from typing import Any
 
 from fluxvla_core.cli.parser import Parser
+from fluxvla_core.config.check import INJECTED
 from fluxvla_core.config.constructor import Signature
 from fluxvla_core.config.resolve import installed
 from fluxvla_core.errors import MissingPlugin, PluginError
 from fluxvla_core.plugins import known
 from fluxvla_core.plugins._metadata import Plugin, canonical, index
 from fluxvla_core.plugins.groups import PREFIX, REGISTRIES
-from fluxvla_core.plugins.load import DOCTOR, LIST
-
-INJECTED_NOTE = "filled in when the run starts"
-
-
-class List:
-    api = "1.0"
-    help = "List everything that is installed for FluxVLA, without importing it."
-
-    def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("--json", action="store_true", help="for machines")
-
-    def run(self, args: argparse.Namespace) -> int:
-        found = index()
-        plugins = [p for _, many in sorted(found.plugins.items()) for p in many]
-        if args.json:
-            print(json.dumps([_record(p) for p in plugins], indent=1))
-        else:
-            print("\n".join(_table(plugins)) or "nothing is installed")
-        if found.broken:
-            count = len(found.broken)
-            print(f"{count} distribution(s) could not be read; run: {DOCTOR}", file=sys.stderr)
-        return 0
+from fluxvla_core.plugins.load import LIST
 
 
 class Show:
@@ -98,37 +74,13 @@ def describe(plugin: Plugin) -> str:
 
 
 def _keys(signature: Signature) -> list[str]:
-    from fluxvla_core.config.check import INJECTED
-
     lines = ["  keys"] if signature.parameters or signature.open else ["  keys         none"]
     for parameter in signature.parameters:
         note = "required" if parameter.required else ""
         if parameter.name in INJECTED:
-            note = INJECTED_NOTE
+            note = "filled in when the run starts"
         text = f"    {parameter.name}{parameter.text}"
         lines.append(f"{text}   [{note}]" if note else text)
     if signature.open:
         lines.append("    ...   [takes further keys, which cannot be checked]")
-    return lines
-
-
-def _record(plugin: Plugin) -> dict[str, Any]:
-    return {
-        "group": plugin.group,
-        "name": plugin.name,
-        "distribution": plugin.dist,
-        "version": plugin.version,
-        "value": plugin.value,
-    }
-
-
-def _table(plugins: list[Plugin]) -> list[str]:
-    lines: list[str] = []
-    width = max((len(p.name) for p in plugins), default=0)
-    group = ""
-    for plugin in plugins:
-        if plugin.group != group:
-            group = plugin.group
-            lines.append(group)
-        lines.append(f"  {plugin.name:{width}}  {plugin.origin}")
     return lines

@@ -27,8 +27,8 @@ from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.joining import Chunk, Joiner
 from fluxvla_core.control.path import CommandPath
 from fluxvla_core.control.worker import Worker
-from fluxvla_core.errors import SafetyStop
 from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.stops import BadChunk, Starved
 
 Array = npt.NDArray[np.float64]
 # How often a wait that may be long looks whether somebody wants it to end.
@@ -98,6 +98,7 @@ class Loop:
         self.joiner.reset()
         try:
             self._receive(*self._first())
+            self.path.rate.reset()
             if whole_chunks:
                 self._play_whole()
             else:
@@ -137,7 +138,7 @@ class Loop:
         while (row := self.joiner.target(now + (len(rows) + 1) * period)) is not None:
             rows.append(row)
         if not rows:
-            raise SafetyStop(
+            raise BadChunk(
                 f"a chunk at {self.keyframe_hz:g} Hz holds no command at "
                 f"{self.path.rate.hz:g} Hz: it is too short"
             )
@@ -177,7 +178,7 @@ class Loop:
                 if future.done():
                     raise
             if time.monotonic() > until:
-                raise SafetyStop(
+                raise Starved(
                     f"the policy gave no chunk within {self.settings.first_chunk_s:g} s",
                     cause="it hangs, or it is far slower than this robot needs",
                     next="safety.first_chunk_s sets how long it may take to warm up",
@@ -203,7 +204,7 @@ class Loop:
 
     def _check_starved(self, seconds: float) -> None:
         if seconds > self.settings.starvation_s:
-            raise SafetyStop(
+            raise Starved(
                 f"the robot waits for a chunk for {seconds:.2f} s, "
                 f"safety.starvation_s is {self.settings.starvation_s:g}",
                 cause="the policy hangs, or is slower than its chunks are long",

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.control.rate import Rate
-from fluxvla_core.errors import SafetyStop
 from fluxvla_core.safety.limits import Clamp, Limiter
+from fluxvla_core.safety.stops import BadCommand
 from fluxvla_core.safety.trips import Latch
 
 Array = npt.NDArray[np.float64]
@@ -63,15 +63,15 @@ class CommandPath:
         self._between = False
         rate.on_beat = self._beat
 
-    def play(self, targets: npt.ArrayLike) -> None:
-        """Send one command for each row of ``(N, D)`` targets.
+    def play(self, targets: npt.ArrayLike, filtered: bool = True) -> None:
+        """Send one command for each row of ``(N, D)`` targets; ``filtered`` through the filters.
 
         Raises:
             SafetyStop: the latch is tripped, or a target is not finite or of another shape.
         """
         self.latch.check()
         wanted = np.asarray(targets, dtype=np.float64)
-        shaped = np.array([self._filtered(row) for row in wanted]) if self._filters else wanted
+        shaped = np.array([self._filtered(row) for row in wanted]) if filtered else wanted
         before = self.limiter.snapshot()
         commands, clamps = self.limiter.run(shaped)
         played = len(commands)
@@ -127,7 +127,7 @@ class CommandPath:
         for apply in self._filters:
             row = np.asarray(apply(row.copy()), dtype=np.float64)
             if row.shape != (self.limiter.embodiment.dim,):
-                raise SafetyStop(
+                raise BadCommand(
                     f"action filter {type(apply).__name__} made an action of shape {row.shape}; "
                     f"{self.limiter.embodiment.name} takes ({self.limiter.embodiment.dim},)"
                 )

@@ -48,7 +48,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import ConfigError, SafetyStop
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.safety.stops import BadCommand
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -128,8 +129,13 @@ class Limiter:
     def last(self) -> Array:
         """``(D,)`` the last command (a copy), or where ``start`` found the arm."""
         if self._last is None:
-            raise SafetyStop("no command can be formed before the limiter was started")
+            raise BadCommand("no command can be formed before the limiter was started")
         return self._last.copy()
+
+    @property
+    def started(self) -> bool:
+        """Whether it knows where the arm is."""
+        return self._last is not None
 
     @property
     def acceleration(self) -> Array:
@@ -148,14 +154,14 @@ class Limiter:
             measured: ``(D,)`` position of every action joint.
 
         Raises:
-            SafetyStop: a joint is not finite, or further beyond its limits than backlash explains.
+            BadCommand: a joint is not finite, or further beyond its limits than backlash explains.
         """
         pose = self._checked(measured, "the measured pose")
         excess = np.maximum(self.lower - pose, pose - self.upper)
         slack = np.minimum(START_SHARE * (self.upper - self.lower), START_SLACK)
         for index in np.flatnonzero(excess > slack):
             joint = self.embodiment.joints[index]
-            raise SafetyStop(
+            raise BadCommand(
                 f"{joint.name} is at {pose[index]:.4g}, outside its limits "
                 f"[{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
                 cause="the joint was moved by hand, or its zero or unit is not what the spec says",
@@ -176,7 +182,7 @@ class Limiter:
             ``(D,)`` command, and one ``Clamp`` for each joint that differs from ``wanted``.
 
         Raises:
-            SafetyStop: ``wanted`` has another shape or is not finite; nothing changes then.
+            BadCommand: ``wanted`` has another shape or is not finite; nothing changes then.
         """
         before = self.last
         target = self._checked(wanted, "the command")
@@ -272,12 +278,12 @@ class Limiter:
         array = np.asarray(values, dtype=np.float64)
         names = self.embodiment.joint_names
         if array.shape != (len(names),):
-            raise SafetyStop(
+            raise BadCommand(
                 f"{what} has shape {array.shape}; {self.embodiment.name} takes ({len(names)},)"
             )
         bad = [name for name, ok in zip(names, np.isfinite(array), strict=True) if not ok]
         if bad:
-            raise SafetyStop(f"{what} is not finite for {', '.join(bad)}")
+            raise BadCommand(f"{what} is not finite for {', '.join(bad)}")
         return array
 
 

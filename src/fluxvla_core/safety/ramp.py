@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import numpy.typing as npt
 
@@ -14,45 +12,42 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 Array = npt.NDArray[np.float64]
 
 
-def ramp(limiter: Limiter, pose: npt.ArrayLike, speed: float) -> Iterator[Array]:
-    """Commands from where the limiter is to ``pose``: all joints set off and arrive together.
+def ramp(limiter: Limiter, pose: npt.ArrayLike, speed: float) -> Array:
+    """Targets from where the limiter is to ``pose``: all joints set off and arrive together.
 
-    The way is a straight line in joint space, so that it is the same every time. The share ``s`` of
-    it is driven like a joint of its own, from 0 to 1, with the speed and acceleration that the
-    joint with the longest way allows; every joint then keeps its limits.
+    The way is a straight line in joint space, so that it is the same every time. The share of it
+    that is done is driven like a joint of its own, from 0 to 1, with the speed and acceleration
+    that the joint with the longest way allows; every joint then keeps its limits.
 
     Args:
-        limiter: started; each command goes through it.
+        limiter: started and at rest; it is not changed.
         pose: ``(D,)`` within the position limits.
         speed: share of the velocity limits, in (0, 1].
 
-    Yields:
-        ``(D,)`` commands, the last one at ``pose`` and at rest. None when the arm is there.
+    Returns:
+        ``(N, D)`` targets, the last one ``pose``; ``N`` is 0 when the arm is there.
 
     Raises:
         ConfigError: the pose has another shape, is not finite, or is beyond a position limit.
     """
     target = check_pose(pose, limiter.embodiment)
-    while not limiter.at_rest:
-        yield limiter.brake()
     start = limiter.last
     way = target - start
     moving = way != 0.0
     if not moving.any():
-        return
+        return np.empty((0, len(way)))
     distance = np.abs(way[moving])
     pace = float(np.min(limiter.velocity[moving] * speed / distance))
     push = float(np.min(limiter.acceleration[moving] / distance))
     share = Joint("share", "normalized", 0.0, 1.0, pace, push)
     driver = Limiter(EmbodimentSpec("way", (share,), (), 1.0 / limiter.period), limiter.period)
     driver.start([0.0])
-    while True:
-        (done,), _ = driver.step([1.0])
-        wanted = target if done == 1.0 else start + way * done
-        command, _ = limiter.step(wanted)
-        yield command
-        if done == 1.0 and np.array_equal(command, target):
-            return
+    rows = []
+    done = 0.0
+    while done < 1.0:
+        done = float(driver.step([1.0])[0][0])
+        rows.append(target if done == 1.0 else start + way * done)
+    return np.array(rows)
 
 
 def check_pose(pose: npt.ArrayLike, embodiment: EmbodimentSpec) -> Array:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import FluxError, SafetyStop
 from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.stops import BadChunk, BadFrame, NotFollowing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -101,7 +102,7 @@ class TrackingWatch:
             now: seconds, when it was measured.
 
         Raises:
-            SafetyStop: a joint has been too far behind for too long.
+            NotFollowing: a joint has been too far behind for too long.
         """
         error = np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
         behind = error > self._allowed
@@ -109,7 +110,7 @@ class TrackingWatch:
         late = np.flatnonzero(behind & (now - self._since >= self._time))
         if late.size:
             index = int(late[np.argmax(error[late])])
-            raise SafetyStop(
+            raise NotFollowing(
                 f"{self._names[index]} is {error[index]:.3g} away from its command "
                 f"for {now - self._since[index]:.2f} s; {self._allowed[index]:.3g} are allowed "
                 f"for {self._time:g} s",
@@ -122,12 +123,12 @@ def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
     """Where in the state vector each action joint's position is; ``(dim,)`` indices.
 
     Raises:
-        SafetyStop: the state lacks a joint that is commanded.
+        BadFrame: the state lacks a joint that is commanded.
     """
     names = embodiment.state_names
     missing = [name for name in embodiment.joint_names if name not in names]
     if missing:
-        raise SafetyStop(
+        raise BadFrame(
             f"the state of {embodiment.name} does not tell where {', '.join(missing)} is; "
             "a joint that cannot be read back cannot be moved safely"
         )
@@ -154,23 +155,23 @@ def check_chunk(
         ``(T, dim)`` float64.
 
     Raises:
-        SafetyStop: another shape, empty, a value that is not finite, far beyond a position limit,
+        BadChunk: another shape, empty, a value that is not finite, far beyond a position limit,
             or a jump that no motion explains.
     """
     try:
         keyframes = np.asarray(chunk, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise SafetyStop(f"the policy's chunk is no array of numbers: {error}") from error
+        raise BadChunk(f"the policy's chunk is no array of numbers: {error}") from error
     dim = embodiment.dim
     if keyframes.ndim != 2 or keyframes.shape[1] != dim or len(keyframes) == 0:
-        raise SafetyStop(
+        raise BadChunk(
             f"the policy's chunk has shape {keyframes.shape}; {embodiment.name} takes (T, {dim})"
         )
     names = embodiment.joint_names
     bad = np.argwhere(~np.isfinite(keyframes))
     if bad.size:
         row, column = bad[0]
-        raise SafetyStop(
+        raise BadChunk(
             f"the policy's chunk is not finite: keyframe {row}, {names[column]} is "
             f"{keyframes[row, column]}",
             cause="the policy diverged, or an input that it was given is not finite",
@@ -181,7 +182,7 @@ def check_chunk(
     row, column = np.unravel_index(np.argmax(excess), excess.shape)
     if excess[row, column] > settings.excess:
         joint = joints[column]
-        raise SafetyStop(
+        raise BadChunk(
             f"keyframe {row} wants {joint.name} at {keyframes[row, column]:.4g}, far beyond its "
             f"limits [{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
             cause="the policy's units or statistics are not this robot's",
@@ -191,7 +192,7 @@ def check_chunk(
     seconds = np.abs(moves) / np.array([j.velocity for j in joints]) - 1.0 / rate_hz
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)
     if seconds[row, column] > settings.jump_s:
-        raise SafetyStop(
+        raise BadChunk(
             f"keyframe {row} wants {names[column]} to jump by {moves[row, column]:.4g}; at full "
             f"speed that takes {seconds[row, column]:.2f} s more than there are",
             cause="the policy is not for the pose that the arm is in, or it diverged",

@@ -1,0 +1,320 @@
+"""``BaseInferenceRunner``: a policy drives a robot, one task after the other, within limits.
+
+A robot whose operator has the full contract needs no runner of its own. One of the
+specification's shape overrides ``get_ros_observation``, ``update_observation_window`` and
+``_execute_actions``; what the latter is given has passed the safety already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import RunContext, build_action_filter_from_cfg, build_operator_from_cfg
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.protocols import Policy
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.joining import LatestOnly, Synchronous
+from fluxvla_core.control.worker import Worker
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.hooks import build_hooks
+from fluxvla_core.infer.episode import Episode
+from fluxvla_core.infer.plan import Plan
+from fluxvla_core.infer.robot import Robot
+from fluxvla_core.infer.tasks import Task, check_descriptions, resolve_task, tasks
+from fluxvla_core.record.trace import next_folder
+from fluxvla_core.safety.ramp import check_pose
+from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.trips import Latch
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+
+Array = npt.NDArray[np.float64]
+FOLDER = "inference"
+
+
+class BaseInferenceRunner:
+    """Runs a policy on a robot: ``run_setup()``, then ``run()``.
+
+    Args:
+        cfg: the whole config (injected).
+        context: what the run knows (injected): work dir, task, reporter.
+        seed: of the policy's noise; episode ``n`` uses ``seed + n``.
+        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
+        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
+        policy: an object of the Policy contract instead of a checkpoint.
+        task_descriptions: id -> instruction; what ``--task ID`` may name.
+        state_dim: checked against the robot's state, if given.
+        action_chunk: how many of a chunk's actions may be used; all by default.
+        publish_rate: commands a second; the embodiment's rate by default.
+        max_publish_step: commands after which an episode ends.
+        camera_names: the cameras that are observed; those that the policy looks at by default.
+        operator: table or object.
+        prepare_pose: where the arm goes before an episode, in the embodiment's units.
+        embodiment: of an operator that has none, or narrower limits for one that has.
+        execute_horizon: how many actions of a chunk are executed before the next is asked for;
+            without a meaning, and ignored, where ``async_execution`` asks all the time.
+        async_execution: think while moving; the newest chunk replaces the one before.
+        action_filters: tables or callables that may alter an action, in order, before the limits.
+        safety: thresholds, see ``SafetySettings``.
+        mixed_precision_dtype: ``float32`` or ``bf16``.
+        device: of torch.
+        record_fps: frames a second of the recorded videos; None records none.
+        ready_timeout: seconds that the robot may take to give its first reading.
+
+    Raises:
+        ConfigError, PluginError: the operator cannot be built, or the values do not fit it.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(
+        self,
+        cfg: Mapping[str, Any] | None = None,
+        context: RunContext | None = None,
+        seed: int = 7,
+        ckpt_path: str | None = None,
+        dataset: Any = None,
+        denormalize_action: Any = None,
+        policy: Policy | None = None,
+        task_descriptions: Mapping[str, str] | None = None,
+        state_dim: int | None = None,
+        action_chunk: int | None = None,
+        publish_rate: float | None = None,
+        max_publish_step: int = 10000,
+        camera_names: Sequence[str] | None = None,
+        operator: Any = None,
+        prepare_pose: Sequence[float] | None = None,
+        embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
+        execute_horizon: int | None = None,
+        async_execution: bool = False,
+        action_filters: Sequence[Any] = (),
+        safety: Mapping[str, Any] | None = None,
+        mixed_precision_dtype: str = "float32",
+        device: str = "cpu",
+        record_fps: float | None = 10.0,
+        ready_timeout: float = 10.0,
+    ) -> None:
+        self.cfg = cfg
+        self.context = context or RunContext(config=cfg or {})
+        self.seed = seed
+        self.ckpt_path = ckpt_path
+        self.dataset = dataset
+        self.denormalize_action = denormalize_action
+        self.policy = policy
+        self.task_descriptions = check_descriptions(task_descriptions)
+        self.action_chunk = action_chunk
+        self.execute_horizon = execute_horizon
+        self.max_publish_step = max_publish_step
+        self.camera_names = None if camera_names is None else tuple(camera_names)
+        self.prepare_pose = prepare_pose
+        self.async_execution = async_execution
+        self.mixed_precision_dtype = mixed_precision_dtype
+        self.device = device
+        self.record_fps = record_fps
+        self.ready_timeout = ready_timeout
+        self.safety = SafetySettings.of(safety)
+        if operator is None:
+            raise ConfigError(
+                f"{type(self).__name__} has no operator: which robot is it to drive?",
+                where=self.context.where(self.context.section),
+                next="set operator = dict(type='...') in this section",
+            )
+        counts = {
+            "action_chunk": action_chunk,
+            "execute_horizon": execute_horizon,
+            "max_publish_step": max_publish_step,
+        }
+        for name, value in counts.items():
+            if value is not None and value < 1:
+                raise self._wrong(name, f"must be at least 1, got {value}")
+        self.ros_operator = build_operator_from_cfg(operator, context)
+        own_sending = type(self)._execute_actions is not BaseInferenceRunner._execute_actions
+        self.robot = Robot(self.ros_operator, embodiment, sends=own_sending)
+        self.embodiment = self.robot.embodiment
+        self.publish_rate = self._checked_rate(publish_rate)
+        if state_dim is not None and state_dim != self.embodiment.state_dim:
+            raise self._wrong(
+                "state_dim",
+                f"is {state_dim}; {self.embodiment.name} has "
+                f"{self.embodiment.state_dim} state values",
+            )
+        if async_execution and self.robot.lockstep:
+            raise self._wrong(
+                "async_execution",
+                "needs a robot that lives in real time: this simulation "
+                "waits while the policy thinks (its operator may have realtime=True)",
+            )
+        self.action_filters = [build_action_filter_from_cfg(f, context) for f in action_filters]
+        self.latch = Latch(self.robot.clock.now)
+        self._frame: Frame | None = None
+        self._episodes = 0
+
+    def run_setup(self) -> None:
+        """Load the policy and check that it, the robot, the poses and the task fit together.
+
+        Raises:
+            CheckpointError: there is no policy to load.
+            SpecMismatch: the policy is for another robot.
+            ConfigError, UsageError: a pose, a camera or the task does not fit.
+        """
+        if self.context.task is not None:
+            resolve_task(self.context.task, self.task_descriptions)
+        if self.policy is None:
+            from fluxvla_core.infer.local_policy import find_checkpoint, load_policy
+
+            place = find_checkpoint(self.ckpt_path, self.context.work_dir)
+            self.context.reporter.info(f"policy: {place}")
+            self.policy = load_policy(
+                place,
+                self.device,
+                self.dataset,
+                self.denormalize_action,
+                self.mixed_precision_dtype,
+            )
+        looks_at = tuple(getattr(self.policy, "cameras", self.policy.embodiment.camera_names))
+        self._cameras = self.camera_names or looks_at
+        check_match(self.policy.embodiment, self.embodiment, "the policy", "the robot", looks_at)
+        known = self.embodiment.camera_names
+        for name in (*self._cameras, *looks_at):
+            if name not in known:
+                raise self._wrong("camera_names", f"{name!r} is none of {', '.join(known)}")
+            if name not in self._cameras:
+                raise self._wrong("camera_names", f"the policy looks at {name!r} too")
+        if self.prepare_pose is not None:
+            check_pose(self.prepare_pose, self.embodiment)
+
+    def run(self) -> dict[str, Any]:
+        """Connect, run the task that was given, or those that a person asks for, and stop.
+
+        Returns:
+            The last episode's task, outcome, success and steps, and how many there were.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C; the robot was stopped.
+            RunFailed: SIGTERM; the robot was stopped.
+            Exception: what ended the run; the robot was stopped.
+        """
+        hooks = build_hooks(self.context)
+        worker = Worker("fluxvla-policy")
+        ended, result = "failed", {"episodes": 0}
+        self._work = (hooks, worker)
+        with Interrupts() as interrupts:
+            self._interrupts = interrupts
+            try:
+                hooks.call("run_started")
+                self.robot.connect()
+                asked = tasks(self.context.task, self.task_descriptions)
+                for task in asked:
+                    summary = self._run_episode(task)
+                    self._episodes += 1
+                    kept = ("task", "outcome", "success", "steps")
+                    result = {"episodes": self._episodes, **{k: summary[k] for k in kept}}
+                ended = "ok"
+            except Interrupted as signal:
+                ended = "interrupted"
+                raise signal.final() from None
+            finally:
+                interrupts.stopping = True
+                self._shut_down(worker)
+                hooks.call("run_finished", outcome=ended)
+        return result
+
+    def get_ros_observation(self) -> tuple[Any, ...]:
+        """The newest reading: one picture for each of ``camera_names``, then the state.
+
+        A subclass returns whatever its ``update_observation_window`` makes use of.
+        """
+        frame = self.ros_operator.get_frame()
+        self._frame = frame
+        return (*(frame.images.get(name) for name in self._cameras), frame.state)
+
+    def update_observation_window(self) -> dict[str, Any]:
+        """What the policy is asked with, but for the instruction.
+
+        Returns:
+            ``qpos``: ``(state_dim,)`` float32, and ``images``: camera -> ``(H, W, 3)`` uint8 RGB. A
+            stream that has not come yet is None.
+        """
+        *images, state = self.get_ros_observation()
+        return {
+            "qpos": None if state is None else np.asarray(state, dtype=np.float32),
+            "images": dict(zip(self._cameras, images, strict=True)),
+        }
+
+    def _execute_actions(self, actions: Array, rate: Any) -> None:
+        """Send ``(N, D)`` commands that are within all limits, one at each beat of ``rate``."""
+        for action in actions:
+            self.robot.send(action)
+            rate.sleep()
+
+    def _run_episode(self, task: Task) -> dict[str, Any]:
+        """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""
+        assert self.policy is not None, "run_setup() comes before run()"
+        hooks, worker = self._work
+        reporter = self.context.reporter
+        folder = next_folder(Path(self.context.work_dir) / FOLDER, task.name)
+        reporter.info(f"task: {task.instruction}")
+        # While it moves and thinks, a chunk is left when the next is there, not before.
+        horizon = None if self.async_execution else self.execute_horizon
+        horizons = [n for n in (self.action_chunk, horizon) if n is not None]
+        plan = Plan(
+            robot=self.robot,
+            policy=self.policy,
+            cameras=self._cameras,
+            rate_hz=self.publish_rate,
+            settings=self.safety,
+            latch=self.latch,
+            filters=self.action_filters,
+            joiner=LatestOnly() if self.async_execution else Synchronous(),
+            whole_chunks=not self.async_execution,
+            keyframes=min(horizons) if horizons else None,
+            most_steps=self.max_publish_step,
+            start_pose=self.prepare_pose,
+            look=self._look,
+            execute=self._execute_actions,
+            video_fps=self.record_fps,
+            ready_s=self.ready_timeout,
+            interrupts=self._interrupts,
+            worker=worker,
+            hooks=hooks,
+            context=self.context,
+        )
+        return Episode(plan, task, self.seed + self._episodes, folder).run()
+
+    def _look(self) -> tuple[dict[str, Any], Frame | None]:
+        self._frame = None
+        window = self.update_observation_window()
+        return window, self._frame
+
+    def _shut_down(self, worker: Worker) -> None:
+        reporter = self.context.reporter
+        for problem in (self.robot.stop(), self.robot.close()):
+            if problem:
+                reporter.warn(problem)
+        if not worker.close(1.0):
+            reporter.warn("the policy still hangs; its thread ends with the program")
+
+    def _checked_rate(self, publish_rate: float | None) -> float:
+        most = self.embodiment.rate_hz
+        if publish_rate is None:
+            return most
+        if not 0 < publish_rate <= most:
+            raise self._wrong(
+                "publish_rate",
+                f"is {publish_rate:g} Hz; {self.embodiment.name} takes up to "
+                f"{most:g} commands a second",
+            )
+        if self.robot.lockstep and publish_rate != most:
+            raise self._wrong(
+                "publish_rate",
+                f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
+            )
+        return float(publish_rate)
+
+    def _wrong(self, key: str, what: str) -> ConfigError:
+        section = self.context.section
+        return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))

@@ -1,0 +1,318 @@
+"""One episode on a robot, from the first reading to the record that it leaves behind.
+
+Whatever happens in it, it ends in a safe stop: the arm brakes within its limits where it still
+obeys, and the operator's own ``stop`` is called where something went wrong.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.loop import EpisodeOver, Loop, Seen
+from fluxvla_core.control.path import CommandPath, Sent
+from fluxvla_core.control.rate import Rate
+from fluxvla_core.errors import FluxError, NotReady, OperatorError, RunFailed
+from fluxvla_core.infer.episode_record import EpisodeRecord
+from fluxvla_core.infer.plan import Answer, Plan, PolicyFailed
+from fluxvla_core.infer.tasks import Task
+from fluxvla_core.record.trace import EpisodeTrace
+from fluxvla_core.safety.gates import FreshnessGate, check_frame
+from fluxvla_core.safety.limits import Limiter
+from fluxvla_core.safety.ramp import ramp
+from fluxvla_core.safety.stops import BadChunk, BadFrame
+from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
+
+Array = npt.NDArray[np.float64]
+# After these the arm no longer obeys, or nobody knows whether it does: it is not commanded on.
+_NOT_BRAKED = ("operator", "tracking", "execute")
+
+
+class Episode:
+    """Runs once. ``run`` returns the summary that ``episode.json`` holds.
+
+    Args:
+        plan: what to run with.
+        task: what to do.
+        seed: of everything random in the policy.
+        folder: where the record goes.
+
+    Raises:
+        RunFailed: the folder cannot be written to.
+        BadFrame: the state does not tell where a commanded joint is.
+    """
+
+    def __init__(self, plan: Plan, task: Task, seed: int, folder: Path) -> None:
+        self._plan = plan
+        self._task = task
+        self._seed = seed
+        self._folder = folder
+        embodiment, settings = plan.robot.embodiment, plan.settings
+        self._rate = Rate(plan.rate_hz, plan.robot.clock)
+        self._limiter = Limiter(
+            embodiment,
+            self._rate.period,
+            settings.velocity_scale,
+            settings.acceleration_scale,
+        )
+        self._path = CommandPath(
+            self._execute, self._rate, self._limiter, plan.latch, plan.filters, self._on_sent
+        )
+        self._gate = FreshnessGate(settings.max_age_s, settings.max_skew_s)
+        self._tracking = TrackingWatch(embodiment, settings)
+        self._columns = action_columns(embodiment)
+        self._phase = "start"
+        self._executing = False
+        trace = EpisodeTrace(folder, plan.video_fps)
+        self._record = EpisodeRecord(plan, trace, self._rate)
+
+    def run(self) -> dict[str, Any]:
+        """The whole episode.
+
+        Raises:
+            Exception: what ended it before its time; the robot is stopped by then.
+            Interrupted: a signal ended it; the robot is stopped by then.
+        """
+        plan = self._plan
+        outcome, problem = "failed", None
+        plan.interrupts.deferred = True
+        try:
+            plan.latch.check()
+            plan.hooks.call("episode_started", task=self._task.instruction)
+            self._begin()
+            outcome = self._loop().run(plan.whole_chunks)
+            self._phase = "hold"
+            self._path.brake(self._most_braking())
+        except Interrupted as error:
+            outcome, problem = "interrupted", f"stopped by {error.name}"
+            self._stop("interrupt", problem)
+            raise
+        except BaseException as error:
+            outcome, problem = "failed", _what(error)
+            self._stop(self._rule(error), problem)
+            raise
+        finally:
+            plan.interrupts.deferred = False
+            summary = self._close(outcome, problem)
+            plan.hooks.call("episode_finished", reason=problem or outcome)
+        return summary
+
+    def _begin(self) -> None:
+        """Read where the arm is, and bring it to the start pose."""
+        plan = self._plan
+        plan.robot.begin(self._task.instruction, self._seed)
+        window, frame = self._first_reading()
+        self._limiter.start(self._checked(window, frame)[self._columns])
+        pose = self._limiter.last
+        for each in plan.filters:
+            reset = getattr(each, "reset", None)
+            if reset is not None:
+                reset(pose)
+        plan.policy.reset(self._seed)
+        if plan.start_pose is not None:
+            self._phase = "ramp"
+            targets = ramp(self._limiter, plan.start_pose, plan.settings.ramp_scale)
+            seconds = len(targets) / plan.rate_hz
+            plan.context.reporter.info(f"moving to the start pose, {seconds:.1f} s")
+            self._path.play(targets, filtered=False)
+        self._rate.reset()
+        self._tracking.reset()
+        self._phase = "run"
+
+    def _loop(self) -> Loop:
+        plan = self._plan
+        return Loop(
+            path=self._path,
+            joiner=plan.joiner,
+            observe=self._observe,
+            think=self._think,
+            admit=self._admit,
+            keyframe_hz=plan.policy.action_rate_hz,
+            clock=plan.robot.clock,
+            lockstep=plan.robot.lockstep,
+            settings=plan.settings,
+            worker=plan.worker,
+            interrupts=plan.interrupts,
+        )
+
+    def _first_reading(self) -> tuple[dict[str, Any], Frame | None]:
+        until = time.monotonic() + self._plan.ready_s
+        while True:
+            self._plan.interrupts.check()
+            try:
+                window, frame = self._plan.look()
+                _check_complete(window, self._plan.cameras)
+                return window, frame
+            except NotReady as error:
+                if time.monotonic() > until:
+                    raise NotReady(
+                        f"the robot gave no complete reading within {self._plan.ready_s:g} s: "
+                        f"{error.what}",
+                        cause=error.cause,
+                        next=error.next,
+                    ) from error
+                time.sleep(0.02)
+
+    def _checked(self, window: dict[str, Any], frame: Frame | None) -> Array:
+        """The state of a reading that is what the embodiment describes, ``(state_dim,)``."""
+        state = np.asarray(window["qpos"] if frame is None else frame.state, dtype=np.float64)
+        stamps = frame.stamps if frame is not None else {}
+        reading = Frame(state=state, images=window["images"], stamps=stamps)
+        check_frame(reading, self._plan.robot.embodiment, self._plan.cameras)
+        return state
+
+    def _observe(self, last: Array) -> Seen:
+        plan, clock = self._plan, self._plan.robot.clock
+        began = time.perf_counter()
+        window, frame = plan.look()
+        try:
+            _check_complete(window, plan.cameras)
+        except NotReady as error:
+            raise BadFrame(error.what, cause="a stream that was there is gone") from error
+        state = self._checked(window, frame)
+        now, age = clock.now(), 0.0
+        if frame is not None:
+            age = max(self._gate.check(frame.stamps, plan.cameras, now), 0.0)
+            self._record.timings.add("receipt", age)
+        self._tracking.check(last, state, now)
+        self._record.seen(state, window["images"])
+        observation = {**window, "task_description": self._task.instruction}
+        self._record.timings.add("observe", time.perf_counter() - began)
+        return Seen(observation, now - age)
+
+    def _think(self, seen: Seen) -> Answer:
+        began = time.perf_counter()
+        try:
+            chunk = self._plan.policy.predict_action(seen.observation)
+        except FluxError:
+            raise
+        except Exception as error:
+            raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
+        return Answer(chunk, time.perf_counter() - began)
+
+    def _admit(self, seen: Seen, answer: Answer) -> Array:
+        plan, policy = self._plan, self._plan.policy
+        embodiment, last = plan.robot.embodiment, self._limiter.last
+        keyframes = check_chunk(
+            answer.chunk, embodiment, last, policy.action_rate_hz, plan.settings
+        )
+        if len(keyframes) != policy.horizon:
+            raise BadChunk(
+                f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+            )
+        keyframes = keyframes.copy()
+        keyframes.flags.writeable = False
+        if plan.hooks:
+            plan.hooks.call("observed", observation=_frozen(seen.observation))
+            plan.hooks.call("inferred", chunk=keyframes, latency_s=answer.seconds)
+        stages = {"policy": answer.seconds, **getattr(policy, "stages", {})}
+        self._record.chunk(keyframes, seen.at, stages)
+        return keyframes[: plan.keyframes]
+
+    def _execute(self, actions: Array, rate: Rate) -> None:
+        self._executing = True
+        self._plan.execute(actions, rate)
+        self._executing = False
+
+    def _on_sent(self, sent: Sent | None) -> None:
+        """The beat after each command: recorded always, supervised while it may still stop."""
+        plan, record = self._plan, self._record
+        state = plan.robot.state()
+        if sent is not None:
+            record.command(sent, self._phase, state)
+            if plan.hooks:
+                action = sent.command.copy()
+                action.flags.writeable = False
+                plan.hooks.call("action_sent", action=action, stamp=plan.robot.clock.now())
+        if self._phase not in ("ramp", "run"):
+            return
+        plan.interrupts.check()
+        if state is not None and sent is not None:
+            self._tracking.check(sent.command, state, plan.robot.clock.now())
+        if self._phase != "run" or sent is None:
+            return
+        record.steps += 1
+        plan.context.reporter.progress("commands", record.steps, plan.most_steps)
+        if plan.robot.success():
+            raise EpisodeOver("success")
+        if record.steps >= plan.most_steps:
+            raise EpisodeOver("max_steps")
+
+    def _rule(self, error: BaseException) -> str:
+        rule = getattr(error, "rule", None)
+        if rule is not None:
+            return str(rule)
+        if isinstance(error, OperatorError):
+            return "operator"
+        return "execute" if self._executing else "run"
+
+    def _stop(self, rule: str, problem: str) -> None:
+        """The safe stop: brake where the arm still obeys, then the operator's own stop."""
+        plan = self._plan
+        plan.interrupts.stopping = True
+        began = plan.robot.clock.now()
+        self._phase = "stop"
+        if rule != "interrupt":
+            plan.latch.trip(rule, problem)
+        if self._limiter.started and (rule not in _NOT_BRAKED or not plan.robot.can_stop):
+            try:
+                self._path.brake(self._most_braking())
+            except Exception as error:  # noqa: BLE001 - the operator's own stop comes next
+                plan.context.reporter.warn(f"braking failed: {_what(error)}")
+        failure = plan.robot.stop()
+        if failure:
+            plan.context.reporter.warn(failure)
+        seconds = plan.robot.clock.now() - began
+        self._record.event("stop", rule=rule, problem=problem, seconds=seconds, failure=failure)
+
+    def _most_braking(self) -> int:
+        limiter = self._limiter
+        return int(np.max(limiter.velocity / limiter.acceleration) / limiter.period) + 3
+
+    def _close(self, outcome: str, problem: str | None) -> dict[str, Any]:
+        plan = self._plan
+        success: bool | None
+        try:
+            success = outcome == "success" or plan.robot.success()
+        except Exception as error:  # noqa: BLE001 - why the episode ended matters more
+            plan.context.reporter.warn(f"task_success failed: {_what(error)}")
+            success = None
+        try:
+            summary = self._record.close(self._task, self._seed, outcome, success, problem)
+        except RunFailed as error:
+            if problem is None:
+                raise
+            # A lost record must not hide why an episode ended.
+            plan.context.reporter.warn(str(error))
+            summary = {}
+        plan.context.reporter.artifact("episode", self._folder)
+        return summary
+
+
+def _what(error: BaseException) -> str:
+    return error.what if isinstance(error, FluxError) else f"{type(error).__name__}: {error}"
+
+
+def _frozen(observation: dict[str, Any]) -> dict[str, Any]:
+    """The observation with its arrays read-only: hooks look, they do not touch."""
+    images = {name: image.view() for name, image in observation["images"].items()}
+    shown = {**observation, "qpos": np.asarray(observation["qpos"]).view(), "images": images}
+    for array in (shown["qpos"], *images.values()):
+        array.flags.writeable = False
+    return shown
+
+
+def _check_complete(window: dict[str, Any], cameras: Sequence[str]) -> None:
+    """A stream that has not come yet is None in an operator of the specification's shape."""
+    if window.get("qpos") is None:
+        raise NotReady("there are no joint states yet")
+    missing = [name for name in cameras if window["images"].get(name) is None]
+    if missing:
+        raise NotReady(f"there is no picture of {', '.join(missing)} yet")

@@ -1,0 +1,79 @@
+"""What a runner gives each of its episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.protocols import Policy
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.joining import Joiner
+from fluxvla_core.control.path import Execute, Filter
+from fluxvla_core.control.worker import Worker
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.hooks import HookCaller
+from fluxvla_core.infer.robot import Robot
+from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.trips import Latch
+
+
+class PolicyFailed(RunFailed):
+    """A policy raised something; ``rule`` is for the latch and the record."""
+
+    rule = "policy"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A policy's chunk, unchecked, and how long it took."""
+
+    chunk: Any
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the runner gives each of its episodes.
+
+    Args:
+        robot, policy: connected, loaded, and fitting each other.
+        cameras: names of those that the policy looks at.
+        rate_hz: commands a second.
+        settings: thresholds of the safety rules.
+        latch: of the run; an episode does not begin while it is tripped.
+        filters: the config's ``action_filters``.
+        joiner: how chunks become one motion.
+        whole_chunks: hand a chunk to ``execute`` in one piece.
+        keyframes: how many of a chunk's keyframes are played; None plays all.
+        most_steps: commands after which the episode ends.
+        start_pose: ``(D,)``, where the arm goes first; None stays.
+        look: makes an observation and, if it can, the frame that it is made of.
+        execute: sends commands: ``(N, D)`` and the rate.
+        video_fps: of the recorded videos; None records none.
+        ready_s: how long the robot may take to give its first reading.
+        interrupts, worker, hooks, context: of the run.
+    """
+
+    robot: Robot
+    policy: Policy
+    cameras: tuple[str, ...]
+    rate_hz: float
+    settings: SafetySettings
+    latch: Latch
+    filters: Sequence[Filter]
+    joiner: Joiner
+    whole_chunks: bool
+    keyframes: int | None
+    most_steps: int
+    start_pose: Sequence[float] | None
+    look: Callable[[], tuple[dict[str, Any], Frame | None]]
+    execute: Execute
+    video_fps: float | None
+    ready_s: float
+    interrupts: Interrupts
+    worker: Worker
+    hooks: HookCaller
+    context: RunContext

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import HOME, load_model
+from fluxvla_sim.aloha.scene import HOME, load_model, sample_cube
 from fluxvla_sim.operators import ALOHA_CAMERAS, AlohaSimOperator, URSimOperator
 from fluxvla_sim.ur.expert import URExpert
 
@@ -55,41 +55,51 @@ def test_a_command_is_one_control_period(aloha):
     assert aloha.get_frame().stamps == {"state": aloha.clock.now(), "top": aloha.clock.now()}
 
 
-def test_waiting_on_the_clock_holds_the_last_command(aloha):
-    target = HOME.copy()
-    target[0] = 0.3
-    aloha.send_action(target)
-    aloha.clock.sleep_until(1.0)
-    assert aloha.clock.now() == pytest.approx(1.0)
-    assert aloha.get_frame().state[0] == pytest.approx(0.3, abs=0.05)
-    aloha.clock.sleep_until(0.5)
-    assert aloha.clock.now() == pytest.approx(1.0), "a deadline that is past is no wait"
-
-
-def test_stop_holds_where_the_robot_is(aloha):
-    target = HOME.copy()
-    for target[0] in np.arange(0, 0.4, 0.02):
-        aloha.send_action(target)
-    aloha.stop()
-    stopped = aloha.get_frame().state[0]
-    aloha.clock.sleep_until(2.0)
-    assert 0.2 < stopped < 0.45
-    assert aloha.get_frame().state[0] == pytest.approx(stopped, abs=0.02)
-
-
-def test_in_real_time_the_world_goes_on_by_itself():
+@pytest.fixture
+def live():
     operator = AlohaSimOperator(realtime=True, **SMALL)
-    assert operator.clock is None
     operator.connect()
+    yield operator
+    operator.close()
+
+
+def test_in_real_time_the_world_goes_on_by_itself(live):
+    assert not live.clock.lockstep
     target = HOME.copy()
     target[0] = 0.3
-    operator.send_action(target)
-    before = operator.simulated_seconds
+    before = live.get_state()
+    live.send_action(target)
     threading.Event().wait(0.3)
-    state = operator.get_frame().state
-    assert operator.simulated_seconds > before + 0.2
-    assert state[0] > 0.1
-    operator.close()
+    after = live.get_frame().state
+    assert before[0] < 0.05
+    assert after[0] > 0.1
+
+
+def test_stop_holds_where_the_robot_is(live):
+    target = HOME.copy()
+    for target[0] in np.arange(0, 0.3, 0.02):
+        live.send_action(target)
+        threading.Event().wait(0.02)
+    live.stop()
+    stopped = live.get_state()[0]
+    threading.Event().wait(0.3)
+    assert stopped > 0.1
+    assert live.get_state()[0] == pytest.approx(stopped, abs=0.06)
+
+
+def test_an_episode_begins_with_its_instructions_task_and_its_seeds_cube(aloha):
+    lift = "pick up the cube with the right arm and hold it"
+    aloha.begin_episode(lift, 21)
+    assert aloha.task.name == "lift_hold"
+    np.testing.assert_array_equal(aloha._scene.cube, sample_cube(21))
+    aloha.begin_episode("dance", 22)
+    assert aloha.task.name == "lift_hold", "an unknown instruction leaves the task"
+    np.testing.assert_array_equal(aloha._scene.cube, sample_cube(22))
+
+
+def test_the_state_alone_is_that_of_the_frame(aloha):
+    aloha.send_action(HOME)
+    np.testing.assert_array_equal(aloha.get_state(), aloha.get_frame().state)
 
 
 @pytest.mark.parametrize("task", ["transfer_cube", "lift_hold"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha import scene as scene_module
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import ARM_JOINTS, ARMS, AlohaScene, to_metres, to_normalized
-from fluxvla_sim.aloha.tasks import TASKS, Facts, get_task
+from fluxvla_sim.aloha.tasks import TASKS, Facts, get_task, task_of
 from fluxvla_sim.render import import_mujoco
 
 from fluxvla_core.errors import ConfigError, RunFailed
@@ -140,13 +141,20 @@ def test_tasks_judge_facts():
     held = Facts(steps=300, best_reward=2, right_touches=True, height=0.2)
     handed = Facts(steps=190, best_reward=4, left_touched=True, right_touches=True, height=0.2)
     assert lift.success(held)
-    assert not lift.done(held)
+    assert lift.done(held)
     assert not transfer.success(held)
+    assert not transfer.done(held)
     assert transfer.success(handed)
     assert transfer.done(handed)
-    assert not lift.success(handed), "the left gripper touched it"
-    assert not lift.success(Facts(right_touches=True, height=0.05)), "not high enough"
-    assert not lift.success(Facts(right_touches=False, height=0.2)), "thrown, not held"
+    assert not lift.success(replace(held, left_touched=True)), "the left gripper touched it"
+    assert not lift.success(replace(held, height=0.05)), "not high enough"
+    assert not lift.success(replace(held, right_touches=False)), "thrown, not held"
+    assert not lift.success(replace(held, steps=299)), "holding is judged at the end"
+
+
+def test_an_instruction_finds_its_task():
+    assert task_of("Hand the cube  over to the left arm").name == "transfer_cube"
+    assert task_of("dance") is None
 
 
 def test_an_unknown_task_is_refused_with_those_that_exist():

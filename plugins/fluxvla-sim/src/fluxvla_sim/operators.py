@@ -95,6 +95,14 @@ class AlohaSimOperator(SimOperator):
             super().reset(seed)
             self._facts = type(self._facts)()
 
+    def begin_episode(self, instruction: str, seed: int) -> None:
+        """Reset to ``seed``, and judge the task that ``instruction`` asks for, if any does."""
+        from fluxvla_sim.aloha.tasks import task_of
+
+        with self._lock:
+            self.task = task_of(instruction) or self.task
+            self.reset(seed)
+
     def _after_step(self) -> None:
         self._facts = self._facts.after(self._scene)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
 from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
 from fluxvla_core.errors import NotReady, Rejected
 
 if TYPE_CHECKING:
@@ -26,19 +26,6 @@ class Scene(Protocol):
     def state(self) -> npt.NDArray[np.float64]: ...
     def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]: ...
     def close(self) -> None: ...
-
-
-class SimClock:
-    """Simulated seconds. Waiting on it lets the robot hold its last command meanwhile."""
-
-    def __init__(self, operator: SimOperator) -> None:
-        self._operator = operator
-
-    def now(self) -> float:
-        return self._operator.simulated_seconds
-
-    def sleep_until(self, deadline: float) -> None:
-        self._operator.hold_until(deadline)
 
 
 class SimOperator:
@@ -61,9 +48,8 @@ class SimOperator:
         self.embodiment = embodiment
         self.seed = seed
         self.realtime = realtime
-        self.clock: SimClock | None = None if realtime else SimClock(self)
+        self.clock = MonotonicClock() if realtime else SimulatedClock()
         self._period = 1.0 / embodiment.rate_hz
-        # Whole periods, so that time does not collect rounding errors.
         self._periods = 0
         self._started = 0.0
         self._lock = threading.RLock()
@@ -82,7 +68,7 @@ class SimOperator:
         with self._lock:
             if self._scene is None:
                 self._scene = self._make_scene()
-                self._periods, self._started = 0, time.monotonic()
+                self._periods, self._started = 0, self.clock.now()
                 self.reset(self.seed)
 
     def reset(self, seed: int) -> None:
@@ -97,16 +83,20 @@ class SimOperator:
             scene.reset(seed)
             self._target = self._measured()
 
-    @property
-    def simulated_seconds(self) -> float:
-        """Control time that the physics has lived through since :meth:`connect`."""
-        return self._periods * self._period
+    def begin_episode(self, instruction: str, seed: int) -> None:
+        """Reset to ``seed``; inference runners call this before each episode."""
+        self.reset(seed)
 
-    def hold_until(self, seconds: float) -> None:
-        """Let simulated time pass with the last command held, up to ``seconds``."""
+    def get_state(self) -> npt.NDArray[np.float64]:
+        """``(dim,)`` the state alone, without drawing anything.
+
+        Raises:
+            NotReady: not connected.
+        """
         with self._lock:
-            while self._scene is not None and self.simulated_seconds < seconds - self._period / 2:
-                self._step()
+            scene = self._connected()
+            self._catch_up()
+            return np.array(scene.state)
 
     def get_frame(self) -> Frame:
         """State and pictures of this moment.
@@ -117,7 +107,7 @@ class SimOperator:
         with self._lock:
             scene = self._connected()
             self._catch_up()
-            now = time.monotonic() if self.realtime else self.simulated_seconds
+            now = self.clock.now()
             images = {
                 c.name: scene.render(c.name, c.height, c.width) for c in self.embodiment.cameras
             }
@@ -160,11 +150,13 @@ class SimOperator:
     def _step(self) -> None:
         self._scene.step(self._target)
         self._periods += 1
+        if isinstance(self.clock, SimulatedClock):
+            self.clock.advance(self._period)
         self._after_step()
 
     def _catch_up(self) -> None:
         if self.realtime:
-            due = int((time.monotonic() - self._started) / self._period)
+            due = int((self.clock.now() - self._started) / self._period)
             while self._periods < due:
                 self._step()
 

@@ -57,10 +57,10 @@ class Task(Protocol):
     record_steps: int
 
     def success(self, facts: Facts) -> bool:
-        """Whether the task is done, judged now."""
+        """Whether the task was done; once true it stays so, and the episode can end."""
 
     def done(self, facts: Facts) -> bool:
-        """Whether the episode can end before its step limit."""
+        """Whether nothing that comes could change :meth:`success`."""
 
 
 class TransferCube:
@@ -78,7 +78,7 @@ class TransferCube:
 
 
 class LiftHold:
-    """The right arm holds the cube in the air when the episode ends, and the left never touched it.
+    """The right arm holds the cube in the air at step 300, and the left one never touched it.
 
     One finger's contact is enough: the solver drops one of a firm grip's two for single steps, and
     nothing else could keep the cube up there.
@@ -89,10 +89,11 @@ class LiftHold:
     record_steps = 200
 
     def success(self, facts: Facts) -> bool:
-        return facts.right_touches and facts.height > LIFTED_M and not facts.left_touched
+        held = facts.right_touches and facts.height > LIFTED_M
+        return held and not facts.left_touched and self.done(facts)
 
     def done(self, facts: Facts) -> bool:
-        return False
+        return facts.steps >= MAX_STEPS
 
 
 TASKS: dict[str, Task] = {task.name: task for task in (TransferCube(), LiftHold())}
@@ -107,3 +108,9 @@ def get_task(name: str) -> Task:
     if name not in TASKS:
         raise ConfigError(f"there is no task {name!r}; there are {', '.join(TASKS)}")
     return TASKS[name]
+
+
+def task_of(instruction: str) -> Task | None:
+    """The task that an instruction in these words asks for; None if none does."""
+    words = instruction.casefold().split()
+    return next((t for t in TASKS.values() if t.instruction.casefold().split() == words), None)

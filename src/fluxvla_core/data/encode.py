@@ -37,6 +37,11 @@ CODECS: Mapping[str, Codec] = {
 }
 
 
+# The index at the front lets a reader open the file without seeking to its end. The bit rate would
+# be copied from whichever clip comes first, and differ between a recording and a merge.
+_CONTAINER = {"movflags": "+faststart", "write_btrt": "0"}
+
+
 def find_codec(name: str) -> Codec:
     """The codec called ``name``.
 
@@ -131,10 +136,10 @@ def join_clips(clips: Sequence[Clip], out: Path, fps: float) -> None:
     step = Fraction(1) / Fraction(fps).limit_denominator(1001)
     with (
         av.open(str(clips[0].path)) as first,
-        # The index at the front lets a reader open the file without seeking to its end.
-        av.open(str(out), "w", options={"movflags": "+faststart"}) as target,
+        av.open(str(out), "w", options=_CONTAINER) as target,
     ):
-        stream = target.add_stream_from_template(first.streams.video[0])
+        # Opaque: packets pass through, so the decoder need not have an encoder of its name.
+        stream = target.add_stream_from_template(first.streams.video[0], opaque=True)
         done = 0
         for clip in clips:
             for count, packet in enumerate(_packets(clip, step)):

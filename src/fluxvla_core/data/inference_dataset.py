@@ -86,8 +86,8 @@ class PrivateInferenceDataset:
             sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
         sample = self.pipeline(sample)
         sample["images"] = stack(sample["images"])
-        arrays = {key: np.ascontiguousarray(sample[key]) for key in _KEYS if key in sample}
-        return {key: torch.from_numpy(array)[None] for key, array in arrays.items()}
+        batch = {key: np.asarray(sample[key])[None] for key in _KEYS if key in sample}
+        return {k: torch.from_numpy(np.ascontiguousarray(array)) for k, array in batch.items()}
 
     def _image(self, observation: Mapping[str, Any], key: str) -> npt.NDArray[np.uint8]:
         nested = observation.get("images")

@@ -1,0 +1,273 @@
+"""Each thing that can be wrong with a dataset, made wrong in a real one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fluxvla_core.data.metadata import read_metadata
+from fluxvla_core.data.parquet_dataset import ParquetDataset
+from fluxvla_core.data.validate import main
+from fluxvla_core.data.writer import LeRobotWriter
+from fluxvla_core.errors import DataError, SpecMismatch
+
+TOP = "observation.images.top"
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+VIDEO = f"videos/{TOP}/chunk-000/file-000.mp4"
+
+
+def load(root, **options):
+    return ParquetDataset(str(root), [], ["top"], **options)
+
+
+def refused(root, **options):
+    with pytest.raises(DataError) as caught:
+        load(root, **options)
+    assert caught.value.exit_code == 2
+    return str(caught.value)
+
+
+def edit_info(root, **changes):
+    path = root / "meta/info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def edit_column(root, file, name, change):
+    """Replace a column by ``change(list of its values)``, or an array; None drops it."""
+    table = pq.read_table(root / file)
+    i = table.schema.get_field_index(name)
+    table = table.remove_column(i)
+    column = change(pq.read_table(root / file)[name].to_pylist()) if change else None
+    if column is not None:
+        table = table.add_column(i, name, [column])
+    pq.write_table(table, root / file)
+
+
+def test_missing(tmp_path):
+    text = refused(tmp_path / "nowhere")
+    assert f"{tmp_path / 'nowhere'}: there is no dataset here: the folder does not exist" in text
+    assert "check data_root_path" in text
+
+
+def test_a_file_or_another_folder(tmp_path, dataset):
+    (tmp_path / "a.txt").write_text("")
+    assert "this is no LeRobot dataset: it is a file" in refused(tmp_path / "a.txt")
+    text = refused(dataset.parent)
+    assert "this is no LeRobot dataset: it has no meta/info.json" in text
+    assert f"did you mean {dataset}?" in text
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v2.0", "v4.0", None])
+def test_another_version(dataset, version):
+    edit_info(dataset, codebase_version=version)
+    text = refused(dataset)
+    assert f"LeRobot dataset of version {version}, v3.0 is what is read here" in text
+    assert ("convert_dataset_v21_to_v30" in text) == str(version).startswith("v2")
+
+
+def test_empty(dataset):
+    edit_info(dataset, total_episodes=0, total_frames=0)
+    text = refused(dataset)
+    assert "the dataset is empty: 0 episodes, 0 frames" in text
+    assert "nothing was recorded into it yet" in text
+
+
+def test_info_that_is_no_json_or_not_all(dataset):
+    edit_info(dataset)
+    info = json.loads((dataset / "meta/info.json").read_text())
+    del info["fps"], info["data_path"]
+    (dataset / "meta/info.json").write_text(json.dumps(info))
+    assert "meta/info.json: data_path, fps missing" in refused(dataset)
+    (dataset / "meta/info.json").write_text("[1]")
+    assert "meta/info.json: holds a list, not a table" in refused(dataset)
+    (dataset / "meta/info.json").write_text("{")
+    assert "meta/info.json: cannot be read as JSON" in refused(dataset)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 500, -30])
+@pytest.mark.parametrize("file", [DATA, EPISODES, "meta/tasks.parquet"])
+def test_truncated_parquet(dataset, file, keep):
+    data = (dataset / file).read_bytes()
+    (dataset / file).write_bytes(data[:keep])
+    text = refused(dataset)
+    assert f"{dataset / file}: cannot be read as parquet" in text
+    assert "the file is truncated, or its writer was stopped before its end" in text
+
+
+@pytest.mark.parametrize("file", [DATA, "meta/tasks.parquet"])
+def test_a_missing_table(dataset, file):
+    (dataset / file).unlink()
+    assert f"{dataset / file}: the file is missing" in refused(dataset)
+
+
+def test_no_episode_table(dataset):
+    shutil.rmtree(dataset / "meta/episodes")
+    assert "meta/episodes holds no episode table" in refused(dataset)
+
+
+def test_truncated_video(dataset):
+    data = (dataset / VIDEO).read_bytes()
+    (dataset / VIDEO).write_bytes(data[: len(data) // 2])
+    text = refused(dataset)
+    assert f"{dataset / VIDEO}: 28 frames expected, " in text
+    assert "the file is truncated: its index points beyond its end" in text
+    assert "python -m fluxvla_core.data.validate DATASET" in text
+
+
+def test_a_missing_video_matters_only_to_who_needs_it(dataset):
+    (dataset / VIDEO).unlink()
+    assert f"{dataset / VIDEO}: the video file is missing; 28 frames expected" in refused(dataset)
+    assert len(ParquetDataset(str(dataset), [], ["wrist"])) == 28
+
+
+def test_a_missing_camera_gets_a_hint(shared):
+    with pytest.raises(DataError) as caught:
+        ParquetDataset(str(shared), [], ["tpo"])
+    text = str(caught.value)
+    assert f"{shared}: there is no camera 'tpo'; did you mean '{TOP}'?" in text
+    assert f"there are {TOP}, observation.images.wrist" in text
+    with pytest.raises(DataError, match="there is no camera 'zzz'; there are"):
+        ParquetDataset(str(shared), [], ["zzz"])
+
+
+def test_a_missing_feature_gets_a_hint(shared):
+    text = refused(shared, action_key="actions")
+    assert "there is no feature 'actions'; did you mean 'action'?" in text
+    text = refused(shared, state_key="task_index")
+    assert "feature 'task_index' is int64 of shape (1,), not a vector of float32" in text
+
+
+def test_pictures_in_the_tables_are_not_read(dataset):
+    info = json.loads((dataset / "meta/info.json").read_text())
+    info["features"]["observation.images.side"] = {
+        "dtype": "image",
+        "shape": [32, 48, 3],
+        "names": None,
+    }
+    edit_info(dataset, features=info["features"])
+    with pytest.raises(DataError, match=r"'observation\.images\.side' is stored as 'image'"):
+        ParquetDataset(str(dataset), [], ["side"])
+
+
+def test_totals_that_do_not_agree(dataset):
+    edit_info(dataset, total_episodes=4)
+    assert "states 4 episodes, the episode table lists 3" in refused(dataset)
+    edit_info(dataset, total_episodes=3, total_frames=29)
+    assert "states 29 frames, the episode table lists 28" in refused(dataset)
+
+
+def test_rows_that_are_missing(dataset):
+    table = pq.read_table(dataset / DATA)
+    pq.write_table(table.slice(0, 27), dataset / DATA)
+    assert f"{dataset / DATA}: 28 frames expected, 27 found" in refused(dataset)
+
+
+def test_rows_of_another_recording(dataset):
+    edit_column(dataset, DATA, "episode_index", lambda v: v[::-1])
+    text = refused(dataset)
+    assert "the rows of the data files are not those that the episode table lists" in text
+
+
+def test_episodes_that_are_not_numbered_through(dataset):
+    edit_column(dataset, EPISODES, "episode_index", lambda v: [0, 2, 3])
+    assert "does not number its episodes 0, 1, 2" in refused(dataset)
+
+
+def test_a_column_that_is_gone(dataset):
+    edit_column(dataset, DATA, "action", None)
+    assert f"{dataset / DATA}: column 'action' is missing" in refused(dataset)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: [r[:2] for r in v], "does not hold 3 numbers in every row"),
+        (lambda v: [*v[1:], v[0][:2]], "does not hold 3 numbers in every row"),
+        (lambda v: [[str(x) for x in r] for r in v], "holds string, not numbers"),
+        (lambda v: [r[0] for r in v], "is double, not a list of 3 numbers"),
+        (lambda v: [None, *v[1:]], "has 1 empty rows"),
+        (lambda v: [[None, 0.0, 0.0], *v[1:]], "has 1 empty rows"),
+        (lambda v: [[float("nan"), 0.0, 0.0], *v[1:]], "is not finite in row 0: [nan, 0.0, 0.0]"),
+    ],
+)
+def test_values_that_are_not_what_info_says(dataset, change, message):
+    edit_column(dataset, DATA, "action", change)
+    text = refused(dataset)
+    assert f"{dataset / DATA}: column 'action' {message}" in text
+
+
+def test_other_floats_and_plain_lists_are_read_as_they_are(dataset, shared):
+    edit_column(dataset, DATA, "action", lambda v: pa.array(v, pa.list_(pa.float64())))
+    edit_column(
+        dataset, DATA, "timestamp", lambda v: pa.array([[x] for x in v], pa.list_(pa.float32()))
+    )
+    ours, other = load(shared), load(dataset)
+    for i in range(28):
+        np.testing.assert_array_equal(ours[i]["actions"], other[i]["actions"])
+        assert ours[i]["timestamp"] == other[i]["timestamp"]
+
+
+def test_tasks_that_do_not_exist(dataset):
+    edit_column(dataset, DATA, "task_index", lambda v: [x + 1 for x in v])
+    assert "task_index runs from 1 to 2, meta/tasks.parquet lists 2 tasks" in refused(dataset)
+    pq.write_table(pa.table({"a": [1]}), dataset / "meta/tasks.parquet")
+    assert "tasks.parquet: columns ['a'] hold no tasks" in refused(dataset)
+
+
+def test_an_embodiment_that_is_none(dataset):
+    (dataset / "meta/fluxvla_embodiment.json").write_text('{"name": "x"}')
+    with pytest.raises(SpecMismatch, match="this is no embodiment spec"):
+        read_metadata(dataset)
+
+
+def test_datasets_that_do_not_go_together(shared, tmp_path, recorder, take, spec):
+    left = spec(name="left", joints=spec().joints[::-1])
+    other = recorder(tmp_path / "left", [take(0, 4)], embodiment=left)
+    with pytest.raises(SpecMismatch) as caught:
+        ParquetDataset([str(shared), str(other)], [], ["top"])
+    assert "joints and their order" in str(caught.value)
+    assert str(other) in str(caught.value)
+    with LeRobotWriter(tmp_path / "fast", 20, spec()) as writer:
+        take(0, 4).record(writer)
+    with pytest.raises(DataError, match=r"do not go together: fps: 10\.0 / 20\.0"):
+        ParquetDataset([str(shared), str(tmp_path / "fast")], [], ["top"])
+
+
+@pytest.mark.parametrize("camera", ["top", "wrist"])
+def test_every_frame_is_decoded_by_validate(camera, dataset, capsys):
+    assert main([str(dataset)]) == 0
+    out = capsys.readouterr().out
+    assert f"{dataset}: 3 episodes, 28 frames at 10 Hz" in out
+    assert f"{TOP}: 28 frames in 1 files" in out
+    # Damage that no index shows: zeros where frame data was.
+    path = dataset / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + 4
+    data[start:] = bytes(len(data) - start)
+    path.write_bytes(data)
+    assert len(ParquetDataset(str(dataset), [], [camera])) == 28
+    assert main([str(dataset)]) == 2
+    assert f"{path}: no frame at 0.000 s" in capsys.readouterr().err
+
+
+def test_validate_says_how_it_is_used_and_what_is_wrong(tmp_path, capsys):
+    assert main([]) == 2
+    assert "usage: python -m fluxvla_core.data.validate DATASET" in capsys.readouterr().err
+    assert main([str(tmp_path / "none")]) == 2
+    assert "there is no dataset here" in capsys.readouterr().err
+
+
+def test_pictures_of_another_size_than_stated(dataset, capsys):
+    info = json.loads((dataset / "meta/info.json").read_text())
+    info["features"][TOP]["shape"] = [64, 48, 3]
+    edit_info(dataset, features=info["features"])
+    assert main([str(dataset)]) == 2
+    assert "is 32 x 48, info.json says 64 x 48" in capsys.readouterr().err
+    with pytest.raises(DataError, match=r"frames of 32 x 48, info\.json says 64 x 48"):
+        load(dataset, cache_frames=True).prepare()

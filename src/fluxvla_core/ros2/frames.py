@@ -1,0 +1,54 @@
+"""From messages to a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.ros2 import images
+from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2.streams import CAMERA, DEPTH, StreamSpec
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RobotFrame(Frame):
+    """A frame with what else the robot has.
+
+    Args:
+        depths: camera name -> ``(height, width)`` float32 metres, NaN where nothing was measured.
+        base: ``(2,)`` forward speed in m/s and turning speed in rad/s of a mobile base, or None.
+    """
+
+    depths: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    base: Array | None = None
+
+
+def pictures(
+    specs: Sequence[StreamSpec], chosen: Mapping[str, Received]
+) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, npt.NDArray[np.float32]]]:
+    """The colour and depth pictures of a frame, by camera name, in fresh arrays.
+
+    Args:
+        specs: of any kind; cameras and depths are taken.
+        chosen: stream name -> the message to convert.
+
+    Raises:
+        Faulted: a picture has another size or encoding than its camera; names stream and topic.
+    """
+    colours: dict[str, npt.NDArray[np.uint8]] = {}
+    depths: dict[str, npt.NDArray[np.float32]] = {}
+    for spec in specs:
+        if spec.camera is None:
+            continue
+        message, camera = chosen[spec.name].message, spec.camera
+        if spec.kind == CAMERA:
+            colours[camera.name] = images.to_rgb(message, camera.height, camera.width, spec.label)
+        elif spec.kind == DEPTH:
+            depths[camera.name] = images.to_depth(message, camera.height, camera.width, spec.label)
+    return colours, depths

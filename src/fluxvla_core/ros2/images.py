@@ -1,0 +1,203 @@
+"""``sensor_msgs/Image`` and ``CompressedImage`` to numpy and back; a picture is copied once.
+
+A message's ``data`` is an ``array.array``; numpy can look at it without copying (0.6 us for a VGA
+picture, against 18 ms through a list). Going back, only an ``array.array`` is taken as it is; bytes
+and ndarrays are converted byte by byte, or refused when field checks are on.
+Encodings are those of sensor_msgs' ``image_encodings.hpp``; depth follows REP 118.
+"""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import Faulted, LoadFailed
+
+# encoding -> (element type, number of channels, columns that are red, green and blue)
+_COLOUR: Mapping[str, tuple[int, tuple[int, int, int]]] = {
+    "rgb8": (3, (0, 1, 2)),
+    "8UC3": (3, (2, 1, 0)),
+    "bgr8": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+}
+_DEPTH: Mapping[str, type[np.generic]] = {
+    "16UC1": np.uint16,
+    "mono16": np.uint16,
+    "32FC1": np.float32,
+}
+_MILLIMETRE = np.float32(1e-3)
+# image_transport's compressedDepth puts its parameters (one enum, two floats) before the PNG.
+_DEPTH_HEADER = 12
+
+
+def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
+    """The pixels of an ``Image`` where they lie: ``(height, width, channels)``, channels as sent.
+
+    Rows may be padded (``step``). Numbers of the other byte order are swapped, which copies.
+
+    Raises:
+        Faulted: an unknown encoding, or fewer bytes than the header promises; names ``source``.
+    """
+    encoding = message.encoding
+    if encoding in _COLOUR:
+        channels = _COLOUR[encoding][0]
+    elif encoding in _DEPTH:
+        channels = 1
+    else:
+        known = ", ".join([*_COLOUR, *_DEPTH])
+        raise Faulted(
+            f"{source} sends pictures with encoding {encoding!r}; understood are {known}",
+            next="set the camera driver to one of them (rgb8 costs the least)",
+        )
+    dtype: np.dtype[Any] = np.dtype(_DEPTH.get(encoding, np.uint8))
+    row = message.width * channels * dtype.itemsize
+    size = message.step * (message.height - 1) + row if message.height else 0
+    if message.step < row or len(message.data) < size:
+        raise Faulted(
+            f"{source} sends damaged pictures: {message.width}x{message.height} {encoding} with "
+            f"rows of {message.step} bytes needs {max(size, row)} bytes, got {len(message.data)}"
+        )
+    pixels: npt.NDArray[Any] = np.ndarray(
+        (message.height, message.width, channels),
+        dtype,
+        buffer=memoryview(message.data),
+        strides=(message.step, channels * dtype.itemsize, dtype.itemsize),
+    )
+    if message.is_bigendian and dtype.itemsize > 1:
+        pixels = pixels.byteswap()
+    return pixels
+
+
+def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.NDArray[np.uint8]:
+    """A fresh ``(height, width, 3)`` uint8 RGB array from an ``Image`` or ``CompressedImage``.
+
+    Raises:
+        Faulted: another size, no colour picture, or damaged; names ``source``.
+        LoadFailed: a compressed picture, and no decoder is installed.
+    """
+    if is_compressed(message):
+        picture = _decode(message, source, colour=True)
+        _check_size(picture, height, width, source)
+        return picture
+    pixels = view(message, source)
+    if message.encoding not in _COLOUR:
+        raise Faulted(
+            f"{source} sends {message.encoding} pictures, which have no colours",
+            cause="a depth topic is given where a colour topic belongs",
+        )
+    _check_size(pixels, height, width, source)
+    order = _COLOUR[message.encoding][1]
+    rgb = np.empty((height, width, 3), np.uint8)
+    if order == (0, 1, 2):
+        np.copyto(rgb, pixels[..., :3])
+    else:
+        # Plane by plane takes a fifth of a reversed copy, whose inner loop is 3 long.
+        for plane, column in enumerate(order):
+            np.copyto(rgb[..., plane], pixels[..., column])
+    return rgb
+
+
+def to_depth(
+    message: Any, height: int, width: int, source: str = "image"
+) -> npt.NDArray[np.float32]:
+    """A fresh ``(height, width)`` float32 array in metres, NaN where nothing was measured.
+
+    ``16UC1`` holds millimetres with 0 for nothing, ``32FC1`` metres with NaN (REP 118).
+
+    Raises:
+        Faulted: another size, no depth picture, or damaged; names ``source``.
+        LoadFailed: a compressed picture, and no decoder is installed.
+    """
+    if is_compressed(message):
+        pixels = _decode(message, source, colour=False)
+    elif message.encoding in _DEPTH:
+        pixels = view(message, source)[..., 0]
+    else:
+        view(message, source)
+        raise Faulted(
+            f"{source} sends {message.encoding} pictures, which hold no distances",
+            cause="a colour topic is given where a depth topic belongs",
+        )
+    _check_size(pixels, height, width, source)
+    metres = np.array(pixels, np.float32)
+    if pixels.dtype == np.uint16:
+        metres *= _MILLIMETRE
+        metres[metres == 0] = np.nan
+    return metres
+
+
+def fill(message: Any, pixels: npt.NDArray[Any], encoding: str) -> Any:
+    """Put ``(height, width[, channels])`` pixels into an ``Image``; returns the message.
+
+    The pixels are copied once; ``header`` is left alone.
+
+    Raises:
+        ValueError: the array does not fit the encoding.
+    """
+    if encoding not in _COLOUR and encoding not in _DEPTH:
+        raise ValueError(f"unknown encoding {encoding!r}")
+    channels = _COLOUR[encoding][0] if encoding in _COLOUR else 1
+    dtype: np.dtype[Any] = np.dtype(_DEPTH.get(encoding, np.uint8))
+    wanted = pixels.shape[:2] if channels == 1 else (*pixels.shape[:2], channels)
+    if pixels.dtype != dtype or pixels.shape not in (wanted, (*pixels.shape[:2], channels)):
+        raise ValueError(
+            f"{encoding} needs {dtype} of shape {wanted}, got {pixels.dtype} {pixels.shape}"
+        )
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(pixels).data.cast("B"))
+    message.height, message.width = pixels.shape[:2]
+    message.encoding = encoding
+    message.step = pixels.shape[1] * channels * dtype.itemsize
+    message.is_bigendian = 0 if np.little_endian else 1
+    message.data = data
+    return message
+
+
+def is_compressed(message: Any) -> bool:
+    """Whether the message is a ``CompressedImage`` (those say ``format``, not ``encoding``)."""
+    return hasattr(message, "format") and not hasattr(message, "encoding")
+
+
+def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) -> None:
+    if pixels.shape[:2] != (height, width):
+        raise Faulted(
+            f"{source} sends {pixels.shape[1]}x{pixels.shape[0]} pictures, "
+            f"the embodiment says {width}x{height}",
+            next="set the camera driver's resolution, or the operator's image_size",
+        )
+
+
+def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
+    try:
+        import cv2
+    except ImportError as error:
+        raise LoadFailed(
+            f"{source} sends compressed pictures, and OpenCV is not installed ({error})",
+            next="pip install opencv-python-headless, or name the uncompressed topic",
+        ) from error
+    data = np.frombuffer(message.data, np.uint8)
+    if colour:
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        if picture is not None:
+            return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+    elif message.format.startswith("16UC1"):
+        data = data[_DEPTH_HEADER:] if "compressedDepth" in message.format else data
+        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        if picture is not None and picture.dtype == np.uint16 and picture.ndim == 2:
+            return np.asarray(picture)
+    else:
+        raise Faulted(
+            f"{source} sends compressed depth as {message.format!r}; only 16UC1 is understood",
+            next="name the uncompressed depth topic",
+        )
+    raise Faulted(
+        f"{source} sends a compressed picture ({message.format!r}, {data.size} bytes) "
+        "that cannot be decoded"
+    )

@@ -1,0 +1,351 @@
+"""The base of ROS 2 operators: a subclass says what is read and written, and what it means.
+
+A subclass has ``embodiment``, lists its ``streams()`` and ``commands()``, makes a state vector of
+messages in ``read_state`` and messages of an action in ``publish_action``. Everything else is here:
+connecting and its checks, matching pictures and state in time, refusing bad actions before any I/O,
+holding on ``stop``, and noticing a driver that falls silent or another node that commands the arm.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import STATE as STATE_STREAM
+from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady, OperatorError
+from fluxvla_core.ros2 import discovery, frames, sync
+from fluxvla_core.ros2.actions import checked_action, hold_target
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2.startup import Startup
+from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, CommandSpec, StreamSpec
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+log = logging.getLogger("fluxvla.ros2")
+
+# A burst on one stream puts it apart from the others for a moment; a driver that is late, for good.
+_PATIENCE_S = 0.25
+_LOOK_S = 0.002
+# How long a last command may take to be acknowledged before the connection is given up.
+_FLUSH_S = 0.2
+
+
+class RosOperator(ABC):
+    """One robot on ROS 2 topics.
+
+    Args:
+        domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
+        connect_timeout_s: how long ``connect`` waits for drivers to be there and to send.
+        max_age_s: a stream whose last message arrived longer ago is silent, and no frame is made.
+        max_skew_s: how far the messages of one frame may be apart by their stamps.
+        sync_on: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived.
+        rate_window_s: for how long ``connect`` counts what arrives; 0 does not count.
+    """
+
+    api: ClassVar[str] = "1.0"
+    embodiment: EmbodimentSpec
+
+    def __init__(
+        self,
+        domain_id: int | None = None,
+        connect_timeout_s: float = 10.0,
+        max_age_s: float = 0.5,
+        max_skew_s: float = 0.1,
+        sync_on: str = "stamp",
+        rate_window_s: float = 1.0,
+    ) -> None:
+        if sync_on not in ("stamp", "receipt"):
+            raise ConfigError(f"sync_on is 'stamp' or 'receipt', got {sync_on!r}")
+        bounds = {
+            "connect_timeout_s": connect_timeout_s,
+            "max_age_s": max_age_s,
+            "max_skew_s": max_skew_s,
+        }
+        for name, value in bounds.items():
+            if not 0 < value < float("inf"):
+                raise ConfigError(f"{name} must be a positive number of seconds, got {value!r}")
+        self.domain_id = domain_id
+        self.connect_timeout_s = connect_timeout_s
+        self.max_age_s = max_age_s
+        self.max_skew_s = max_skew_s
+        self.sync_on = sync_on
+        self.rate_window_s = rate_window_s
+        # Re-entrant: a signal handler may call stop() in the thread that is sending.
+        self._lock = threading.RLock()
+        self._opening = threading.Lock()
+        self._connection: Connection | None = None
+        self._specs: tuple[StreamSpec, ...] = ()
+        self._publishers: dict[str, Any] = {}
+        self._last: Array | None = None
+        self._fault: FluxError | None = None
+
+    # What a subclass says.
+
+    @abstractmethod
+    def streams(self) -> Sequence[StreamSpec]:
+        """Everything that is subscribed to."""
+
+    @abstractmethod
+    def commands(self) -> Sequence[CommandSpec]:
+        """Everything that is published."""
+
+    @abstractmethod
+    def read_state(self, messages: Mapping[str, Any]) -> Array:
+        """``(state_dim,)`` of the newest message of each ``state`` stream; raises Faulted."""
+
+    @abstractmethod
+    def publish_action(self, action: Array) -> None:
+        """Send a ``(dim,)`` action that was checked, with :meth:`publish`."""
+
+    def read_base(self, messages: Mapping[str, Any]) -> Array | None:
+        """``(2,)`` speeds of a mobile base of the ``side`` streams' messages; None without one."""
+        return None
+
+    def on_connected(self, connection: Connection) -> None:
+        """Called at the end of ``connect``."""
+        return
+
+    def on_stop(self) -> None:
+        """Called in every ``stop``, after the arm holds: stop what else can move."""
+        return
+
+    def check_robot(self) -> None:
+        """Called before every action; raises Faulted when the robot says that it cannot move."""
+        return
+
+    # The contract.
+
+    def connect(self) -> None:
+        """Open the connection and wait until the robot is there; nothing if it is open.
+
+        Raises:
+            LoadFailed: no ROS 2, or a message package is missing.
+            NotReady: a topic has no publisher (names those that are there), bears another type,
+                stays silent, or loses most messages; nobody listens for commands.
+            Rejected: another node publishes commands.
+            Faulted: what arrives is not what the embodiment describes.
+        """
+        # Its own lock: stop() must never wait for a driver that does not come.
+        with self._opening:
+            if self._connection is not None:
+                return
+            self._fault, self._last = None, None
+            connection = Connection(f"fluxvla_{self.embodiment.name}", self.domain_id)
+            try:
+                self._open(connection)
+                self._connection = connection
+                self.get_frame()
+                self.on_connected(connection)
+            except BaseException:
+                self._connection = None
+                connection.close()
+                raise
+
+    def get_frame(self) -> RobotFrame:
+        """State and pictures that belong together, in fresh arrays, with their receipt stamps.
+
+        Raises:
+            NotReady: not connected; a stream is silent, or they are too far apart in time.
+            Faulted: the connection broke, or a message is not what the embodiment describes.
+        """
+        rings, matched = self._matched()
+        stamps = {name: received.receipt for name, received in matched.items()}
+        side = {spec.name: rings[spec.name][-1] for spec in self._specs if spec.name in rings}
+        states = {spec.name: matched[spec.name].message for spec in self._specs_of(STATE)}
+        stamps[STATE_STREAM] = min(stamps.pop(name) for name in states)
+        colours, depths = frames.pictures(self._specs, matched)
+        base = self.read_base({name: received.message for name, received in side.items()})
+        return RobotFrame(self.read_state(states), colours, stamps, depths, base)
+
+    def get_state(self) -> tuple[Array, float]:
+        """The newest ``(state_dim,)`` state and its receipt stamp, without looking at pictures.
+
+        Raises:
+            NotReady: not connected, or a state stream is silent.
+            Faulted: the connection broke, or a message is not what the embodiment describes.
+        """
+        rings = self._fresh(STATE)
+        newest = {name: items[-1] for name, items in rings.items()}
+        state = self.read_state({name: received.message for name, received in newest.items()})
+        return state, min(received.receipt for received in newest.values())
+
+    def send_action(self, action: npt.ArrayLike) -> None:
+        """Publish one ``(dim,)`` command.
+
+        Raises:
+            Rejected: wrong shape, not finite, or outside the limits; before anything is sent.
+            NotReady: not connected.
+            Faulted: the connection broke, another node commands the arm, or the robot cannot move.
+        """
+        checked = checked_action(self.embodiment, action)
+        with self._lock:
+            connection = self._connected()
+            connection.check()
+            if self._fault is not None:
+                raise self._fault
+            self.check_robot()
+            self.publish_action(checked)
+            self._last = checked
+
+    def stop(self) -> None:
+        """Hold: repeat the last command, or where a joint is if it was kept from following.
+
+        Any state, any thread, any number of times. An arm that was never commanded is left alone.
+        What fails is logged, not raised: the caller is ending a motion for another reason.
+        """
+        with self._lock:
+            if self._connection is None:
+                return
+            steps = [self.on_stop]
+            if self._last is not None:
+                target = self._hold_target(self._last)
+                steps.insert(0, lambda: self.publish_action(target))
+            for step in steps:
+                try:
+                    step()
+                except Exception as error:  # noqa: BLE001 - the other steps must still be taken
+                    log.error("%s: stopping failed: %s", self.embodiment.name, error)
+
+    def close(self) -> None:
+        """Hold, then give the connection back; any number of times."""
+        with self._lock:
+            connection = self._connection
+            if connection is None:
+                return
+            try:
+                self.stop()
+                self._flush()
+            finally:
+                self._connection = None
+                connection.close()
+
+    # For subclasses.
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Send a message on one of the ``commands()`` topics; stamps its header if it has one.
+
+        Raises:
+            Faulted: the middleware does not take it.
+        """
+        connection = self._connected()
+        if hasattr(message, "header"):
+            message.header.stamp = connection.node.get_clock().now().to_msg()
+        try:
+            self._publishers[topic].publish(message)
+        except Exception as error:  # rclpy's own classes differ between releases
+            raise Faulted(f"a command on {topic} could not be sent: {error}") from error
+
+    def newest(self, name: str) -> Received | None:
+        """The newest message of a stream, None before the first or without a connection."""
+        connection = self._connection
+        return connection.streams[name].newest() if connection is not None else None
+
+    # Parts.
+
+    def _open(self, connection: Connection) -> None:
+        self._specs = tuple(self.streams())
+        commands = tuple(self.commands())
+        for spec in self._specs:
+            message = message_class(spec.message)
+            connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
+        self._publishers = {
+            command.topic: connection.publisher(command.topic, message_class(command.message))
+            for command in commands
+        }
+        startup = Startup(connection, self._specs, commands)
+        startup.wait(self.connect_timeout_s)
+        for warning in startup.count(self.rate_window_s):
+            log.warning("%s", warning)
+        exclusive = [command.topic for command in commands if command.exclusive]
+        connection.watch(lambda: self._watch_commanders(connection, exclusive))
+
+    def _watch_commanders(self, connection: Connection, topics: Sequence[str]) -> None:
+        others = discovery.commanders(connection.node, topics, connection.name)
+        error = discovery.contested(others) if others else None
+        if error is not None and self._fault is None:
+            log.error("%s", error.what)
+        self._fault = Faulted(error.what, cause=error.cause, next=error.next) if error else None
+
+    def _connected(self) -> Connection:
+        if self._connection is None:
+            raise NotReady(f"{self.embodiment.name} is not connected", next="call connect() first")
+        return self._connection
+
+    def _matched(self) -> tuple[dict[str, tuple[Received, ...]], Mapping[str, Received]]:
+        """Messages of all streams, and those that belong together, waiting a little for them."""
+        until = time.monotonic() + _PATIENCE_S
+        specs = self._specs_of(STATE, CAMERA, DEPTH)
+        while True:
+            rings = self._fresh()
+            by = "receipt" if self._clock_stepped() else self.sync_on
+            try:
+                match = sync.match({s.name: rings[s.name] for s in specs}, self.max_skew_s, by)
+            except NotReady:
+                if time.monotonic() >= until:
+                    raise
+                time.sleep(_LOOK_S)
+            else:
+                return rings, match.messages
+
+    def _specs_of(self, *kinds: str) -> list[StreamSpec]:
+        return [spec for spec in self._specs if spec.kind in kinds]
+
+    def _fresh(self, *kinds: str) -> dict[str, tuple[Received, ...]]:
+        """Messages of every required stream (of ``kinds``), none silent."""
+        connection = self._connected()
+        connection.check()
+        specs = self._specs_of(*kinds) if kinds else self._specs
+        rings = {spec.name: connection.streams[spec.name].ring.items() for spec in specs}
+        required = {spec.name: rings[spec.name] for spec in specs if spec.required}
+        silent = sync.silent(required, time.monotonic(), self.max_age_s)
+        if silent:
+            raise self._silence(connection, silent)
+        return {name: items for name, items in rings.items() if items}
+
+    def _silence(self, connection: Connection, silent: Mapping[str, float | None]) -> OperatorError:
+        lines, gone = [], []
+        for name, age in silent.items():
+            stream = connection.streams[name]
+            since = f"silent for {age:.2f} s" if age is not None else "never heard"
+            lines.append(f"{stream.label} is {since}")
+            if not connection.node.get_publishers_info_by_topic(stream.topic):
+                gone.append(stream.topic)
+        cause = "the device froze, or its driver was killed or hangs"
+        if gone:
+            cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
+        return NotReady(
+            f"{'; '.join(lines)}; {self.max_age_s:g} s is allowed",
+            cause=cause,
+            next="look at the driver; max_age_s of the operator says how long it may be silent",
+        )
+
+    def _clock_stepped(self) -> bool:
+        """Whether a sender's clock stepped so recently that stamps on both sides are kept."""
+        connection = self._connected()
+        since = time.monotonic() - self.max_age_s
+        rings = [stream.ring for stream in connection.streams.values()]
+        return any(ring.stepped_at is not None and ring.stepped_at > since for ring in rings)
+
+    def _hold_target(self, last: Array) -> Array:
+        try:
+            state, _ = self.get_state()
+        except FluxError:
+            # Where the arm is, nobody knows; its last command is where it goes or stays.
+            return last
+        return hold_target(self.embodiment, last, state)
+
+    def _flush(self) -> None:
+        from rclpy.duration import Duration
+
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=_FLUSH_S))

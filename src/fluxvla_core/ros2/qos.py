@@ -1,0 +1,45 @@
+"""Quality of service: what to ask for, given what publishers offer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+RELIABLE = "reliable"
+BEST_EFFORT = "best_effort"
+
+
+def reliability(offers: Iterable[Any]) -> str:
+    """What to subscribe with: ``reliable`` where every publisher offers it, else ``best_effort``.
+
+    A reliable subscription is never matched with a best-effort publisher, while a best-effort one
+    is matched with any; and best effort loses pictures that a reliable one would have repaired.
+
+    Args:
+        offers: what ``Node.get_publishers_info_by_topic`` gives; none yet counts as best effort.
+    """
+    kinds = [offer.qos_profile.reliability.name for offer in offers]
+    return RELIABLE if kinds and all(kind == "RELIABLE" for kind in kinds) else BEST_EFFORT
+
+
+def keeps_last(offers: Iterable[Any]) -> bool:
+    """Whether every publisher hands its last message to who comes later (``transient_local``).
+
+    Asking for it where one does not would leave that one unmatched.
+    """
+    kinds = [offer.qos_profile.durability.name for offer in offers]
+    return bool(kinds) and all(kind == "TRANSIENT_LOCAL" for kind in kinds)
+
+
+def profile(kind: str, depth: int, latched: bool = False) -> Any:
+    """``rclpy.qos.QoSProfile`` with the last ``depth`` messages, reliable or best effort, and
+    ``transient_local`` durability if ``latched``."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE
+        if kind == RELIABLE
+        else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

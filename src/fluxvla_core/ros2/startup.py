@@ -1,0 +1,119 @@
+"""What ``connect`` waits for and checks, with the error that names what is missing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from fluxvla_core.errors import FluxError, NotReady
+from fluxvla_core.ros2 import discovery, rates
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.rates import Reception
+from fluxvla_core.ros2.require import type_name
+from fluxvla_core.ros2.stream import Stream
+from fluxvla_core.ros2.streams import CommandSpec, StreamSpec
+
+_POLL_S = 0.02
+
+
+class Startup:
+    """Looks at one connection until everything that is needed is there.
+
+    Args:
+        connection: with all streams subscribed and all publishers made.
+        specs: the streams.
+        commands: the publishers.
+    """
+
+    def __init__(
+        self, connection: Connection, specs: Sequence[StreamSpec], commands: Sequence[CommandSpec]
+    ) -> None:
+        self._connection = connection
+        self._node = connection.node
+        self._specs = [spec for spec in specs if spec.required]
+        self._exclusive = [command.topic for command in commands if command.exclusive]
+        self._since = time.monotonic()
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when every stream has spoken, commands have a listener and no other commander.
+
+        Raises:
+            NotReady, Rejected: not within ``timeout_s``; names the first thing that is wrong.
+            Faulted: the connection broke.
+        """
+        until = self._since + timeout_s
+        while True:
+            self._connection.check()
+            problem = self._problem(hurry=time.monotonic() < until)
+            if problem is None:
+                return
+            if time.monotonic() >= until:
+                raise problem
+            time.sleep(_POLL_S)
+
+    def count(self, seconds: float) -> list[str]:
+        """Count what arrives for a while; warnings about streams that lose some of it.
+
+        Raises:
+            NotReady: a stream loses most messages.
+        """
+        if seconds <= 0:
+            return []
+        streams = [(spec, self._connection.streams[spec.name]) for spec in self._specs]
+        before = [(stream.ring.received, stream.lost) for _, stream in streams]
+        start = time.monotonic()
+        time.sleep(seconds)
+        span = time.monotonic() - start
+        return rates.check(
+            Reception(
+                stream.label,
+                stream.reliability,
+                span,
+                stream.ring.received - received,
+                stream.lost - lost,
+                _size(stream),
+                spec.expected_hz,
+            )
+            for (spec, stream), (received, lost) in zip(streams, before, strict=True)
+        )
+
+    def _problem(self, hurry: bool) -> FluxError | None:
+        """What is still wrong; ``hurry`` leaves out what only makes the message better."""
+        quiet = [s for spec in self._specs if not (s := self._stream(spec)).newest()]
+        if quiet:
+            return NotReady("waiting") if hurry else self._why(quiet)
+        deaf = [t for t in self._exclusive if not self._node.count_subscribers(t)]
+        if deaf:
+            return discovery.nobody_listens(deaf)
+        others = discovery.commanders(self._node, self._exclusive, self._connection.name)
+        return discovery.contested(others) if others else None
+
+    def _why(self, quiet: Sequence[Stream]) -> FluxError:
+        published = discovery.published(self._node, self._connection.name)
+        missing = {s.name: s.topic for s in quiet if s.topic not in published}
+        if missing:
+            return discovery.missing(missing, published, self._connection.domain)
+        for stream in quiet:
+            wanted = type_name(stream.message)
+            offers = self._node.get_publishers_info_by_topic(stream.topic)
+            types = sorted({offer.topic_type for offer in offers})
+            if wanted not in types:
+                return discovery.wrong_type(stream.label, stream.topic, wanted, types)
+        lost = [s for s in quiet if s.lost]
+        if lost:
+            span = time.monotonic() - self._since
+            return rates.lossy(
+                [Reception(s.label, s.reliability, span, 0, s.lost, 0) for s in lost]
+            )
+        return discovery.silent_publishers([s.label for s in quiet])
+
+    def _stream(self, spec: StreamSpec) -> Stream:
+        return self._connection.streams[spec.name]
+
+
+def _size(stream: Stream) -> int:
+    """Bytes of the newest message's ``data``, 0 where there is none."""
+    newest = stream.newest()
+    data: Any = getattr(newest.message, "data", b"") if newest is not None else b""
+    return len(data) if hasattr(data, "__len__") else 0

@@ -1,0 +1,307 @@
+"""A robot's ROS 2 side without the robot: a process that publishes, listens, and falls ill.
+
+    python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
+
+``Driver`` starts that process from a test, tells it what to do and reads what it heard. It is a
+process of its own because that is what drivers are: what one process does to another through DDS
+(lost pictures, killed publishers, other settings after a restart) happens between processes only.
+Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import itertools
+import json
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fluxvla_core.ros2 import images, joints, qos
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.faults import Fault, Faults
+from fluxvla_core.ros2.require import message_class
+
+_START_S = 20.0
+
+
+class Driver:
+    """The process, from outside; a context manager.
+
+    Args:
+        streams: what it publishes. Each has ``topic``, ``message`` (type), ``hz``, and, by type:
+            ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
+            (Image), ``format`` (CompressedImage, a JPEG or PNG of the same), ``data`` (std_msgs),
+            ``follows`` (a sink's topic: the last command there is where its joints are);
+            ``best_effort`` and ``latched`` say how; ``stamped: false`` leaves stamps at zero.
+        sinks: what it listens to: ``topic`` and ``message``. What arrives is in ``heard``.
+        name: of its node.
+        environment: of the process; this one's by default.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[Mapping[str, Any]] = (),
+        sinks: Sequence[Mapping[str, Any]] = (),
+        name: str = "driver",
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        spec = json.dumps({"streams": list(streams), "sinks": list(sinks), "name": name})
+        self.heard: list[dict[str, Any]] = []
+        self._ready = threading.Event()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, spec],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=None if environment is None else dict(environment),
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        if not self._ready.wait(_START_S) or self._process.poll() is not None:
+            self.kill()
+            raise RuntimeError(f"the driver did not start (exit code {self._process.returncode})")
+
+    def tell(self, **order: Any) -> None:
+        """``fault="TOPIC=MODE:AMOUNT"``, ``well="TOPIC"``, ``change={topic: {key: value}}``."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.flush()
+
+    def kill(self) -> None:
+        """End it with SIGKILL: no goodbye on the graph."""
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        """End it by closing its input; it leaves the graph properly."""
+        assert self._process.stdin is not None
+        if self._process.poll() is None:
+            self._process.stdin.close()
+            try:
+                self._process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                self.kill()
+        self._reader.join(5.0)
+
+    def on(self, topic: str) -> list[dict[str, Any]]:
+        """What it heard on ``topic``, oldest first: ``at`` (monotonic) and the message's fields."""
+        return [item for item in list(self.heard) if item["topic"] == topic]
+
+    def __enter__(self) -> Driver:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            item = json.loads(line)
+            if "ready" in item:
+                self._ready.set()
+            else:
+                self.heard.append(item)
+        self._ready.set()
+
+
+class _Publisher:
+    """One stream of the process."""
+
+    def __init__(self, connection: Connection, spec: dict[str, Any]) -> None:
+        self.spec = spec
+        self.topic: str = spec["topic"]
+        self.cls = message_class(spec["message"])
+        kind = qos.BEST_EFFORT if spec.get("best_effort") else qos.RELIABLE
+        profile = qos.profile(kind, depth=5, latched=bool(spec.get("latched")))
+        self.publisher = connection.node.create_publisher(self.cls, self.topic, profile)
+        self.next = time.monotonic()
+        self.count = 0
+
+    def make(self, connection: Connection, commands: Mapping[str, Any]) -> Any:
+        spec, message, kind = self.spec, self.cls(), self.cls.__name__
+        self.count += 1
+        if kind == "JointState":
+            known = commands.get(spec.get("follows", ""))
+            here = dict(zip(spec["names"], spec["positions"], strict=False))
+            if known is not None:
+                here.update(_targets(known, spec["names"]))
+            spec["positions"] = [here.get(name, 0.0) for name in spec["names"]]
+            joints.fill(message, spec["names"], spec["positions"])
+        elif kind in ("Image", "CompressedImage"):
+            _fill_picture(message, spec)
+        elif kind == "Odometry":
+            message.twist.twist.linear.x, message.twist.twist.angular.z = spec["data"]
+        else:
+            message.data = spec["data"]
+        if hasattr(message, "header") and spec.get("stamped", True):
+            message.header.stamp = connection.node.get_clock().now().to_msg()
+        return message
+
+
+def _targets(command: Any, names: Sequence[str]) -> dict[str, float]:
+    """Joint positions that a JointState, a JointTrajectory's end or an array in order asks for."""
+    if hasattr(command, "points"):
+        return dict(zip(command.joint_names, command.points[-1].positions, strict=True))
+    if hasattr(command, "position"):
+        return dict(zip(command.name, command.position, strict=True))
+    return dict(zip(names, command.data, strict=False))
+
+
+def picture(height: int, width: int, encoding: str) -> np.ndarray[Any, np.dtype[Any]]:
+    """What the driver's cameras see: in colours, red 10, green 20, blue 30; in depth, 1.5 m."""
+    if encoding == "16UC1":
+        return np.full((height, width), 1500, np.uint16)
+    if encoding == "32FC1":
+        return np.full((height, width), 1.5, np.float32)
+    if encoding == "mono8":
+        return np.full((height, width), 40, np.uint8)
+    colours = {"r": 10, "g": 20, "b": 30, "a": 255}
+    row = [colours[letter] for letter in encoding.rstrip("8")]
+    return np.broadcast_to(np.array(row, np.uint8), (height, width, len(row)))
+
+
+def _fill_picture(message: Any, spec: dict[str, Any]) -> None:
+    encoding = spec.get("encoding", "rgb8")
+    size = spec.get("height", 48), spec.get("width", 64)
+    cached = spec.get("cached")
+    if cached is None or cached[0] != (size, encoding):
+        pixels = picture(*size, encoding)
+        if "format" in spec:
+            import cv2
+
+            done, packed = cv2.imencode(f".{spec['format']}", pixels[..., ::-1])
+            assert done
+            pixels = packed
+        cached = spec["cached"] = ((size, encoding), pixels)
+    if "format" in spec:
+        message.format = spec["format"]
+        message.data = cached[1].tobytes()
+    else:
+        images.fill(message, cached[1], encoding)
+
+
+def _orders() -> queue.Queue[dict[str, Any] | None]:
+    orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            orders.put(json.loads(line))
+        orders.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    return orders
+
+
+def _listen(
+    connection: Connection, sinks: Sequence[Mapping[str, Any]], say: Callable[..., None]
+) -> dict[str, Any]:
+    commands: dict[str, Any] = {}
+
+    def hear(topic: str) -> Callable[[Any], None]:
+        def store(message: Any) -> None:
+            commands[topic] = message
+            say(topic=topic, at=time.monotonic(), **_plain(message))
+
+        return store
+
+    for sink in sinks:
+        connection.node.create_subscription(
+            message_class(sink["message"]), sink["topic"], hear(sink["topic"]), 50
+        )
+    return commands
+
+
+def _plain(message: Any) -> dict[str, Any]:
+    """The message's fields as JSON values; headers and empty fields left out."""
+    found: dict[str, Any] = {}
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        if name == "header" or name == "layout":
+            continue
+        if hasattr(value, "get_fields_and_field_types"):
+            found[name] = _plain(value)
+        elif isinstance(value, (str, bool, int, float)):
+            found[name] = value
+        else:
+            found[name] = [
+                _plain(v) if hasattr(v, "get_fields_and_field_types") else v for v in value
+            ]
+    return found
+
+
+def _order(order: Mapping[str, Any], faults: Faults, publishers: Sequence[_Publisher]) -> None:
+    if "fault" in order:
+        faults.set(*Fault.parse(order["fault"]))
+    if "well" in order:
+        faults.clear(order["well"])
+    for topic, changes in order.get("change", {}).items():
+        for publisher in publishers:
+            if publisher.topic == topic:
+                publisher.spec.update(changes)
+
+
+def run(spec: Mapping[str, Any]) -> None:
+    """Be the driver until standard input ends."""
+    connection = Connection(spec.get("name", "driver"))
+    lock = threading.Lock()
+
+    def say(**fields: Any) -> None:
+        with lock:
+            print(json.dumps(fields), flush=True)
+
+    try:
+        commands = _listen(connection, spec["sinks"], say)
+        publishers = [_Publisher(connection, dict(stream)) for stream in spec["streams"]]
+        orders, faults = _orders(), Faults()
+        say(ready=True)
+        _publish(connection, publishers, commands, orders, faults)
+    finally:
+        connection.close()
+
+
+def _publish(
+    connection: Connection,
+    publishers: Sequence[_Publisher],
+    commands: Mapping[str, Any],
+    orders: queue.Queue[dict[str, Any] | None],
+    faults: Faults,
+) -> None:
+    late: list[tuple[float, int, Any, Any]] = []
+    ticket = itertools.count()
+    while True:
+        now = time.monotonic()
+        for publisher in publishers:
+            if now < publisher.next:
+                continue
+            hz = publisher.spec["hz"]
+            # hz 0: once, as a latched topic does.
+            publisher.next = max(publisher.next + 1.0 / hz, now - 0.5) if hz else float("inf")
+            message = publisher.make(connection, commands)
+            for delay, copy in faults.apply(publisher.topic, message):
+                heapq.heappush(late, (now + delay, next(ticket), publisher.publisher, copy))
+        while late and late[0][0] <= time.monotonic():
+            _, _, sender, message = heapq.heappop(late)
+            sender.publish(message)
+        upcoming = [p.next for p in publishers] + [item[0] for item in late[:1]]
+        pause = min([*upcoming, now + 0.1]) - time.monotonic()
+        try:
+            order = orders.get(timeout=max(pause, 0.0))
+        except queue.Empty:
+            continue
+        if order is None:
+            return
+        _order(order, faults, publishers)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="a robot's ROS 2 side, for tests")
+    parser.add_argument("spec", type=json.loads)
+    run(parser.parse_args().spec)

@@ -1,0 +1,52 @@
+"""Choosing reliability and durability by what is offered."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from fluxvla_core.ros2 import qos
+
+
+def offers(*kinds):
+    def named(value):
+        return SimpleNamespace(name=value)
+
+    return [
+        SimpleNamespace(qos_profile=SimpleNamespace(reliability=named(r), durability=named(d)))
+        for r, d in kinds
+    ]
+
+
+R, B = "RELIABLE", "BEST_EFFORT"
+V, T = "VOLATILE", "TRANSIENT_LOCAL"
+
+
+@pytest.mark.parametrize(
+    ("given", "chosen"),
+    [
+        ([], qos.BEST_EFFORT),
+        ([(R, V)], qos.RELIABLE),
+        ([(R, V), (R, T)], qos.RELIABLE),
+        ([(B, V)], qos.BEST_EFFORT),
+        ([(R, V), (B, V)], qos.BEST_EFFORT),
+    ],
+)
+def test_reliable_only_where_everybody_offers_it(given, chosen):
+    assert qos.reliability(offers(*given)) == chosen
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"), [([], False), ([(R, T)], True), ([(R, T), (R, V)], False)]
+)
+def test_last_messages_are_asked_for_only_where_everybody_keeps_them(given, kept):
+    assert qos.keeps_last(offers(*given)) is kept
+
+
+def test_profiles_say_what_was_chosen(ros_domain):
+    profile = qos.profile(qos.RELIABLE, 3, latched=True)
+    plain = qos.profile(qos.BEST_EFFORT, 1)
+
+    assert (profile.depth, profile.reliability.name, profile.durability.name) == (3, R, T)
+    assert (plain.depth, plain.reliability.name, plain.durability.name) == (1, B, V)

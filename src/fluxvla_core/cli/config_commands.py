@@ -27,7 +27,8 @@ class Show:
 
     def run(self, args: argparse.Namespace) -> int:
         config = apply_overrides(load_config(args.file), args.overrides)
-        print("\n".join(listing(config, origin=args.origin)))
+        for line in listing(config, origin=args.origin):
+            print(line)
         return 0
 
 
@@ -49,7 +50,8 @@ class Check:
         config = apply_overrides(load_config(args.file), args.overrides)
         checked = check_config(config, args.section)
         print(f"{config.file}: no problems; sections: {', '.join(checked.sections) or 'none'}")
-        print("\n".join(used(checked.uses)))
+        for line in used(checked.uses):
+            print(line)
         return 0
 
 

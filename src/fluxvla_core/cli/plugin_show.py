@@ -62,9 +62,9 @@ def describe(plugin: Plugin) -> str:
     try:
         signature = installed(plugin).signature
     except PluginError as error:
-        return "\n".join([*lines, f"  cannot work   {error.what}"])
+        return "\n".join([*lines, f"  cannot work  {error.what}"])
     if signature is None:
-        return "\n".join([*lines, "  source        cannot be read; its keys are not checked"])
+        return "\n".join([*lines, "  source       cannot be read; its keys are not checked"])
     lines.append(f"  defined at   {signature.place}")
     if signature.api:
         lines.append(f"  contract     {plugin.group.removeprefix(PREFIX)} {signature.api}")

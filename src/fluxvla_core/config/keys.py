@@ -34,7 +34,7 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     elif isinstance(value, list) and value and any(isinstance(v, (dict, list)) for v in value):
         for index, item in enumerate(value):
             yield from leaves(item, child(key, index))
-    else:
+    elif key:
         yield key, value
 
 

@@ -1,0 +1,93 @@
+"""``fluxvla config show`` and ``check``."""
+
+from __future__ import annotations
+
+import pytest
+
+from fluxvla_core.cli.config_commands import literal
+from fluxvla_core.config.overrides import parse_value
+
+from .conftest import Fluxvla, Write
+
+
+def test_show_prints_keys_as_overrides_take_them(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.toml", "_base_ = 'c.py'\n[eval]\nseeds = 3\nnames = ['a b', 'c']\n")
+    ended = fluxvla("config", "show", "d.toml", "--set", "runner.max_epochs=7")
+    assert ended.code == 0
+    assert ended.out == (
+        'train_dataloader.dataset.type = "ToyDataset"\n'
+        'runner.type = "ToyTrainRunner"\n'
+        "runner.max_epochs = 7\n"
+        'eval.type = "ToyEvalRunner"\n'
+        'eval.operator.type = "ToyOperator"\n'
+        "eval.seeds = 3\n"
+        'eval.names = ["a b", "c"]\n'
+    )
+
+
+def test_show_with_origins(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.toml", "_base_ = 'c.py'\n[eval]\nseeds = 3\n")
+    ended = fluxvla("config", "show", "--origin", "d.toml", "--cfg-options", "runner.max_epochs=7")
+    rows = dict(map(str.strip, line.split("  # ")) for line in ended.out.splitlines())
+    assert rows["runner.max_epochs = 7"] == "--set runner.max_epochs=7"
+    assert rows["eval.seeds = 3"] == "d.toml:3"
+    assert rows['eval.type = "ToyEvalRunner"'] == "c.py:4"
+
+
+def test_check_says_what_is_used(fluxvla: Fluxvla, write: Write) -> None:
+    ended = fluxvla("config", "check", "c.py", "--plugin", "toy.py")
+    assert ended.code == 0
+    assert ended.out.splitlines() == [
+        "c.py: no problems; sections: runner, eval",
+        "  train_dataloader.dataset  ToyDataset      registered in this process",
+        "  runner                    ToyTrainRunner  registered in this process",
+        "  eval                      ToyEvalRunner   registered in this process",
+        "  eval.operator             ToyOperator     registered in this process",
+    ]
+
+
+def test_check_fails_with_every_problem(fluxvla: Fluxvla, write: Write) -> None:
+    ended = fluxvla(
+        "config",
+        "check",
+        "c.py",
+        "--plugin",
+        "toy.py",
+        "--set",
+        "runner.max_epoch+=1",
+        "--set",
+        "eval.operator.prt+=1",
+    )
+    assert ended.code == 2
+    assert ended.err.startswith("2 problems in the config:\n")
+    assert (
+        "--set runner.max_epoch+=1: runner.max_epoch: ToyTrainRunner takes no 'max_epoch'"
+    ) in ended.err
+    assert "eval.operator.prt: ToyOperator takes no 'prt'; did you mean 'port'?" in ended.err
+
+
+def test_check_for_one_section(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.py", "runner = dict(type='FarTrainRunner')\neval = dict(type='ToyEvalRunner')\n")
+    words = ("config", "check", "d.py", "--plugin", "toy.py")
+    assert fluxvla(*words, "--section", "eval").code == 0
+
+
+def test_check_without_the_section_fails(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.py", "runner = dict(type='FarTrainRunner')\neval = dict(type='ToyEvalRunner')\n")
+    ended = fluxvla("config", "check", "d.py", "--plugin", "toy.py")
+    assert ended.code == 2
+    assert "runner.type: no fluxvla.runners plugin named 'FarTrainRunner'" in ended.err
+
+
+def test_a_config_without_sections(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.py", "x = 1\n")
+    assert fluxvla("config", "check", "d.py").out == "d.py: no problems; sections: none\n"
+    write("e.py", "")
+    assert fluxvla("config", "show", "e.py").out == ""
+
+
+@pytest.mark.parametrize(
+    "value", [None, True, 3, 1e-5, "a 'b' \"c\"", [1, ["x"]], {"type": "X", "y": [1]}, "ü"]
+)
+def test_what_is_printed_can_be_typed_again(value: object) -> None:
+    assert parse_value(literal(value)) == value

@@ -1,0 +1,229 @@
+"""``--nproc``: real ranks, their failures, signals, and a launcher that is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fluxvla_core.cli import launch, ranks
+from fluxvla_core.cli.ranks import Failure, root_cause
+
+from .conftest import Fluxvla, Write
+from .test_run import said
+
+COMMAND = [
+    sys.executable,
+    "-m",
+    "fluxvla_core",
+    "run",
+    "--config",
+    "c.py",
+    "--plugin",
+    "toy.py",
+    "--section",
+    "runner",
+    "--nproc",
+    "2",
+]
+
+torch = pytest.mark.skipif(
+    __import__("importlib.util").util.find_spec("torch") is None, reason="ranks need torch"
+)
+
+
+def start(*words: str) -> subprocess.Popen[str]:
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+    return subprocess.Popen(
+        [*COMMAND, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
+def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+@torch
+def test_two_ranks_train_and_one_talks(write: Write) -> None:
+    code, out, err = finished(start("--set", "runner.max_epochs=5", "--resume", "auto"))
+    assert (code, err) == (0, "")
+    assert out.count("train 2/2") == 1
+    cores = len(os.sched_getaffinity(0))
+    for rank in (0, 1):
+        told = said(rank=rank)
+        assert (told["nproc"], told["world"], told["epochs"]) == (2, "2", 5)
+        assert told["resume"] == "auto"
+        assert told["threads"] == str(max(1, cores // 2))
+
+
+@torch
+@pytest.mark.parametrize(
+    ("mode", "code", "text"),
+    [
+        ("rank 1 fails", 2, "rank-1.mp4: bad data\n"),
+        ("rank 1 raises", 1, "rank 1 failed:\nTraceback"),
+        (
+            "rank 1 dies",
+            1,
+            "rank 1 ended without a word: killed by SIGKILL\n"
+            "  likely cause: killed from outside, most often for want of memory\n",
+        ),
+    ],
+)
+def test_the_first_failure_is_the_message(write: Write, mode: str, code: int, text: str) -> None:
+    ended, _, err = finished(start("--set", f"runner.mode+={mode}"))
+    assert ended == code
+    assert err.startswith(text)
+    assert "SIGTERM" not in err
+
+
+def waiting(process: subprocess.Popen[str]) -> list[int]:
+    """The ranks' process ids, once both are at work."""
+    files = [Path(f"work_dirs/c/pid-{rank}") for rank in (0, 1)]
+    until = time.monotonic() + 60
+    while not all(f.exists() and f.read_text() for f in files):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return [int(f.read_text()) for f in files]
+
+
+@torch
+@pytest.mark.parametrize(
+    ("number", "code", "text"),
+    [(signal.SIGINT, 130, "interrupted\n"), (signal.SIGTERM, 1, "stopped by SIGTERM\n")],
+)
+def test_signals_reach_the_ranks(write: Write, number: int, code: int, text: str) -> None:
+    process = start("--set", "runner.mode+=wait")
+    pids = waiting(process)
+    process.send_signal(number)
+    assert finished(process)[::2] == (code, text)
+    assert not any(alive(pid) for pid in pids)
+
+
+@torch
+def test_ranks_do_not_outlive_a_launcher_that_is_killed(write: Write) -> None:
+    process = start("--set", "runner.mode+=wait")
+    pids = waiting(process)
+    process.kill()
+    process.communicate()
+    until = time.monotonic() + 20
+    while any(alive(pid) for pid in pids):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+# -- in this process -------------------------------------------------------------------------
+
+
+def test_nproc_inside_a_rank(run: Fluxvla, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    ended = run("--config", "c.py", "--section", "runner", "--nproc", "2")
+    assert ended.code == 2
+    assert "--nproc starts ranks, and this process is one already" in ended.err
+    assert "leave --nproc out under torchrun" in ended.err
+
+
+def test_nproc_without_torch(run: Fluxvla, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [n for n in sys.modules if n == "torch" or n.startswith("torch.distributed")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "torch.distributed", None)
+    ended = run("--config", "c.py", "--section", "runner", "--nproc", "2")
+    assert ended.code == 2
+    assert "which is not installed\n  next: pip install 'fluxvla-core[train]'" in ended.err
+
+
+def test_only_rank_0_of_torchrun_talks_and_writes(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    Path("work_dirs/c").mkdir(parents=True)
+    ended = run("--config", "c.py", "--section", "runner")
+    assert (ended.code, ended.out) == (0, "")
+    assert said(rank=1)["nproc"] == 2
+    assert not Path("work_dirs/c/config.resolved.json").exists()
+
+
+def test_a_launched_rank_leaves_its_error_to_the_launcher(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
+    Path("work_dirs/c").mkdir(parents=True)
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
+    assert (ended.code, ended.err) == (2, "")
+    failure = ranks.failures(tmp_path)[1]
+    assert (failure.text, failure.code, failure.expected) == (
+        "a.mp4: bad data\n  next: look at it",
+        2,
+        True,
+    )
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path / "gone"))
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
+    assert "a.mp4: bad data" in ended.err
+
+
+def test_the_root_cause() -> None:
+    asked = Failure(0, 1.0, "training was stopped by SIGTERM", 1, expected=True, asked=True)
+    broken = Failure(1, 2.0, "RuntimeError: connection closed", 1)
+    later = Failure(2, 2.5, "RuntimeError: connection closed", 1)
+    killed = Failure(3, 3.0, "ended without a word", 1, wordless=True)
+    named = Failure(4, 4.0, "a.mp4: bad data", 2, expected=True)
+    assert root_cause([asked, broken, later, killed, named]) is named
+    assert root_cause([asked, broken, later, killed]) is killed
+    assert root_cause([asked, later, broken]) is broken
+    assert root_cause([asked]) is asked
+
+
+def test_a_rank_whose_launcher_is_gone_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = (
+        "from fluxvla_core.cli import launch\n"
+        "try:\n    launch.die_with_parent()\n"
+        "except Exception as error:\n    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, ranks.LAUNCHER: "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "the launcher of this rank has ended\n"
+
+
+def test_a_rank_that_was_killed_after_the_grace_is_no_cause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Process:
+        exitcode = -9
+
+    first = Failure(1, 100.0, "ValueError: boom", 1)
+    monkeypatch.setattr(launch.time, "monotonic", lambda: 100.0 + launch._GRACE_S)
+    found = launch._all({0: Process(), 1: Process()}, {1: first})
+    assert root_cause(found) is first
+    monkeypatch.setattr(launch.time, "monotonic", lambda: 101.0)
+    found = launch._all({0: Process(), 1: Process()}, {1: first})
+    assert root_cause(found).rank == 0
+    assert launch._ending(3) == "exit code 3"

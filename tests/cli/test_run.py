@@ -1,0 +1,347 @@
+"""``fluxvla run`` in this process: sections, work dirs, records, refusals, endings."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from fluxvla_core.cli import plan as plan_module
+from fluxvla_core.cli.plan import default_work_dir
+
+from .conftest import Fluxvla, Write
+
+
+def said(folder: str = "work_dirs/c", rank: int = 0) -> dict[str, object]:
+    found: dict[str, object] = json.loads((Path(folder) / f"said-{rank}.json").read_text())
+    return found
+
+
+def test_training(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.max_epochs=2")
+    assert (ended.code, ended.err) == (0, "")
+    told = said()
+    config = told.pop("config")
+    assert told == {
+        "section": "runner",
+        "examples": 3,
+        "resume": None,
+        "nproc": 1,
+        "file": "c.py",
+        "epochs": 2,
+        "threads": os.environ.get("OMP_NUM_THREADS"),
+        "world": None,
+        "where": "--set runner.max_epochs=2: runner.max_epochs",
+    }
+    saved = json.loads(Path("work_dirs/c/config.resolved.json").read_text())
+    assert saved["config"] == config
+    assert saved["origins"]["runner.max_epochs"] == "--set runner.max_epochs=2"
+    environment = json.loads(Path("work_dirs/c/environment.json").read_text())
+    assert environment["fluxvla-core"]
+    texts = [line.partition("] ")[2] for line in ended.out.splitlines()]
+    assert texts == [
+        "train 1/2  loss 0.5",
+        "train 2/2  loss 0.25",
+        "loss: 0.25",
+        "steps: 2",
+        "work dir: work_dirs/c",
+    ]
+
+
+def test_the_resolved_config_of_a_run_runs_again(run: Fluxvla) -> None:
+    run("--config", "c.py", "--section", "runner", "--set", "runner.max_epochs=2")
+    first = said()
+    ended = run(
+        "--config",
+        "work_dirs/c/config.resolved.json",
+        "--section",
+        "runner",
+        "--work-dir",
+        "again",
+    )
+    assert ended.code == 0, ended.err
+    again = said("again")
+    assert again["config"] == first["config"]
+    assert again["where"] == first["where"]
+
+
+def test_evaluation(run: Fluxvla) -> None:
+    ended = run(
+        "--config",
+        "c.py",
+        "--section",
+        "eval",
+        "--task",
+        "lift it",
+        "--nproc",
+        "3",
+        "--work-dir",
+        "out/x",
+    )
+    assert ended.code == 0, ended.err
+    assert Path("out/x/eval.txt").read_text() == "True lift it 3"
+    assert Path("out/x/config.resolved.json").exists()
+
+
+def test_what_is_evaluated_later_leaves_the_trainings_records_alone(run: Fluxvla) -> None:
+    run("--config", "c.py", "--section", "runner")
+    before = Path("work_dirs/c/config.resolved.json").read_text()
+    run("--config", "c.py", "--section", "eval", "--set", "eval.seeds+=9")
+    assert Path("work_dirs/c/config.resolved.json").read_text() == before
+    theirs = json.loads(Path("work_dirs/c/eval/config.resolved.json").read_text())
+    assert theirs["config"]["eval"]["seeds"] == 9
+    assert Path("work_dirs/c/eval/environment.json").exists()
+
+
+def test_json_lines(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--log-format", "json")
+    records = [json.loads(line) for line in ended.out.splitlines()]
+    assert [r["kind"] for r in records] == [
+        "start",
+        "progress",
+        "progress",
+        "info",
+        "info",
+        "result",
+        "artifact",
+    ]
+    assert all(isinstance(r.pop("time"), float) for r in records)
+    assert records[0] == {"kind": "start", "section": "runner", "work_dir": "work_dirs/c"}
+    assert records[2] == {"kind": "progress", "name": "train", "done": 2, "total": 2, "loss": 0.25}
+    assert records[5]["result"] == {"loss": 0.25, "steps": 2, "curve": [0.5, 0.25]}
+
+
+def test_json_lines_of_a_failure(run: Fluxvla) -> None:
+    ended = run(
+        "--config",
+        "c.py",
+        "--section",
+        "runner",
+        "--log-format",
+        "json",
+        "--set",
+        "runner.mode+=denied",
+    )
+    last = json.loads(ended.out.splitlines()[-1])
+    assert (last["kind"], last["type"]) == ("error", "DataError")
+    assert last["text"] == "a.mp4: bad data\n  next: look at it"
+
+
+# -- which section ---------------------------------------------------------------------------
+
+
+def test_one_section_is_the_default(run: Fluxvla, write: Write) -> None:
+    write("d.py", "eval = dict(type='ToyEvalRunner')\nnote = dict(a=1)\n")
+    assert run("--config", "d.py").code == 0
+    assert Path("work_dirs/d/eval.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (
+            (),
+            "c.py: several sections can be run: runner (ToyTrainRunner), eval (ToyEvalRunner)\n"
+            "  next: name one: --section runner",
+        ),
+        (
+            ("--section", "evl"),
+            "c.py: no section 'evl'; did you mean 'eval'?\n"
+            "  next: sections there: runner (ToyTrainRunner), eval (ToyEvalRunner)",
+        ),
+        (("--section", "zzz"), "c.py: no section 'zzz'\n"),
+        (
+            ("--section", "train_dataloader"),
+            "c.py: section 'train_dataloader' cannot be run: it is no table whose type is a runner",
+        ),
+    ],
+)
+def test_sections_that_cannot_be_chosen(run: Fluxvla, words: tuple[str, ...], text: str) -> None:
+    ended = run("--config", "c.py", *words)
+    assert ended.code == 2
+    assert text in ended.err
+    assert not Path("work_dirs").exists()
+
+
+def test_nothing_to_run(run: Fluxvla, write: Write) -> None:
+    write("d.py", "x = 1\n")
+    ended = run("--config", "d.py")
+    assert ended.code == 2
+    assert "d.py: nothing to run: no table at the top has a type that is a runner" in ended.err
+    ended = run("--config", "d.py", "--section", "runner")
+    assert "no section 'runner'\n  next: sections there: none" in ended.err
+    write("e.py", "rehearse = dict(type='ToyEvalRuner')\n")
+    ended = run("--config", "e.py")
+    assert "rehearse.type: no plugin named 'ToyEvalRuner' in any registry" in ended.err
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+def test_no_config(run: Fluxvla, write: Write) -> None:
+    ended = run()
+    assert ended.code == 2
+    assert ended.err == ("no config given: fluxvla run --config FILE\n  next: fluxvla run --help\n")
+    write("configs/a.py", "")
+    write("configs/b.md", "")
+    assert run().err.endswith("next: configs here: configs/a.py\n")
+
+
+def test_a_typo_never_trains(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "eval", "--set", "runner.max_epoch+=2")
+    assert ended.code == 2
+    assert "ToyTrainRunner takes no 'max_epoch'" in ended.err
+    assert not Path("work_dirs").exists()
+
+
+def test_a_work_dir_that_cannot_be_written(
+    run: Fluxvla, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write("taken", "a file")
+    ended = run("--config", "c.py", "--section", "runner", "--work-dir", "taken")
+    assert ended.code == 2
+    assert ended.err == (
+        "taken: cannot write to the work dir: File exists\n"
+        "  next: name another one: --work-dir DIR\n"
+    )
+
+    def refuse(**kwargs: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(plan_module.tempfile, "TemporaryFile", refuse)
+    ended = run("--config", "c.py", "--section", "runner")
+    assert ended.code == 2
+    assert "work_dirs/c: cannot write to the work dir: Permission denied" in ended.err
+
+
+def test_a_fresh_training_does_not_land_on_another(run: Fluxvla, write: Write) -> None:
+    for step in (100, 200):
+        write(f"work_dirs/c/checkpoints/step-{step:09}/manifest.json", "{}")
+    ended = run("--config", "c.py", "--section", "runner")
+    assert ended.code == 2
+    assert ended.err == (
+        "work_dirs/c: the work dir already holds checkpoints, up to step 200\n"
+        "  next: go on from there: --resume auto; or begin anew elsewhere: --work-dir DIR\n"
+    )
+    assert run("--config", "c.py", "--section", "eval").code == 0
+    ended = run("--config", "c.py", "--section", "runner", "--resume", "auto")
+    assert ended.code == 0, ended.err
+    assert said()["resume"] == "auto"
+
+
+def test_options_that_do_not_fit_the_section(run: Fluxvla) -> None:
+    assert (
+        "--task says what a robot is to do, and section 'runner' trains"
+        in run("--config", "c.py", "--section", "runner", "--task", "1").err
+    )
+    assert (
+        "--resume is for training, and section 'eval' does not train"
+        in run("--config", "c.py", "--section", "eval", "--resume", "auto").err
+    )
+    ended = run("--config", "c.py", "--section", "runner", "--resume", "gone")
+    assert ended.code == 2
+    assert "--resume gone: there is no such checkpoint" in ended.err
+    assert "--resume auto takes the newest one" in ended.err
+
+
+# -- endings ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "code", "err"),
+    [
+        ("denied", 2, "a.mp4: bad data\n  next: look at it\n"),
+        (
+            "full",
+            1,
+            "no space left on the disk while writing big.bin\n"
+            "  next: make room and run the same command again, training with --resume auto\n",
+        ),
+        ("ctrl-c", 130, "interrupted: saved at step 3\n"),
+        ("sigterm", 1, "stopped by SIGTERM\n"),
+    ],
+)
+def test_endings(run: Fluxvla, mode: str, code: int, err: str) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    ended = run("--config", "c.py", "--section", "runner", "--set", f"runner.mode+={mode}")
+    assert (ended.code, ended.err) == (code, err)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_bug_in_a_runner_shows_its_line(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=boom")
+    assert ended.code == 1
+    assert 'raise ValueError("boom")' in ended.err
+
+
+# -- dry runs --------------------------------------------------------------------------------
+
+
+def test_a_dry_run_builds_nothing(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--dry-run", "--nproc", "2")
+    assert ended.code == 0
+    assert ended.out.startswith(
+        "section: runner (trains)\n"
+        "work dir: work_dirs/c\n"
+        "plugins:\n"
+        "  train_dataloader.dataset  ToyDataset      registered in this process\n"
+    )
+    assert "  runner.max_epochs = 1" in ended.out
+    assert ended.out.rstrip().endswith("# c.py:4")
+    assert not Path("work_dirs").exists()
+
+
+def test_a_dry_run_for_machines(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "eval", "--dry-run", "--log-format", "json")
+    outline = json.loads(ended.out)
+    assert (outline["section"], outline["trains"]) == ("eval", False)
+    assert outline["origins"]["runner.max_epochs"] == "c.py:3"
+    assert {
+        "key": "eval",
+        "type": "ToyEvalRunner",
+        "provided_by": "registered in this process",
+    } in (outline["plugins"])
+
+
+# -- --plugin --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("gone.py", None, "--plugin gone.py: there is no such file"),
+        ("x.txt", "", "--plugin x.txt: not a .py file"),
+        ("x.py", "a = 1\n1 / 0\n", "x.py:2: --plugin x.py: raised ZeroDivisionError"),
+        ("x.py", "a = (\n", "x.py:1: --plugin x.py: raised SyntaxError"),
+        (
+            "x.py",
+            "from fluxvla_core import RUNNERS\n@RUNNERS.register_module()\nclass X: ...\n",
+            "X does not fulfil the contract of fluxvla.runners",
+        ),
+    ],
+)
+def test_plugin_files_that_cannot_be_used(
+    fluxvla: Fluxvla, write: Write, name: str, text: str | None, message: str
+) -> None:
+    if text is not None:
+        write(name, text)
+    ended = fluxvla("run", "--config", "c.py", "--plugin", name)
+    assert ended.code == 2
+    assert message in ended.err
+
+
+@pytest.mark.parametrize(
+    ("file", "folder"),
+    [
+        ("configs/x.py", "work_dirs/x"),
+        ("y.toml", "work_dirs/y"),
+        ("out/run/config.resolved.json", "out/run"),
+        ("out/run/checkpoints/step-000000001/config.resolved.json", "out/run"),
+        ("other.json", "work_dirs/other"),
+    ],
+)
+def test_default_work_dirs(file: str, folder: str) -> None:
+    assert default_work_dir(Path(file)) == Path(folder)

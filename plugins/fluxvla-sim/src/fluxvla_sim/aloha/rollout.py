@@ -1,0 +1,134 @@
+"""One closed-loop episode in simulation: observe, predict, interpolate, limit, step.
+
+Commands are formed as an inference runner forms them in simulated time: the keyframes are joined
+linearly from the last command on, and pass the same limits. A policy that was evaluated here does
+the same thing, command for command, through ``AlohaSimOperator``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from fluxvla_aloha.embodiment import aloha_spec
+
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.control.keyframes import interpolate
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.safety.limits import Limiter
+from fluxvla_sim.aloha.scene import CONTROL_HZ, AlohaScene
+from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS, Facts, Task
+
+if TYPE_CHECKING:
+    from fluxvla_core.contracts.protocols import Policy
+    from fluxvla_core.spec.embodiment import Camera
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What one episode came to.
+
+    Args:
+        success: of the task that was asked for.
+        behaviours: success of every task, by name.
+        steps: control steps taken.
+        best_reward: the highest gym-aloha reward.
+        clamped: commands that the limits changed.
+        calls: how often the policy was asked.
+        state_hash: of the simulation's final state; equal for equal episodes.
+        seconds: of the whole episode; ``policy_seconds`` of it in the policy.
+    """
+
+    success: bool
+    behaviours: dict[str, bool]
+    steps: int
+    best_reward: int
+    clamped: int
+    calls: int
+    state_hash: str
+    seconds: float
+    policy_seconds: float
+
+
+def rollout(
+    scene: AlohaScene,
+    policy: Policy,
+    task: Task,
+    instruction: str,
+    seed: int,
+    cameras: Sequence[Camera],
+    replan_every: int,
+    max_steps: int = MAX_STEPS,
+    watch: Callable[[], None] | None = None,
+) -> Rollout:
+    """Run one episode; its course follows from the arguments alone.
+
+    Args:
+        scene: is reset to ``seed``.
+        policy: is reset to ``seed`` too.
+        task: whose end ends the episode: that of ``instruction``, whatever is being measured.
+        instruction: what the policy is told.
+        cameras: the pictures that the policy gets.
+        replan_every: how many keyframes of a chunk are used before the policy is asked again.
+        max_steps: control steps after which the episode ends.
+        watch: called before the first step and after each, for a video.
+
+    Raises:
+        RunFailed: the policy's chunk has the wrong shape or is not finite.
+    """
+    began, policy_seconds = time.perf_counter(), 0.0
+    scene.reset(seed)
+    policy.reset(seed)
+    limiter = Limiter(aloha_spec((), CONTROL_HZ), 1.0 / CONTROL_HZ)
+    limiter.start(scene.state)
+    facts, clamped, calls = Facts(), 0, 0
+    if watch is not None:
+        watch()
+    while not task.done(facts) and facts.steps < max_steps:
+        asked = time.perf_counter()
+        observation = _observe(scene, cameras, instruction)
+        chunk = _checked(policy.predict_action(observation), limiter.last.shape[0])
+        policy_seconds += time.perf_counter() - asked
+        calls += 1
+        keyframes = chunk[:replan_every]
+        for target in interpolate(limiter.last, keyframes, policy.action_rate_hz, CONTROL_HZ):
+            command, clamps = limiter.step(target)
+            clamped += bool(clamps)
+            scene.step(command)
+            facts = facts.after(scene)
+            if watch is not None:
+                watch()
+            if task.done(facts) or facts.steps >= max_steps:
+                break
+    return Rollout(
+        success=task.success(facts),
+        behaviours={name: each.success(facts) for name, each in TASKS.items()},
+        steps=facts.steps,
+        best_reward=facts.best_reward,
+        clamped=clamped,
+        calls=calls,
+        state_hash=hashlib.sha256(scene.data.qpos.tobytes()).hexdigest()[:16],
+        seconds=time.perf_counter() - began,
+        policy_seconds=policy_seconds,
+    )
+
+
+def _observe(scene: AlohaScene, cameras: Sequence[Camera], instruction: str) -> Observation:
+    return {
+        "qpos": scene.state.astype(np.float32),
+        "images": {c.name: scene.render(c.name, c.height, c.width) for c in cameras},
+        "task_description": instruction,
+    }
+
+
+def _checked(chunk: Any, dim: int) -> Any:
+    array = np.asarray(chunk, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != dim or not len(array):
+        raise RunFailed(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
+    if not np.isfinite(array).all():
+        raise RunFailed("the policy's chunk is not finite")
+    return array

@@ -1,0 +1,396 @@
+"""``AlohaSimEvalRunner``: how often a policy does what it is told, over seeds it has not seen."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.evaluate.episodes import open_ledger, run_episodes
+from fluxvla_core.evaluate.ledger import DONE, EpisodeKey
+from fluxvla_core.evaluate.pool import run_jobs
+from fluxvla_core.evaluate.summary import describe, summarise
+from fluxvla_sim.eval_worker import (
+    POLICY,
+    SWAPPED,
+    UNTRAINED,
+    AlohaEvalWorker,
+    Job,
+    Settings,
+)
+
+FORMAT = "fluxvla-eval-1"
+FOLDER = "eval"
+
+
+class AlohaSimEvalRunner:
+    """Evaluates a policy on gym-aloha's cube scene with the instructions of its two tasks.
+
+    Every episode's outcome follows from the policy, its task and its seed; the number of workers
+    changes nothing but the time. An evaluation that was interrupted goes on where it was when it
+    is started again in the same work dir.
+
+    Writes ``<work_dir>/eval/``: ``results.json``, ``episodes.jsonl``, ``videos/*.mp4``.
+
+    Args:
+        cfg: the whole config (injected).
+        context: what the run knows (injected): work dir, reporter.
+        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
+        policy: ``checkpoint``, or ``expert`` or ``untrained`` for comparison.
+        episodes: for each task.
+        seed: of each task's first episode; the others count up from it.
+        tasks: names of the tasks.
+        replan_every: how many keyframes of a chunk are used before the policy is asked again.
+        max_steps: control steps (20 ms) after which an episode ends.
+        instruction_swap: also tell the policy the other task's instruction, on seeds of its own,
+            and count which of the two it does.
+        baseline: also evaluate the same model with fresh random weights, on the same seeds.
+        workers: processes; ``--nproc`` overrides it.
+        record_videos: how many episodes to show: failures first, then successes.
+        video_camera, video_height, video_width, video_fps: of the videos.
+        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
+        height, width: of the policy's pictures; as in its training data by default.
+        quality: ``cheap`` or ``reference`` pictures, see ``fluxvla_sim.render``.
+        device, mixed_precision_dtype: of the policy.
+        episode_timeout_s: an episode that takes longer is tried again in a new process.
+
+    Raises:
+        ConfigError: a value is impossible.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(
+        self,
+        cfg: Mapping[str, Any] | None = None,
+        context: RunContext | None = None,
+        ckpt_path: str | None = None,
+        policy: str = "checkpoint",
+        episodes: int = 50,
+        seed: int = 500,
+        tasks: Sequence[str] = ("lift_hold", "transfer_cube"),
+        replan_every: int = 5,
+        max_steps: int = 300,
+        instruction_swap: bool = False,
+        baseline: bool = False,
+        workers: int = 2,
+        record_videos: int = 4,
+        video_camera: str = "top",
+        video_height: int = 240,
+        video_width: int = 320,
+        video_fps: float = 25.0,
+        dataset: Any = None,
+        denormalize_action: Any = None,
+        height: int | None = None,
+        width: int | None = None,
+        quality: str = "cheap",
+        device: str = "cpu",
+        mixed_precision_dtype: str = "float32",
+        episode_timeout_s: float = 600.0,
+    ) -> None:
+        self.context = context or RunContext(config=cfg or {})
+        self.ckpt_path = ckpt_path
+        self.policy = policy
+        self.episodes = episodes
+        self.seed = seed
+        self.tasks = tuple(tasks)
+        self.instruction_swap = instruction_swap
+        self.baseline = baseline
+        self.workers = self.context.nproc if self.context.nproc > 1 else workers
+        self.record_videos = record_videos
+        self.episode_timeout_s = episode_timeout_s
+        self.folder = Path(self.context.work_dir) / FOLDER
+        self._settings = Settings(
+            policy=policy,
+            ckpt_path=None,
+            replan_every=replan_every,
+            max_steps=max_steps,
+            quality=quality,
+            device=device,
+            mixed_precision_dtype=mixed_precision_dtype,
+            dataset=dataset,
+            denormalize_action=denormalize_action,
+            height=height,
+            width=width,
+            video_camera=video_camera,
+            video_size=(video_height, video_width),
+            video_fps=video_fps,
+        )
+        self._checkpoint: dict[str, Any] | None = None
+        self._check()
+
+    def run_setup(self) -> None:
+        """Find the checkpoint.
+
+        Raises:
+            CheckpointError: there is none, or the one that is named is damaged.
+        """
+        from fluxvla_sim.aloha.policies import NEEDS_CHECKPOINT
+
+        if self.policy not in NEEDS_CHECKPOINT and not self.baseline:
+            return
+        from fluxvla_core.infer.local_policy import find_checkpoint
+        from fluxvla_core.train.checkpoint import Checkpoint
+        from fluxvla_core.train.manifest import NAME, hash_file
+
+        path = find_checkpoint(self.ckpt_path, Path(self.context.work_dir))
+        checkpoint = Checkpoint.open(path)
+        checkpoint.verify()
+        self._checkpoint = {
+            "path": str(path),
+            "step": checkpoint.step,
+            "sha256": hash_file(path / NAME),
+        }
+        self.context.reporter.info(f"evaluating {path}")
+
+    def run(self) -> dict[str, Any]:
+        """Run the episodes, write ``results.json``, and return what is in it.
+
+        Raises:
+            SpecMismatch: the policy is for another robot.
+            RunFailed: no episode gave a result, or results cannot be written.
+        """
+        reporter, settings = self.context.reporter, self._worker_settings()
+        keys = self._keys()
+        ledger = open_ledger(self.folder / "episodes.jsonl", self._what(), reporter)
+        began = time.monotonic()
+        new = sum(key not in ledger for key in keys)
+        records = run_episodes(
+            partial(AlohaEvalWorker, settings),
+            keys,
+            ledger,
+            self.workers,
+            reporter,
+            self.episode_timeout_s,
+        )
+        seconds = time.monotonic() - began
+        if not any(record["status"] == DONE for record in records):
+            raise RunFailed(
+                f"none of the {len(records)} episodes gave a result; the last one:\n"
+                f"{records[-1]['error']}",
+                where=str(ledger.path),
+            )
+        results = {
+            "format": FORMAT,
+            "policy": self.policy,
+            "checkpoint": self._checkpoint,
+            "settings": self._what()["settings"],
+            "groups": summarise(records),
+            "behaviours": count_behaviours(records),
+            "videos": self._videos(settings, records),
+            "timing": _timing(records, new, seconds, self.workers),
+        }
+        self._write(results)
+        self._tell(results)
+        return results
+
+    def _check(self) -> None:
+        from fluxvla_sim.aloha.policies import POLICIES
+        from fluxvla_sim.aloha.tasks import MAX_STEPS, get_task
+        from fluxvla_sim.operators import ALOHA_CAMERAS
+        from fluxvla_sim.render import QUALITIES
+
+        settings = self._settings
+        if self.policy not in POLICIES:
+            raise self._wrong("policy", f"{self.policy!r} is none of {', '.join(POLICIES)}")
+        for task in self.tasks:
+            get_task(task)
+        if not self.tasks or len(set(self.tasks)) != len(self.tasks):
+            raise self._wrong("tasks", f"must name each task once, got {list(self.tasks)}")
+        if settings.quality not in QUALITIES:
+            raise self._wrong("quality", f"{settings.quality!r} is none of {', '.join(QUALITIES)}")
+        if settings.video_camera not in ALOHA_CAMERAS:
+            known = ", ".join(ALOHA_CAMERAS)
+            raise self._wrong("video_camera", f"{settings.video_camera!r} is none of {known}")
+        for name, value in (
+            ("episodes", self.episodes),
+            ("workers", self.workers),
+            ("replan_every", settings.replan_every),
+        ):
+            if value < 1:
+                raise self._wrong(name, f"must be at least 1, got {value}")
+        if settings.max_steps < MAX_STEPS:
+            raise self._wrong(
+                "max_steps",
+                f"must be at least {MAX_STEPS}, when lift_hold is judged; got {settings.max_steps}",
+            )
+
+    def _wrong(self, name: str, what: str) -> ConfigError:
+        return ConfigError(
+            f"{name} {what}", where=self.context.where(f"{self.context.section}.{name}")
+        )
+
+    def _worker_settings(self) -> Settings:
+        from dataclasses import replace
+
+        path = None if self._checkpoint is None else self._checkpoint["path"]
+        return replace(self._settings, ckpt_path=path)
+
+    def _keys(self) -> list[EpisodeKey]:
+        def keys(group: str, first: int) -> list[EpisodeKey]:
+            seeds = range(first, first + self.episodes)
+            # Tasks take turns, so that an evaluation that is watched tells of both from the start.
+            return [EpisodeKey(group, task, seed) for seed in seeds for task in self.tasks]
+
+        found = keys(POLICY, self.seed)
+        if self.instruction_swap:
+            # The scenes of both tasks are alike, so the same seeds would repeat what is known.
+            found += keys(SWAPPED, self.seed + self.episodes)
+        if self.baseline:
+            found += keys(UNTRAINED, self.seed)
+        return found
+
+    def _what(self) -> dict[str, Any]:
+        """What outcomes follow from, beside each episode's key."""
+        settings = self._settings
+        return {
+            "policy": self.policy,
+            "checkpoint": None if self._checkpoint is None else self._checkpoint["sha256"],
+            "settings": {
+                "replan_every": settings.replan_every,
+                "max_steps": settings.max_steps,
+                "quality": settings.quality,
+                "device": settings.device,
+                "mixed_precision_dtype": settings.mixed_precision_dtype,
+                "height": settings.height,
+                "width": settings.width,
+                "dataset": _plain(settings.dataset),
+                "denormalize_action": _plain(settings.denormalize_action),
+            },
+        }
+
+    def _videos(
+        self, settings: Settings, records: Sequence[Mapping[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """Run the chosen episodes once more, watched: they go as they went before."""
+        chosen = choose_videos(records, self.record_videos)
+        folder = self.folder / "videos"
+        for old in folder.glob("*.mp4"):
+            old.unlink()
+        jobs, videos = [], []
+        for number, record in enumerate(chosen):
+            word = "success" if record["success"] else "failure"
+            path = folder / f"{number:02d}-{word}-{record['task']}-seed-{record['seed']}.mp4"
+            jobs.append(Job(EpisodeKey(record["group"], record["task"], record["seed"]), str(path)))
+            kept = {name: record[name] for name in ("group", "task", "seed", "success")}
+            videos.append({**kept, "path": f"videos/{path.name}"})
+        reporter, made = self.context.reporter, [False] * len(jobs)
+        factory = partial(AlohaEvalWorker, settings)
+        with closing(
+            run_jobs(factory, jobs, self.workers, timeout_s=self.episode_timeout_s)
+        ) as outcomes:
+            for done, outcome in enumerate(outcomes, 1):
+                reporter.progress("videos", done, len(jobs))
+                made[outcome.index] = outcome.error is None
+                if outcome.error is not None:
+                    reporter.warn(f"no video of {videos[outcome.index]}: {outcome.error}")
+                elif outcome.result["state_hash"] != chosen[outcome.index]["state_hash"]:
+                    reporter.warn(
+                        f"{videos[outcome.index]['path']}: the episode went another way than when "
+                        "it was counted; its outcome does not follow from its seed alone"
+                    )
+        return [video for video, there in zip(videos, made, strict=True) if there]
+
+    def _write(self, results: Mapping[str, Any]) -> None:
+        path = self.folder / "results.json"
+        part = path.with_suffix(".json.part")
+        try:
+            part.write_text(json.dumps(results, indent=1) + "\n")
+            os.replace(part, path)
+        except OSError as error:
+            full = error.errno == errno.ENOSPC
+            raise RunFailed(
+                f"results cannot be written: {error}",
+                where=str(path),
+                next="make room and run the same command again" if full else None,
+            ) from error
+        self.context.reporter.artifact("evaluation", path)
+
+    def _tell(self, results: Mapping[str, Any]) -> None:
+        reporter = self.context.reporter
+        for group, found in results["groups"].items():
+            for task, counted in found["tasks"].items():
+                reporter.info(describe(f"{group} {task}", counted))
+        timing = results["timing"]
+        if timing["episodes"]:
+            reporter.info(
+                f"{timing['steps']} steps in {timing['seconds']:.0f} s: "
+                f"{timing['steps_per_s']:.0f} steps/s in {timing['workers']} processes"
+            )
+        for video in results["videos"]:
+            reporter.artifact("video", self.folder / video["path"])
+
+
+def choose_videos(records: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, Any]]:
+    """Up to ``count`` of the policy's episodes: half failures, half successes, tasks in turn.
+
+    Where there are not enough of one kind the other fills up. Failures come first.
+    """
+    mine = [r for r in records if r["group"] == POLICY and r["status"] == DONE]
+    failures = _in_turn([r for r in mine if not r["success"]])
+    successes = _in_turn([r for r in mine if r["success"]])
+    shown = min(len(failures), max((count + 1) // 2, count - len(successes)))
+    return failures[:shown] + successes[: count - shown]
+
+
+def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    seen: dict[str, int] = {}
+    ranked = []
+    for record in records:
+        rank = seen.get(record["task"], 0)
+        seen[record["task"]] = rank + 1
+        ranked.append((rank, record))
+    return [record for _, record in sorted(ranked, key=lambda pair: pair[0])]
+
+
+def count_behaviours(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Which task was done after which instruction.
+
+    Returns:
+        ``{group: {instruction: {"episodes": n, "neither": n, task: n, …}}}``; the counts of a
+        wrong instruction tell whether the policy listens.
+    """
+    table: dict[str, Any] = {}
+    for record in records:
+        if record["status"] != DONE:
+            continue
+        said = table.setdefault(record["group"], {})
+        empty = {"episodes": 0, "neither": 0, **dict.fromkeys(record["behaviours"], 0)}
+        row = said.setdefault(record["instruction"], empty)
+        row["episodes"] += 1
+        row["neither"] += not any(record["behaviours"].values())
+        for task, did in record["behaviours"].items():
+            row[task] += bool(did)
+    return table
+
+
+def _timing(
+    records: Sequence[Mapping[str, Any]], new: int, seconds: float, workers: int
+) -> dict[str, Any]:
+    """How fast the new episodes were; nothing where all were there already."""
+    done = [r for r in records if r["status"] == DONE]
+    calls = sum(r["calls"] for r in done)
+    policy = sum(r["timing"]["policy_seconds"] for r in done)
+    if new < len(records):  # a mixture of two runs has no one speed
+        return {"episodes": 0, "workers": workers, "policy_ms": 1e3 * policy / max(calls, 1)}
+    steps = sum(r["steps"] for r in done)
+    return {
+        "episodes": new,
+        "steps": steps,
+        "seconds": seconds,
+        "steps_per_s": steps / max(seconds, 1e-9),
+        "workers": workers,
+        "policy_ms": 1e3 * policy / max(calls, 1),
+    }
+
+
+def _plain(table: Any) -> Any:
+    return json.loads(json.dumps(table, default=str))

@@ -14,7 +14,7 @@ import signal
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -61,6 +61,7 @@ class TinyVLA(nn.Module):
         self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(2))
         self.head = nn.Linear(width, HORIZON * ACTIONS)
         self.bad_sample = bad_sample
+        self.batches: Tensor
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
 
     def forward(
@@ -96,7 +97,9 @@ class TinyDataset:
     """``length`` samples whose noise follows from (seed, epoch, index)."""
 
     fps = 10.0
-    statistics = {"private": {"action": {"mean": [0.0] * ACTIONS, "std": [1.0] * ACTIONS}}}
+    statistics: ClassVar[dict[str, Any]] = {
+        "private": {"action": {"mean": [0.0] * ACTIONS, "std": [1.0] * ACTIONS}}
+    }
     embodiment = EmbodimentSpec(
         "tiny", tuple(Joint(f"j{i}", "rad", -1.0, 1.0, 1.0, 1.0) for i in range(ACTIONS)), (), 10.0
     )

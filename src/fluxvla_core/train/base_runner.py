@@ -245,6 +245,9 @@ class BaseTrainRunner:
         """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
         return nullcontext()
 
+    def _warm_up(self, batch: dict[str, Any]) -> None:
+        """Called with the first batch, before the first step; must leave no trace."""
+
     def clip_grad_norm(self) -> Tensor | None:
         """Scale the gradients down to ``max_grad_norm``; their norm before, on the device."""
         import torch

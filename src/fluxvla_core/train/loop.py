@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Any
 
 import torch
@@ -73,6 +74,10 @@ class StepLoop:
             The signal that asked for a stop, 0 if none did.
         """
         run, stopped = self._run, 0
+        if not finished():
+            first = next(self._batches)
+            run._warm_up(to_device(first, run.world.device))
+            self._batches = chain([first], self._batches)
         self._window.restart_clock()
         while not stopped and not finished():
             step = run.progress.step + 1

@@ -27,7 +27,9 @@ class SentenceEncoder(nn.Module):
     def __init__(self, model_path: str = MINILM) -> None:
         super().__init__()
         from transformers import AutoModel
+        from transformers.utils import logging
 
+        logging.disable_progress_bar()  # a local file of 90 MB is there in a blink
         self.encoder = AutoModel.from_pretrained(
             str(resolve_model_path(model_path)), local_files_only=True
         )

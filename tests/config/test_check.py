@@ -172,6 +172,16 @@ def test_a_train_section_needs_a_dataset(write: Write) -> None:
     assert "c.py:2: train_dataloader: needs dataset = dict(type=...)" in text
 
 
+def test_a_typo_beside_the_dataset(write: Write) -> None:
+    text = findings(GOOD.replace("per_device_batch_size", "per_device_batchsize"), write)
+    assert text.endswith(
+        "c.py:3: train_dataloader.per_device_batchsize: unknown key; "
+        "did you mean 'per_device_batch_size'?"
+    )
+    theirs = GOOD.replace("per_device_batch_size=8", "shards=8")
+    assert examine(load_config(write("c.py", theirs))).problems == ()
+
+
 def test_none_switches_parts_off(write: Write) -> None:
     text = GOOD + "eval = None\nval_dataloader = None\n"
     checked = check_config(load_config(write("c.py", text)))

@@ -22,6 +22,9 @@ INJECTED = ("cfg", "context")
 """Constructor parameters that are filled in when the run starts; a config may not set them."""
 
 LOADERS = ("train_dataloader", "val_dataloader")
+LOADER_KEYS = ("per_device_batch_size", "per_device_num_workers", "dataset")
+"""What the core's own train runners read of ``train_dataloader``."""
+
 _NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, "requires", "hooks")
 # Keys under which a table without ``type`` can only be a slip.
 _NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filters"}
@@ -104,10 +107,18 @@ def _loader_problems(config: Config, section: str) -> list[Problem]:
     if loader is None:
         what = f"{section!r} trains, and there is no train_dataloader = dict(dataset=dict(...))"
         return [config.problem(section, what)]
-    if isinstance(loader, dict) and not isinstance(loader.get("dataset"), dict):
-        what = "needs dataset = dict(type=...)"
-        return [config.problem("train_dataloader", what)]
-    return []
+    if not isinstance(loader, dict):
+        return []
+    found = []
+    if not isinstance(loader.get("dataset"), dict):
+        found.append(config.problem("train_dataloader", "needs dataset = dict(type=...)"))
+    for name in loader:
+        # Another runner may read keys of its own; one that nearly is one of ours is a typo.
+        near = difflib.get_close_matches(name, LOADER_KEYS, 1, 0.75)
+        if near and name not in LOADER_KEYS:
+            key = keys.child("train_dataloader", name)
+            found.append(config.problem(key, f"unknown key; did you mean {near[0]!r}?"))
+    return found
 
 
 class _Walk:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.config.check import LOADER_KEYS
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.train.schedule import make_schedule
 
@@ -128,7 +129,7 @@ class LoaderOptions:
                 where=context.config_file,
                 next=f"{section} = dict(per_device_batch_size=…, dataset=dict(type=…))",
             )
-        known = ("per_device_batch_size", "per_device_num_workers", "dataset")
+        known = LOADER_KEYS
         found: list[tuple[str, str]] = []
         for key in table:
             if key not in known:

@@ -202,7 +202,7 @@ class steps:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, shell.StepFailed):
-            self.session.error(f"{error}\n{error.output}")
+            self.session.error(str(error))
         if kind is None:
             self.session.log("took: " + ", ".join(self.took))
             if self.failed:

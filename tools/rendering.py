@@ -61,7 +61,7 @@ def ensure(env: Env, log: Callable[[str], None]) -> None:
         for command in apt_commands(rights):
             shell.run(command, env={"DEBIAN_FRONTEND": "noninteractive"}, quiet=True)
     except StepFailed as error:
-        raise CannotRender(f"{advice(reason, have_apt=True)}\n{error.output[-2000:]}") from error
+        raise CannotRender(f"{advice(reason, have_apt=True)}\n{error}") from error
     reason = probe(env)
     if reason is not None:
         raise CannotRender(

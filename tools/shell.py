@@ -24,7 +24,8 @@ class StepFailed(Exception):
         self.command = tuple(command)
         self.status = status
         self.output = output
-        super().__init__(f"exit status {status} from: {shlex.join(self.command)}")
+        told = f"\n{output.rstrip()}" if output else ""
+        super().__init__(f"exit status {status} from: {shlex.join(self.command)}{told}")
 
 
 def child_environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -44,6 +44,7 @@ class AcmeOperator:
         self.embodiment = EmbodimentSpec(
             name="acme",
             joints=(Joint("elbow", "rad", -2.0, 2.0, velocity=1.0, acceleration=10.0),),
+            cameras=(),
             rate_hz=10.0,
         )
         self.position = start

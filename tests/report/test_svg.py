@@ -65,8 +65,8 @@ def test_intervals() -> None:
 def test_durations_share_the_bar() -> None:
     svg = duration_bar([("train", 90.0), ("evaluate", 30.0)], title="Time")
     widths = [float(e.get("width") or 0) for e in ET.fromstring(svg).iter("rect")]
-    assert widths[0] == 539.0
-    assert widths[2] == 179.0
+    assert widths[0] == 644.0
+    assert widths[2] == 214.0
     assert texts(svg) == ["train · 1 min 30 s", "evaluate · 30 s"]
     assert "0.0 s" in texts(duration_bar([("none", 0.0)], title="Time"))[0]
 

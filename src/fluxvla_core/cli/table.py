@@ -32,5 +32,6 @@ COMMANDS: Mapping[str, Entry] = {
     "plugins doctor": Entry(
         "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"
     ),
+    "report": Entry("fluxvla_core.report.command:Report", "write the HTML report of a work dir"),
     "version": Entry("fluxvla_core.cli.version:Version", "print the versions"),
 }

@@ -33,35 +33,42 @@ class Video:
 
 @dataclass(frozen=True)
 class Score:
-    """How many episodes of one task succeeded; ``low``, ``high``: 95 % Wilson bounds, 0..1."""
+    """How many episodes succeeded; ``low``, ``high``: bounds of the 95 % interval, in 0..1.
+
+    ``errors`` episodes gave no result and are not among ``episodes`` (> 0).
+    """
 
     task: str
     successes: int
     episodes: int
     low: float
     high: float
+    errors: int = 0
 
     @property
     def rate(self) -> float:
-        return self.successes / self.episodes if self.episodes else 0.0
+        return self.successes / self.episodes
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """One evaluation run: all its episodes, and each of its tasks.
-
-    Args:
-        name: the folder it came from; ``label`` is what people call it.
-        total: over all tasks.
-        tasks: task by task.
-        videos: failures first.
-        details: what else the results state, for the table under the chart.
-    """
+class Group:
+    """Who acted and what it was told: ``name`` as results have it, ``label`` for people."""
 
     name: str
     label: str
     total: Score
     tasks: Sequence[Score]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation: its groups, and videos in the order in which to show them.
+
+    ``details`` are plain values that the results state beside the rates.
+    """
+
+    name: str
+    groups: Sequence[Group]
     videos: Sequence[Video] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 

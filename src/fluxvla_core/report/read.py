@@ -129,7 +129,7 @@ def joint_traces(
     for column, name in enumerate(names):
         clamped = [
             (time, number(event["command"][column]))
-            for time, event in zip(times, commands)
+            for time, event in zip(times, commands, strict=True)
             if any(clamp.get("joint") == name for clamp in event.get("clamps") or ())
         ]
         traces.append(

@@ -65,9 +65,9 @@ def line_chart(
     return _svg(width, height, title, "".join(body))
 
 
-def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 720) -> str:
+def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 860) -> str:
     """A dot with its interval for each row, on a common scale from 0 to 100 %."""
-    left, right, step, top = 250, 70, 34, 8
+    left, right, step, top = 240, 76, 30, 6
     height = top + step * len(rows) + 30
     span = width - left - right
     parts = []
@@ -91,7 +91,7 @@ def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 720) ->
     return _svg(width, height, title, "".join(parts))
 
 
-def duration_bar(parts: Sequence[tuple[str, float]], *, title: str, width: int = 720) -> str:
+def duration_bar(parts: Sequence[tuple[str, float]], *, title: str, width: int = 860) -> str:
     """One bar that is divided among named durations (s), and a legend with the figures."""
     total = sum(seconds for _, seconds in parts) or 1.0
     columns = 3

@@ -1,0 +1,277 @@
+"""One HTML file that shows a run: what was trained, how well it does, what it did."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.report.facts import Evaluation, Facts, JointTrace, Training, Video
+from fluxvla_core.report.files import text_rows
+from fluxvla_core.report.read import read_facts
+from fluxvla_core.report.scale import duration, short
+from fluxvla_core.report.svg import Interval, Series, duration_bar, interval_chart, line_chart
+
+# Videos are put into the page up to this many bytes in all; the rest is linked to.
+EMBEDDED_BYTES = 32_000_000
+MOST_VIDEOS = 12
+CURVES = (
+    ("loss", "Loss", True),
+    ("lr", "Learning rate", False),
+    ("grad_norm", "Gradient norm", True),
+    ("samples_per_s", "Samples per second", False),
+)
+SMOOTHED = ("loss", "grad_norm", "samples_per_s")
+
+
+def build_report(work_dir: Path | str, out: Path | str | None = None, title: str = "") -> Path:
+    """Write the report of a work dir; what is missing there is said in it.
+
+    Args:
+        work_dir: of ``fluxvla run``.
+        out: the HTML file; ``<work_dir>/report.html`` by default.
+        title: the heading; by default the name of the config.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        UsageError: there is no such folder.
+        RunFailed: ``jinja2`` is missing, or nothing can be written.
+    """
+    folder = Path(work_dir)
+    target = Path(out) if out is not None else folder / "report.html"
+    if not folder.is_dir():
+        raise UsageError("there is no such work dir to report on", where=str(folder))
+    html = render(read_facts(folder), target.parent, title)
+    part = target.with_name(target.name + ".part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(html, encoding="utf-8")
+        os.replace(part, target)
+    except OSError as error:
+        raise RunFailed(f"the report cannot be written: {error}", where=str(target)) from error
+    return target
+
+
+def render(facts: Facts, beside: Path, title: str = "") -> str:
+    """The page as text; videos that are not embedded are linked relative to ``beside``."""
+    try:
+        import jinja2
+    except ImportError as error:
+        raise RunFailed(
+            "a report needs the package 'jinja2', which is not installed",
+            next="pip install 'fluxvla-core[report]'",
+        ) from error
+    templates = resources.files("fluxvla_core.report") / "templates"
+    texts = {
+        name: (templates / name).read_text(encoding="utf-8")
+        for name in ("report.html.jinja", "style.css")
+    }
+    # Charts are markup made here, from escaped text; everything else is escaped by the template.
+    environment = jinja2.Environment(
+        loader=jinja2.DictLoader(texts),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["duration"] = duration
+    environment.filters["short"] = short
+    shelf = Shelf(beside)
+    return environment.get_template("report.html.jinja").render(
+        style=texts["style.css"],
+        title=title or heading(facts),
+        facts=facts,
+        tiles=tiles(facts),
+        curves=[] if facts.training is None else curves(facts.training),
+        evaluations=[_evaluation(e, shelf) for e in facts.evaluations],
+        episodes=[
+            {
+                "facts": e,
+                "joints": [joint_chart(joint) for joint in e.joints],
+                "rows": text_rows(e.notes.items()),
+                "videos": [shelf.put(v) for v in e.videos],
+            }
+            for e in facts.episodes[-4:]
+        ],
+        stages=duration_bar([(s.name, s.seconds) for s in facts.stages], title="Where time went"),
+        environment_rows=environment_rows(facts.environment),
+        config_text=json.dumps(facts.config.get("config", {}), indent=2),
+    )
+
+
+@dataclass
+class Shelf:
+    """Hands out videos as the page shows them, embedded while there is room."""
+
+    beside: Path
+    room: int = EMBEDDED_BYTES
+    _known: dict[Path, str] = field(default_factory=dict)
+
+    def put(self, video: Video) -> dict[str, Any]:
+        """``src``, ``caption`` and ``success`` of a video."""
+        return {"src": self._source(video.path), "caption": video.caption, "success": video.success}
+
+    def _source(self, path: Path) -> str:
+        if path not in self._known:
+            size = path.stat().st_size
+            if size <= self.room:
+                self.room -= size
+                coded = base64.b64encode(path.read_bytes()).decode("ascii")
+                self._known[path] = f"data:video/mp4;base64,{coded}"
+            else:
+                self._known[path] = Path(os.path.relpath(path, self.beside)).as_posix()
+        return self._known[path]
+
+
+def heading(facts: Facts) -> str:
+    """The name of the config that ran, else of the folder."""
+    places = facts.config.get("origins") or {}
+    files = [str(place).rpartition(":")[0] for place in places.values()]
+    name = Path(files[0]).stem if files and files[0] else facts.work_dir.resolve().name
+    return name.replace("_", " ")
+
+
+def tiles(facts: Facts) -> list[dict[str, str]]:
+    """The figures at the top: name, figure, detail."""
+    found = []
+    for group in (g for e in facts.evaluations for g in e.groups):
+        score = group.total
+        found.append(
+            {
+                "name": f"{group.label} succeeds",
+                "figure": f"{score.rate:.0%}",
+                "detail": f"{score.successes} of {score.episodes} episodes, interval "
+                f"{score.low:.0%} to {score.high:.0%}",
+            }
+        )
+    if facts.training is not None:
+        found.append(_training_tile(facts.training))
+    if facts.dataset:
+        data = facts.dataset
+        found.append(
+            {
+                "name": "demonstrations",
+                "figure": str(data.get("total_episodes", "?")),
+                "detail": f"{data.get('total_frames', '?')} frames, "
+                f"{data.get('total_tasks', '?')} instructions, "
+                f"LeRobot {data.get('codebase_version', '?')}",
+            }
+        )
+    if facts.stages:
+        total = sum(stage.seconds for stage in facts.stages)
+        found.append(
+            {
+                "name": "from nothing to this page",
+                "figure": duration(total) if total < 60 else f"{total / 60:.0f} min",
+                "detail": f"in {len(facts.stages)} stages",
+            }
+        )
+    return found
+
+
+def _training_tile(training: Training) -> dict[str, str]:
+    losses = [v for v in training.columns.get("loss", ()) if math.isfinite(v)]
+    last = losses[-max(1, len(losses) // 20) :]
+    seconds = sum(v for v in training.columns.get("step_time", ()) if math.isfinite(v))
+    detail = f"loss {short(sum(last) / len(last))}" if last else "no loss logged"
+    if seconds:
+        detail += f" after {duration(seconds)}"
+    return {"name": "training steps", "figure": f"{training.steps[-1]:,.0f}", "detail": detail}
+
+
+def curves(training: Training) -> list[dict[str, str]]:
+    """A chart for each column that was logged, noisy ones with their running mean."""
+    charts = []
+    for name, label, log in CURVES:
+        values = training.columns.get(name, ())
+        if not any(math.isfinite(v) for v in values):
+            continue
+        if name in SMOOTHED and len(values) > 20:
+            lines = [
+                Series("each step", training.steps, values, kind="faint"),
+                Series("running mean", training.steps, running_mean(values)),
+            ]
+        else:
+            lines = [Series(label, training.steps, values)]
+        chart = line_chart(lines, x_label="step", title=f"{label} over the steps", log=log)
+        charts.append({"name": label, "svg": chart, "mean": str(len(lines) > 1)})
+    return charts
+
+
+def running_mean(values: Sequence[float], share: float = 0.03) -> list[float]:
+    """Exponential running mean over about ``share`` of all values; skips what is not finite."""
+    weight = 2.0 / (1.0 + max(1.0, share * len(values)))
+    means: list[float] = []
+    mean = math.nan
+    for value in values:
+        if math.isfinite(value):
+            mean = value if math.isnan(mean) else mean + weight * (value - mean)
+        means.append(mean)
+    return means
+
+
+def joint_chart(joint: JointTrace) -> dict[str, Any]:
+    """One joint's commands, states and clamps, with its name and unit."""
+    times, values = [t for t, _ in joint.clamped], [v for _, v in joint.clamped]
+    series = [
+        Series("state", joint.times, joint.states, css="s1"),
+        Series("command", joint.times, joint.commands, css="s0"),
+        Series("clamped", times, values, css="bad", kind="dots"),
+    ]
+    title = f"{joint.name}: command and state"
+    chart = line_chart(series, x_label="s", title=title, width=340, height=150)
+    return {"name": joint.name, "unit": joint.unit, "svg": chart, "clamps": len(times)}
+
+
+def _evaluation(evaluation: Evaluation, shelf: Shelf) -> dict[str, Any]:
+    rows = []
+    for number, group in enumerate(evaluation.groups):
+        scores = group.tasks if len(group.tasks) > 1 else [group.total]
+        for score in scores:
+            task = f" · {score.task}" if len(group.tasks) > 1 else ""
+            rows.append(
+                Interval(
+                    name=f"{group.label}{task}",
+                    note=f"{score.successes} of {score.episodes}",
+                    low=score.low,
+                    value=score.rate,
+                    high=score.high,
+                    css=f"s{number % 6}",
+                )
+            )
+    return {
+        "facts": evaluation,
+        "chart": interval_chart(rows, title="Success rates with 95 % intervals"),
+        "rows": text_rows(evaluation.details.items()),
+        "videos": [shelf.put(v) for v in evaluation.videos[:MOST_VIDEOS]],
+        "more": max(0, len(evaluation.videos) - MOST_VIDEOS),
+    }
+
+
+def environment_rows(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of what the environment file states; plugins as distributions."""
+    rows: list[tuple[str, Any]] = []
+    for name, value in environment.items():
+        if name == "format":
+            continue
+        if isinstance(value, Mapping):
+            rows.append((name, ", ".join(f"{key} {text}" for key, text in value.items())))
+        elif name == "plugins" and isinstance(value, list):
+            known = (row for row in value if isinstance(row, Mapping))
+            rows.append((name, ", ".join(sorted({_distribution(row) for row in known}))))
+        else:
+            rows.append((name, value))
+    return text_rows(rows)
+
+
+def _distribution(row: Mapping[str, Any]) -> str:
+    return f"{row.get('distribution')} {row.get('version')}"

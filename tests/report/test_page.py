@@ -1,0 +1,175 @@
+"""The page shows what there is, says what is not, and stands alone."""
+
+from __future__ import annotations
+
+import builtins
+import html.parser
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.report import build_report
+from fluxvla_core.report.command import Report
+from fluxvla_core.report.facts import Video
+from fluxvla_core.report.page import Shelf, running_mean
+
+
+class Page(html.parser.HTMLParser):
+    """Text, sources and unclosed tags of a page."""
+
+    VOID = frozenset({"meta", "link", "br", "img", "input"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [v or "" for k, v in attrs if k in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += [" ".join(data.split())] if data.strip() else []
+
+    def shows(self, words: str) -> bool:
+        return words in " ".join(self.text)
+
+
+def page_of(work_dir: Path, tmp_path: Path) -> Page:
+    page = Page(build_report(work_dir, tmp_path / "out" / "r.html").read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
+    page = page_of(complete, tmp_path)
+    for words in (
+        "two arms",
+        "trained policy succeeds 85% 34 of 40 episodes, interval 71% to 93%",
+        "untrained policy succeeds 0%",
+        "told the other task",
+        "300",
+        "11280 frames, 2 instructions, LeRobot v3.0",
+        "On the robot: lift the cube & hold it",
+        "left_waist (rad) · 3 clamped",
+        "from nothing to this page 15 min",
+        "train · 10 min 01 s",
+        "2.13.0+cpu",
+        "fluxvla-aloha 0.1.0",
+        '"note": "<b>"',
+    ):
+        assert page.shows(words), words
+    assert not page.shows("missing")
+    assert not page.shows("Not evaluated yet")
+    assert "fluxvla-aloha 0.1.0, fluxvla-aloha" not in " ".join(page.text)
+
+
+def test_it_stands_alone(complete: Path, tmp_path: Path) -> None:
+    text = build_report(complete, tmp_path / "r.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert len(page.sources) == 5
+    assert all(source.startswith("data:video/mp4;base64,") for source in page.sources)
+    assert not re.search(r"https?://", text)
+
+
+def test_an_empty_work_dir_says_what_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    page = page_of(tmp_path / "work", tmp_path)
+    for words in (
+        "Not evaluated yet. To do it: fluxvla run --config … --section eval",
+        "No metrics.jsonl in the work dir",
+        "No episode was run yet. To do it: fluxvla run --config … --section inference",
+        "No environment.json in the work dir",
+        "No config.resolved.json in the work dir",
+    ):
+        assert page.shows(words), words
+
+
+def test_damaged_files_are_listed(tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "environment.json").write_text("{")
+    assert page_of(tmp_path / "work", tmp_path).shows("environment.json: cannot be read")
+
+
+def test_what_a_run_names_cannot_become_markup(tmp_path: Path) -> None:
+    folder = tmp_path / "work" / "inference" / "001-x"
+    folder.mkdir(parents=True)
+    evil = "<script>alert(1)</script>"
+    summary = {"instruction": evil, "outcome": evil, "problem": evil, "joints": [evil]}
+    (folder / "episode.json").write_text(json.dumps(summary))
+    event = {"event": "command", "t": 0, "command": [1.0], "state": [1.0], "clamps": []}
+    (folder / "trace.jsonl").write_text(json.dumps(event) + "\n")
+    text = build_report(tmp_path / "work").read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+
+
+def test_videos_beyond_the_limit_are_linked(tmp_path: Path) -> None:
+    for name, size in (("a", 60), ("b", 50), ("c", 30)):
+        (tmp_path / f"{name}.mp4").write_bytes(b"x" * size)
+    shelf = Shelf(tmp_path / "sub", room=100)
+    sources = [shelf.put(Video(tmp_path / f"{n}.mp4", "", None))["src"] for n in "abca"]
+    assert sources[0].startswith("data:")
+    assert sources[1] == "../b.mp4"
+    assert sources[2].startswith("data:")
+    assert sources[3] == sources[0]
+    assert shelf.room == 10
+
+
+def test_the_title_can_be_given(tmp_path: Path) -> None:
+    (tmp_path / "my_work").mkdir()
+    assert "<h1>my work</h1>" in build_report(tmp_path / "my_work").read_text()
+    assert "<h1>A &amp; B</h1>" in build_report(tmp_path / "my_work", title="A & B").read_text()
+
+
+def test_there_is_no_such_folder(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="there is no such work dir to report on"):
+        build_report(tmp_path / "nowhere")
+
+
+def test_it_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFailed, match="the report cannot be written"):
+        build_report(tmp_path, tmp_path / "file" / "r.html")
+
+
+def test_jinja2_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = builtins.__import__
+
+    def refuse(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "jinja2":
+            raise ImportError(name)
+        return original(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(RunFailed, match=r"needs the package 'jinja2'") as told:
+        build_report(tmp_path)
+    assert "pip install 'fluxvla-core[report]'" in str(told.value)
+
+
+def test_the_running_mean_skips_gaps() -> None:
+    assert running_mean([math.nan, 2.0, math.nan, 4.0], share=0.0)[1:] == [2.0, 2.0, 4.0]
+    assert math.isnan(running_mean([math.nan])[0])
+
+
+def test_the_command(complete: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from fluxvla_core.cli.main import main
+
+    out = tmp_path / "page.html"
+    assert main(["report", str(complete), "--out", str(out), "--title", "T"]) == 0
+    assert capsys.readouterr().out.strip() == str(out)
+    assert "<h1>T</h1>" in out.read_text()
+    assert main(["report", str(tmp_path / "nowhere")]) == 2
+    assert "there is no such work dir" in capsys.readouterr().err
+    assert Report.api == "1.0"

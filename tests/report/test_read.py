@@ -1,0 +1,113 @@
+"""What is read of a work dir, whole, in part and damaged."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from fluxvla_core.report.files import Reader, number, text_rows
+from fluxvla_core.report.read import clamp_counts, joint_traces, read_facts
+from fluxvla_core.report.scores import read_evaluations
+
+
+def test_a_complete_work_dir(complete: Path) -> None:
+    facts = read_facts(complete)
+    assert facts.problems == ()
+    assert facts.training is not None
+    assert facts.training.steps[-1] == 300
+    assert set(facts.training.columns) >= {"loss", "lr", "grad_norm", "samples_per_s"}
+    (evaluation,) = facts.evaluations
+    assert [(g.name, g.total.successes, g.total.episodes) for g in evaluation.groups] == [
+        ("policy", 34, 40),
+        ("swapped", 2, 40),
+        ("untrained", 0, 40),
+    ]
+    assert evaluation.groups[0].tasks[0].rate == 0.85
+    assert evaluation.groups[0].total.low == pytest.approx(0.709, abs=1e-3)
+    assert evaluation.details == {"checkpoint": "step-000000300"}
+    assert [v.success for v in evaluation.videos] == [False, False, True, True]
+    (episode,) = facts.episodes
+    assert (episode.task, episode.success) == ("lift the cube & hold it", True)
+    assert len(episode.joints) == 6
+    joint = episode.joints[0]
+    assert (joint.name, joint.unit, len(joint.times)) == ("left_waist", "rad", 200)
+    assert [round(time, 2) for time, _ in joint.clamped] == [1.0, 1.02, 1.04]
+    assert episode.joints[1].clamped == []
+    assert episode.notes["clamped commands"] == "left_waist 3 (velocity)"
+    assert episode.timings["policy"]["p50_ms"] == 11.3
+    assert [stage.name for stage in facts.stages] == ["install", "collect", "train", "evaluate"]
+    assert facts.dataset["total_episodes"] == 240
+
+
+def test_an_empty_work_dir(tmp_path: Path) -> None:
+    facts = read_facts(tmp_path)
+    assert facts.training is None
+    assert facts.problems == ()
+    assert [*facts.evaluations, *facts.episodes, *facts.stages, *facts.dataset] == []
+
+
+def test_a_run_that_was_killed_leaves_half_a_line(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1, "loss": 2}\n{"step": 2, "lo')
+    facts = read_facts(tmp_path)
+    assert facts.training is not None
+    assert facts.training.steps == [1.0]
+    assert facts.problems == ()
+
+
+def test_damage_is_named_and_hurts_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1}\n{]\n7\n{"step": 3, "loss": 1}\n')
+    (tmp_path / "config.resolved.json").write_text("{")
+    (tmp_path / "environment.json").write_text("[]")
+    (tmp_path / "stages.json").write_bytes(b"\xff\xfe\x00")
+    facts = read_facts(tmp_path)
+    assert facts.training is not None
+    assert facts.training.steps == [1.0, 3.0]
+    assert math.isnan(facts.training.columns["loss"][0])
+    problems = "\n".join(facts.problems)
+    assert "metrics.jsonl: 2 line(s) are no JSON objects and were left out" in problems
+    assert "config.resolved.json: cannot be read: Expecting property name" in problems
+    assert "environment.json: holds a list, not an object" in problems
+    assert "stages.json: cannot be read: 'utf-8' codec" in problems
+
+
+def test_results_without_rates_or_with_missing_videos_show_what_there_is(tmp_path: Path) -> None:
+    folder = tmp_path / "eval"
+    folder.mkdir()
+    empty = {"episodes": 0, "successes": 0, "low": 0.0, "high": 1.0, "errors": 3}
+    groups = {"policy": {"all": empty, "tasks": {"a": empty}}, "strange": {"all": 7}}
+    (folder / "results.json").write_text(json.dumps({"groups": groups}))
+    assert read_evaluations(Reader(tmp_path), tmp_path) == []
+    groups["acme"] = {"all": {**empty, "episodes": 2, "successes": 1}, "tasks": {}}
+    (folder / "results.json").write_text(json.dumps({"groups": groups}))
+    record = {"group": "acme", "status": "done", "success": True, "video": "gone.mp4"}
+    (folder / "episodes.jsonl").write_text(json.dumps(record) + "\n")
+    (evaluation,) = read_evaluations(Reader(tmp_path), tmp_path)
+    assert [group.label for group in evaluation.groups] == ["acme"]
+    assert evaluation.groups[0].total.rate == 0.5
+    assert evaluation.videos == []
+
+
+def test_joints_of_a_trace_with_other_states() -> None:
+    events = [
+        {"event": "trip", "t": 0.0},
+        {"event": "command", "t": 5.0, "command": [1.0], "state": [1.0, 2.0], "clamps": None},
+        {"event": "command", "t": 5.5, "command": [1.0, 2.0], "state": [0.0]},
+    ]
+    (trace,) = joint_traces(["a"], events, {})
+    assert trace.times == [0.0]
+    assert math.isnan(trace.states[0])
+    assert joint_traces([], events, {}) == []
+    assert joint_traces(["a", "b", "c"], events, {}) == []
+
+
+def test_small_helpers() -> None:
+    assert math.isnan(number("7"))
+    assert number(7) == 7.0
+    assert clamp_counts(None) == "none"
+    assert clamp_counts({"a": {"velocity": 2, "position": 1}, "b": {}}) == (
+        "a 3 (velocity, position)"
+    )
+    assert text_rows([("a", None), ("b", ""), ("c", 0), ("d", [])]) == [("c", "0")]

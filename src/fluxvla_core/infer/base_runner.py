@@ -207,7 +207,8 @@ class BaseInferenceRunner:
             try:
                 hooks.call("run_started")
                 self.robot.connect()
-                asked = tasks(self.context.task, self.task_descriptions)
+                say = self.context.reporter.info
+                asked = tasks(self.context.task, self.task_descriptions, _ask, say)
                 for task in asked:
                     summary = self._run_episode(task)
                     self._episodes += 1
@@ -265,6 +266,7 @@ class BaseInferenceRunner:
             robot=self.robot,
             policy=self.policy,
             cameras=self._cameras,
+            seed=self.seed,
             rate_hz=self.publish_rate,
             settings=self.safety,
             latch=self.latch,
@@ -283,7 +285,7 @@ class BaseInferenceRunner:
             hooks=hooks,
             context=self.context,
         )
-        return Episode(plan, task, self.seed + self._episodes, folder).run()
+        return Episode(plan, task, self._episodes, folder).run()
 
     def _look(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
@@ -318,3 +320,10 @@ class BaseInferenceRunner:
     def _wrong(self, key: str, what: str) -> ConfigError:
         section = self.context.section
         return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))
+
+
+def _ask(question: str) -> str:
+    try:
+        return input(question)
+    except EOFError:
+        return ""

@@ -41,7 +41,7 @@ class Episode:
     Args:
         plan: what to run with.
         task: what to do.
-        seed: of everything random in the policy.
+        number: how many episodes the run had before.
         folder: where the record goes.
 
     Raises:
@@ -49,10 +49,11 @@ class Episode:
         BadFrame: the state does not tell where a commanded joint is.
     """
 
-    def __init__(self, plan: Plan, task: Task, seed: int, folder: Path) -> None:
+    def __init__(self, plan: Plan, task: Task, number: int, folder: Path) -> None:
         self._plan = plan
         self._task = task
-        self._seed = seed
+        self._number = number
+        self._seed = plan.seed + number
         self._folder = folder
         embodiment, settings = plan.robot.embodiment, plan.settings
         self._rate = Rate(plan.rate_hz, plan.robot.clock)
@@ -107,7 +108,7 @@ class Episode:
     def _begin(self) -> None:
         """Read where the arm is, and bring it to the start pose."""
         plan = self._plan
-        plan.robot.begin(self._task.instruction, self._seed)
+        plan.robot.begin(self._task.instruction, self._number)
         window, frame = self._first_reading()
         self._limiter.start(self._checked(window, frame)[self._columns])
         pose = self._limiter.last
@@ -240,8 +241,8 @@ class Episode:
             return
         record.steps += 1
         plan.context.reporter.progress("commands", record.steps, plan.most_steps)
-        if plan.robot.success():
-            raise EpisodeOver("success")
+        if plan.robot.done():
+            raise EpisodeOver("done")
         if record.steps >= plan.most_steps:
             raise EpisodeOver("max_steps")
 
@@ -280,7 +281,7 @@ class Episode:
         plan = self._plan
         success: bool | None
         try:
-            success = outcome == "success" or plan.robot.success()
+            success = plan.robot.success()
         except Exception as error:  # noqa: BLE001 - why the episode ended matters more
             plan.context.reporter.warn(f"task_success failed: {_what(error)}")
             success = None

@@ -41,6 +41,7 @@ class Plan:
     Args:
         robot, policy: connected, loaded, and fitting each other.
         cameras: names of those that the policy looks at.
+        seed: of the first episode's policy; each later one adds 1.
         rate_hz: commands a second.
         settings: thresholds of the safety rules.
         latch: of the run; an episode does not begin while it is tripped.
@@ -60,6 +61,7 @@ class Plan:
     robot: Robot
     policy: Policy
     cameras: tuple[str, ...]
+    seed: int
     rate_hz: float
     settings: SafetySettings
     latch: Latch

@@ -80,15 +80,21 @@ class Robot:
         return None if read is None else np.asarray(read(), dtype=np.float64)
 
     def success(self) -> bool | None:
-        """Whether the task is done, where the operator can tell (simulations can)."""
+        """Whether the task is done as of now, where the operator can tell (``task_success``)."""
         tell = getattr(self.operator, "task_success", None)
         return None if tell is None else bool(tell())
 
-    def begin(self, instruction: str, seed: int) -> None:
-        """Tell an operator that wants to know (``begin_episode``) that an episode begins."""
-        tell = getattr(self.operator, "begin_episode", None)
-        if tell is not None:
-            tell(instruction, seed)
+    def done(self) -> bool:
+        """Whether the episode can end here, where the operator can tell (``task_done``)."""
+        tell = getattr(self.operator, "task_done", None)
+        return tell is not None and bool(tell())
+
+    def begin(self, instruction: str, episode: int) -> None:
+        """Tell an operator that wants to know (``begin_episode``) that an episode begins.
+
+        Simulations put their objects in place then; ``episode`` counts from 0.
+        """
+        self._call("begin_episode", instruction, episode)
 
     @property
     def can_stop(self) -> bool:

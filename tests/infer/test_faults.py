@@ -1,0 +1,299 @@
+"""Whatever goes wrong, the robot is stopped, the cause is named, and nothing unsafe was sent."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from fluxvla_core.errors import Faulted, NotReady, RunFailed, SafetyStop
+
+
+def spoil(row: int, column: int, value: float):
+    def change(chunk):
+        chunk[row, column] = value
+        return chunk
+
+    return change
+
+
+def fails(bench, kind, match, **arguments):
+    with pytest.raises(kind, match=match) as caught:
+        bench.run(**arguments)
+    return caught.value
+
+
+def assert_stopped(bench, rule: str, text: str) -> None:
+    """The robot was stopped and given back, and the record says why."""
+    assert bench.arm.calls[0] == "connect"
+    assert bench.arm.calls[1:] == ["stop", "stop", "close"]
+    summary = bench.episode()
+    assert summary["outcome"] == "failed"
+    assert text in summary["problem"]
+    assert [(trip["rule"], trip["what"]) for trip in summary["trips"]] == [
+        (rule, summary["problem"])
+    ]
+    (stop,) = [row for row in bench.trace() if row["event"] == "stop"]
+    assert stop["rule"] == rule
+    bench.assert_within_limits()
+
+
+def assert_braked(bench) -> None:
+    """The last commands slow down to a hold within the acceleration limit."""
+    np.testing.assert_allclose(bench.arm.sent[-1], bench.arm.sent[-2], atol=1e-2)
+    assert bench.trace()[-2]["phase"] == "stop" or len(bench.arm.sent) == 25
+
+
+@pytest.mark.parametrize("call", [1, 2])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_chunk_that_is_not_finite(bench, call, bad):
+    bench.policy.faults[call] = spoil(3, 1, bad)
+
+    fails(bench, SafetyStop, "chunk is not finite: keyframe 3, elbow is")
+    assert_stopped(bench, "chunk", "not finite")
+    assert len(bench.arm.sent) <= 35 * (call - 1)
+
+
+@pytest.mark.parametrize("shape", [(5, 2), (5, 4), (15,), (0, 3), (1, 5, 3)])
+def test_a_chunk_of_a_wrong_shape(bench, shape):
+    bench.policy.faults[2] = lambda chunk: np.zeros(shape)
+
+    fails(bench, SafetyStop, r"chunk has shape \(.*\); testarm takes \(T, 3\)")
+    assert_stopped(bench, "chunk", "has shape")
+
+
+def test_a_chunk_of_another_length_than_the_policy_said(bench):
+    bench.policy.faults[2] = lambda chunk: chunk[:3]
+
+    fails(bench, SafetyStop, "chunk has 3 keyframes; it said 5")
+    assert_stopped(bench, "chunk", "3 keyframes")
+
+
+def test_a_chunk_that_is_no_array(bench):
+    bench.policy.faults[1] = lambda chunk: "left a bit"
+
+    fails(bench, SafetyStop, "the policy's chunk is no array of numbers")
+    assert_stopped(bench, "chunk", "no array")
+    assert bench.arm.sent == []
+
+
+def test_a_chunk_that_jumps(bench):
+    def jump(chunk):
+        chunk[2:, 0] = -1.0
+        chunk[:2, 0] = 1.5
+        return chunk
+
+    bench.policy.faults[2] = jump
+
+    fails(bench, SafetyStop, "keyframe 2 wants shoulder to jump by -2.5; at full speed")
+    assert_stopped(bench, "chunk", "jump")
+    assert_braked(bench)
+
+
+def test_a_chunk_far_beyond_a_limit(bench):
+    bench.policy.faults[2] = spoil(4, 0, 9.0)
+
+    fails(bench, SafetyStop, r"keyframe 4 wants shoulder at 9, far beyond its limits \[-1, 1.5\]")
+    assert_stopped(bench, "chunk", "far beyond")
+
+
+def test_a_chunk_a_little_beyond_a_limit_is_clamped(bench):
+    bench.policy.goal = 1.6
+
+    result = bench.run(max_publish_step=150)
+
+    assert result["outcome"] == "max_steps"
+    assert bench.arm.state[0] == 1.5
+    assert bench.episode()["clamps"]["shoulder"].keys() >= {"position"}
+    bench.assert_within_limits()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_policy_that_raises(bench, make_arm, realtime):
+    bench.arm = make_arm(realtime=realtime)
+    bench.policy.faults[3] = ValueError("out of memory")
+
+    error = fails(bench, RunFailed, "the policy raised ValueError: out of memory")
+    assert error.exit_code == 1
+    assert_stopped(bench, "policy", "out of memory")
+    assert_braked(bench)
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_a_policy_that_hangs_on_a_robot(bench, make_arm, asynchronous):
+    """The sender goes on sending holds in the meantime; then the motion is stopped."""
+    bench.arm = make_arm(realtime=True)
+    bench.policy.faults[4] = lambda chunk: time.sleep(3)
+
+    fails(
+        bench,
+        SafetyStop,
+        r"waits for a chunk for 0\.\d+ s, safety.starvation_s is 0.3",
+        async_execution=asynchronous,
+        max_publish_step=500,
+        safety={"starvation_s": 0.3},
+    )
+    assert_stopped(bench, "starvation", "waits for a chunk")
+    assert any("the policy still hangs" in line for line in bench.notes.lines)
+    holds = bench.arm.sent[-10:]
+    np.testing.assert_array_equal(holds[0], holds[-1])
+
+
+def test_a_policy_that_hangs_in_a_simulation(bench):
+    bench.policy.faults[2] = lambda chunk: time.sleep(3)
+
+    fails(
+        bench,
+        SafetyStop,
+        "the policy gave no chunk within 0.2 s",
+        safety={"first_chunk_s": 0.2},
+    )
+    assert_stopped(bench, "starvation", "no chunk")
+
+
+@pytest.mark.parametrize("after", [0, 7])
+def test_an_operator_that_raises_in_send_action(bench, after):
+    bench.arm.faults = {"send_action": OSError("cable pulled"), "after": after}
+
+    fails(bench, Faulted, "Arm.send_action raised OSError: cable pulled")
+    assert_stopped(bench, "operator", "cable pulled")
+    assert len(bench.arm.sent) == after
+
+
+def test_an_operator_that_raises_in_get_frame(bench):
+    bench.arm.faults = {"get_frame": Faulted("the camera is gone"), "after": 20}
+
+    fails(bench, Faulted, "the camera is gone")
+    assert_stopped(bench, "operator", "camera is gone")
+
+
+def test_an_operator_whose_stop_raises_is_reported_and_closed(bench):
+    bench.policy.faults[2] = ValueError("x")
+    bench.arm.faults = {"stop": OSError("no answer")}
+
+    fails(bench, RunFailed, "the policy raised")
+
+    assert bench.arm.calls[-1] == "close"
+    assert "warning: Arm.stop raised OSError: no answer" in bench.notes.lines
+
+
+def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, monkeypatch):
+    monkeypatch.setattr("fluxvla_core.infer.robot.STOP_S", 0.1)
+    bench.arm = make_arm(realtime=True)
+    bench.arm.faults = {"stop": lambda: time.sleep(1)}
+
+    bench.run(max_publish_step=5)
+
+    (line,) = [line for line in bench.notes.lines if "emergency" in line]
+    assert "Arm.stop did not return within 0.1 s: use the robot's emergency stop" in line
+
+
+def test_a_robot_that_does_not_follow(bench):
+    bench.arm.faults = {"stuck": True}
+    bench.policy.stride = 0.3
+    bench.arm.get_state = lambda: bench.arm.state
+
+    fails(bench, SafetyStop, r"shoulder is 0\.\d+ away from its command for 0.2\d s")
+    assert_stopped(bench, "tracking", "away from its command")
+    # It is not commanded on: what it was last sent is what made it trip.
+    assert bench.trace()[-1]["event"] == "stop"
+    assert bench.trace()[-2]["phase"] == "run"
+
+
+def test_a_blocked_robot_is_noticed_from_observations_alone(bench):
+    bench.arm.faults = {"stuck": True}
+    bench.policy.stride = 0.2
+
+    fails(bench, SafetyStop, "shoulder is .* away from its command", max_publish_step=500)
+    assert_stopped(bench, "tracking", "shoulder")
+
+
+def test_a_stream_that_froze(bench):
+    bench.arm.faults["frozen_after"] = 20
+
+    fails(bench, SafetyStop, r"stream state is stale: its newest reading is \d\.\d\d s old")
+    assert_stopped(bench, "freshness", "stale")
+
+
+def test_a_robot_that_never_gives_a_reading(bench):
+    bench.arm.faults["get_frame"] = NotReady("no joint states on /joint_states")
+
+    fails(
+        bench,
+        NotReady,
+        "no complete reading within 0.1 s: no joint states on /joint_states",
+        ready_timeout=0.1,
+    )
+    assert bench.arm.sent == []
+    assert_stopped(bench, "operator", "no complete reading")
+
+
+def test_a_robot_that_is_ready_after_a_while(bench):
+    begin = time.monotonic()
+
+    def warm_up():
+        if time.monotonic() - begin < 0.1:
+            raise NotReady("warming up")
+
+    bench.arm.faults["get_frame"] = warm_up
+
+    assert bench.run(max_publish_step=5)["outcome"] == "max_steps"
+
+
+def test_a_joint_outside_its_limits_at_the_start(bench):
+    bench.arm.state[1] = 2.5
+
+    fails(bench, SafetyStop, r"elbow is at 2.5, outside its limits \[-2, 2\] rad")
+    assert bench.arm.sent == []
+
+
+def test_a_picture_of_another_size(bench):
+    from fluxvla_core.contracts.frame import Frame
+
+    good = bench.arm.get_frame
+
+    def smaller():
+        frame = good()
+        if len(bench.arm.sent) < 20:
+            return frame
+        return Frame(frame.state, {"front": np.zeros((12, 16, 3), np.uint8)}, frame.stamps)
+
+    bench.arm.get_frame = smaller
+
+    fails(bench, SafetyStop, r"camera front gives \(12, 16, 3\) uint8, the embodiment says \(24")
+    assert_stopped(bench, "frame", "camera front")
+
+
+def test_nothing_runs_after_a_trip_until_somebody_re_arms(bench):
+    bench.policy.faults[1] = spoil(0, 0, np.nan)
+    runner = bench.runner()
+    runner.run_setup()
+    with pytest.raises(SafetyStop):
+        runner.run()
+
+    with pytest.raises(SafetyStop, match="stopped by rule chunk: the policy's chunk is not") as hit:
+        runner.run()
+    assert "re-arm" in str(hit.value)
+    assert bench.arm.sent == []
+
+    runner.latch.rearm()
+    assert runner.run()["outcome"] == "max_steps"
+
+
+def test_a_filter_that_makes_nonsense(bench):
+    fails(
+        bench,
+        SafetyStop,
+        r"action filter \w+ made an action of shape \(2,\)",
+        action_filters=[lambda action: action[:2]],
+    )
+    assert_stopped(bench, "limits", "action filter")
+
+
+def test_a_record_that_cannot_be_written_is_an_error_after_the_robot_was_stopped(bench):
+    (bench.work_dir / "inference").write_text("not a folder")
+
+    fails(bench, RunFailed, "cannot record the episode")
+    assert bench.arm.calls == ["connect", "stop", "close"]
+    assert bench.arm.sent == []

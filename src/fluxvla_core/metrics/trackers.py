@@ -108,7 +108,7 @@ _KINDS: Mapping[str, tuple[Callable[..., Tracker], str | None]] = {
 }
 
 
-def check_trackers(names: tuple[str, ...]) -> None:
+def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
     """Refuse, before training, trackers that do not exist or whose package is not installed.
 
     Raises:
@@ -121,11 +121,12 @@ def check_trackers(names: tuple[str, ...]) -> None:
         if name not in _KINDS:
             near = difflib.get_close_matches(name, _KINDS, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(_KINDS)}"
-            raise ConfigError(f"active_trackers has no {name!r}; {hint}")
+            raise ConfigError(f"there is no tracker {name!r}; {hint}", where=where)
         package = _KINDS[name][1]
         if package is not None and importlib.util.find_spec(package) is None:
             raise ConfigError(
                 f"tracker {name!r} needs the package {package}, which is not installed",
+                where=where,
                 next=f"pip install {package}",
             )
 

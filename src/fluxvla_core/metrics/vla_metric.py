@@ -48,11 +48,15 @@ class VLAMetric:
         grad_accumulation_steps: int = 1,
         context: RunContext | None = None,
     ) -> None:
-        if window_size < 1:
-            raise ConfigError(f"window_size must be at least 1, got {window_size}")
-        self.active_trackers = tuple(active_trackers)
-        check_trackers(self.active_trackers)
         self.context = context or RunContext()
+        table = f"{self.context.section}.metric"
+        if window_size < 1:
+            raise ConfigError(
+                f"window_size must be at least 1, got {window_size}",
+                where=self.context.where(f"{table}.window_size"),
+            )
+        self.active_trackers = tuple(active_trackers)
+        check_trackers(self.active_trackers, self.context.where(f"{table}.active_trackers"))
         self.run_dir = Path(run_dir) if run_dir is not None else self.context.work_dir
         self.run_id = run_id or self.run_dir.name
         self.hparams = hparams

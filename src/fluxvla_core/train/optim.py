@@ -98,8 +98,10 @@ def torch_state(
     state: dict[int, dict[str, Any]] = {}
     for place, value in {**tensors, **described["scalars"]}.items():
         name, _, key = place.rpartition("/")
-        if isinstance(value, Tensor) and value.shape == parameters[name].shape:
-            value = like(parameters[name], value)
+        if isinstance(value, Tensor):
+            same = value.shape == parameters[name].shape
+            # A copy: what was read may be a view of the checkpoint's file.
+            value = (like(parameters[name], value) if same else value).clone()
         state.setdefault(index[name], {})[key] = value
     groups, first = [], 0
     for mine, saved in zip(optimizer.param_groups, described["groups"], strict=True):

@@ -41,5 +41,24 @@ class DDPTrainRunner(BaseTrainRunner):
             gradient_as_bucket_view=True,
         )
 
+    def _warm_up(self, batch: dict[str, Any]) -> None:
+        """Let torch rearrange its buckets now rather than after the first step.
+
+        DistributedDataParallel orders its buckets by how gradients arrived in its first backward
+        pass. With more than two processes that changes the order in which they are added up, so
+        the first step of a resumed run would be rounded otherwise than that of one that went on.
+        """
+        if self.world.size <= 2 or self.find_unused_parameters:
+            return
+        from fluxvla_core.train.state import rng_state, set_rng_state
+
+        drawn = rng_state()
+        buffers = {name: buffer.clone() for name, buffer in self.model.named_buffers()}
+        self._training_step(batch).backward()
+        self.optimizer.zero_grad(set_to_none=True)
+        for name, buffer in self.model.named_buffers():
+            buffer.copy_(buffers[name])
+        set_rng_state(drawn)
+
     def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         return nullcontext() if last or self.world.size == 1 else self.vla.no_sync()

@@ -1,0 +1,165 @@
+"""Reading checkpoints: what is whole, what is damaged, and what is offered instead."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.train.checkpoint import Checkpoint, folders, latest, newest_whole
+from fluxvla_core.train.manifest import read_manifest
+from fluxvla_core.train.writer import CheckpointWriter
+
+SPEC = EmbodimentSpec("arm", (Joint("j", "rad", -1.0, 1.0, 1.0, 1.0),), (), 10.0)
+
+
+def write(work_dir, step):
+    with CheckpointWriter(work_dir, step, 3) as writer:
+        writer.write_bytes("model.safetensors", bytes(range(200)))
+        writer.write_json("config.resolved.json", {"config": {"a": 1}, "origins": {}})
+        writer.write_json("embodiment.json", SPEC.to_dict())
+        writer.write_json("policy.json", {"action_rate_hz": 10.0, "horizon": 2})
+        writer.write_json("dataset_statistics.json", {"private": {}})
+        writer.write_bytes("rng/rank-00000.safetensors", b"abc")
+        return writer.commit()
+
+
+def test_what_a_checkpoint_says(tmp_path):
+    found = Checkpoint.open(write(tmp_path, 70))
+    found.verify()
+    assert (found.step, found.epoch) == (70, 3)
+    assert found.config() == {"a": 1}
+    assert found.policy() == {"action_rate_hz": 10.0, "horizon": 2}
+    assert found.statistics() == {"private": {}}
+    assert found.embodiment() == SPEC
+    assert found.processors == found.path / "processors"
+
+
+def test_metadata_is_read_without_torch(tmp_path):
+    code = (
+        "import sys; from fluxvla_core.train.checkpoint import latest\n"
+        "found = latest(sys.argv[1]); found.verify(); found.embodiment(); found.config()\n"
+        "sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
+    )
+    write(tmp_path, 1)
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+
+
+def test_no_embodiment_is_none_and_no_file_is_an_error(tmp_path):
+    with CheckpointWriter(tmp_path, 1, 0) as writer:
+        path = writer.commit()
+    assert Checkpoint.open(path).embodiment() is None
+    with pytest.raises(CheckpointError, match=r"the checkpoint has no policy\.json"):
+        Checkpoint.open(path).policy()
+    with pytest.raises(CheckpointError, match=r"the checkpoint has no model\.safetensors"):
+        Checkpoint.open(path).tensors("model.safetensors")
+
+
+@pytest.mark.parametrize("text", ["[1]", "{"])
+def test_json_that_is_no_object_is_named(tmp_path, text):
+    path = write(tmp_path, 1)
+    (path / "policy.json").write_text(text)
+    with pytest.raises(CheckpointError, match=r"policy\.json (holds no JSON object|cannot be read)"):
+        Checkpoint.open(path).policy()
+
+
+def test_a_flipped_bit_in_any_file_is_named(tmp_path):
+    write(tmp_path, 1)
+    newest = write(tmp_path, 2)
+    names = [p.relative_to(newest) for p in newest.rglob("*") if p.is_file()]
+    assert len(names) == 7
+    for name in names:
+        whole = (newest / name).read_bytes()
+        for at in {0, len(whole) // 2, len(whole) - 2 if len(whole) > 1 else 0}:
+            flipped = bytearray(whole)
+            flipped[at] ^= 1
+            (newest / name).write_bytes(flipped)
+            with pytest.raises(CheckpointError) as caught:
+                Checkpoint.open(newest).verify()
+            message = str(caught.value)
+            assert f"{name} is damaged" in message or "fluxvla-checkpoint" in message
+            assert str(name) in message
+            assert f"the one before it is whole: {tmp_path}/checkpoints/step-000000001" in message
+        (newest / name).write_bytes(whole)
+    Checkpoint.open(newest).verify()
+
+
+def test_a_lost_and_a_cut_file_are_named(tmp_path):
+    path = write(tmp_path, 1)
+    (path / "policy.json").unlink()
+    with pytest.raises(CheckpointError, match=r"policy\.json is missing from the checkpoint"):
+        Checkpoint.open(path).verify()
+    other = write(tmp_path, 2)
+    (other / "model.safetensors").write_bytes(b"short")
+    with pytest.raises(CheckpointError, match=r"model\.safetensors is damaged: 5 bytes instead of"):
+        Checkpoint.open(other).verify()
+
+
+def test_a_damaged_one_without_a_whole_one_before_offers_nothing(tmp_path):
+    first, second = write(tmp_path, 1), write(tmp_path, 2)
+    (first / "manifest.json").write_text("{")
+    (second / "policy.json").unlink()
+    with pytest.raises(CheckpointError) as caught:
+        Checkpoint.open(second).verify()
+    assert caught.value.next is None
+
+
+def test_another_format_is_told_from_damage(tmp_path):
+    path = write(tmp_path, 1)
+    body = json.loads((path / "manifest.json").read_text())
+    body["format"] = "fluxvla-checkpoint-9"
+    (path / "manifest.json").write_text(json.dumps(body))
+    with pytest.raises(CheckpointError, match="has format 'fluxvla-checkpoint-9'; this version"):
+        read_manifest(path)
+
+
+def test_opening_what_is_no_checkpoint(tmp_path):
+    write(tmp_path, 5)
+    with pytest.raises(CheckpointError) as caught:
+        Checkpoint.open(tmp_path / "checkpoints" / "step-000000006")
+    assert str(caught.value) == (
+        f"there is no checkpoint at {tmp_path}/checkpoints/step-000000006\n"
+        f"  next: the newest one there is {tmp_path}/checkpoints/step-000000005"
+    )
+    (tmp_path / "old.pt").write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"old\.pt is a file; a checkpoint is a folder like"):
+        Checkpoint.open(tmp_path / "old.pt")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CheckpointError, match=r"manifest\.json is missing, so this is no checkp"):
+        Checkpoint.open(tmp_path / "empty")
+
+
+def test_a_work_dir_stands_for_its_newest(tmp_path):
+    for step in (9, 100, 20):
+        write(tmp_path, step)
+    assert Checkpoint.open(tmp_path).step == 100
+    assert Checkpoint.open(tmp_path / "checkpoints").step == 100
+    assert latest(tmp_path).step == 100
+    assert [p.name[-3:] for p in folders(tmp_path)] == ["009", "020", "100"]
+
+
+def test_names_that_are_no_checkpoints_are_passed_over(tmp_path):
+    path = write(tmp_path, 1)
+    for name in ("step-000000009.partial", "step-000000008.removing", "step-5.set-aside", "notes"):
+        shutil.copytree(path, path.with_name(name))
+    (path.parent / "step-000000007").mkdir()
+    assert folders(tmp_path) == [path]
+    assert latest(tmp_path / "nowhere") is None
+
+
+def test_newest_whole_says_what_it_passed_over(tmp_path):
+    write(tmp_path, 1)
+    (write(tmp_path, 2) / "policy.json").unlink()
+    (write(tmp_path, 3) / "manifest.json").write_text("{}")
+    found, refused = newest_whole(tmp_path)
+    assert found.step == 1
+    assert [error.what.split(":")[0] for error in refused] == [
+        "manifest.json is damaged",
+        "policy.json is missing from the checkpoint",
+    ]
+    assert newest_whole(tmp_path / "nowhere") == (None, [])

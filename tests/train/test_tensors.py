@@ -1,0 +1,95 @@
+"""Tensors to safetensors files and back."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+from torch import nn
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.train.tensors import check_names, read_tensors, save_tensors
+from fluxvla_core.train.writer import CheckpointWriter
+
+
+def saved(tmp_path, tensors):
+    with CheckpointWriter(tmp_path, 1, 0) as writer:
+        save_tensors(writer, "t.safetensors", tensors)
+        return writer.commit() / "t.safetensors"
+
+
+EVERY = {
+    "f64": torch.tensor([1.0, float("nan"), -0.0], dtype=torch.float64),
+    "f32": torch.tensor([[1e-38, float("inf")], [3.0, -2.0]]),
+    "f16": torch.tensor([0.5, -7.0], dtype=torch.float16),
+    "bf16": torch.tensor([0.1, 3e38], dtype=torch.bfloat16),
+    "i64": torch.tensor(-(2**62)),
+    "i32": torch.tensor([[1], [2]], dtype=torch.int32),
+    "i16": torch.tensor([-3], dtype=torch.int16),
+    "i8": torch.tensor([-128, 127], dtype=torch.int8),
+    "u8": torch.tensor([0, 255, 3], dtype=torch.uint8),
+    "bool": torch.tensor([True, False, True]),
+    "empty": torch.zeros(0, 3),
+    "ümläut/name": torch.ones(1),
+    "view": torch.arange(12).reshape(3, 4).T[1:],
+}
+
+
+def same_bits(a, b):
+    return a.dtype == b.dtype and a.shape == b.shape and bytes_of(a) == bytes_of(b)
+
+
+def bytes_of(t):
+    return t.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes() if t.numel() else b""
+
+
+def test_every_dtype_comes_back_bit_for_bit(tmp_path):
+    path = saved(tmp_path, EVERY)
+    for found in (read_tensors(path), load_file(path)):
+        assert set(found) == set(EVERY)
+        assert all(same_bits(found[name], tensor) for name, tensor in EVERY.items())
+
+
+def test_tied_weights_are_stored_once_and_come_back_under_both_names(tmp_path):
+    """T9 of the field notes: tied weights made saving fail."""
+    net = nn.ModuleDict({"a": nn.Linear(50, 50, bias=False), "b": nn.Linear(50, 50, bias=False)})
+    net["b"].weight = net["a"].weight
+    path = saved(tmp_path, net.state_dict(keep_vars=True))
+    assert path.stat().st_size < 1.5 * 50 * 50 * 4
+    found = read_tensors(path)
+    assert torch.equal(found["b.weight"], net["a"].weight)
+    assert set(found) == {"a.weight", "b.weight"}
+    with safe_open(path, "pt") as file:
+        assert json.loads(file.metadata()["aliases"]) == {"b.weight": "a.weight"}
+
+
+def test_a_dtype_that_the_format_lacks_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r"tensor z has dtype torch\.complex64"):
+        saved(tmp_path, {"z": torch.zeros(1, dtype=torch.complex64)})
+    assert list((tmp_path / "checkpoints").iterdir()) == []
+
+
+def test_a_file_that_is_no_safetensors_is_named(tmp_path):
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(b"no such format")
+    with pytest.raises(CheckpointError, match=r"x\.safetensors cannot be read"):
+        read_tensors(path)
+
+
+def test_check_names_lists_what_differs():
+    ours = {n: torch.zeros(2) for n in "abcdefg"}
+    theirs = {"a": torch.zeros(2), "b": torch.zeros(3), "x": torch.zeros(1)}
+    with pytest.raises(CheckpointError) as caught:
+        check_names(theirs, ours, "the weights", "/ckpt")
+    assert str(caught.value) == (
+        "/ckpt: the weights of the checkpoint are not this model's:\n"
+        "    5 missing in the checkpoint: c; d; e; f …\n"
+        "    1 unexpected in the checkpoint: x\n"
+        "    1 of another size: b: (3,) in the checkpoint, (2,) here\n"
+        "  likely cause: it was made by another model, or by another version of this one\n"
+        "  next: resume with the config that made it: config.resolved.json in its folder"
+    )
+    check_names(ours, ours, "the weights", "/ckpt")

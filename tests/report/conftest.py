@@ -54,24 +54,34 @@ def training(work_dir: Path, steps: int = 300) -> None:
 
 def evaluation(work_dir: Path, episodes: int = 20) -> None:
     records: list[dict[str, Any]] = []
+    videos: list[dict[str, Any]] = []
     for group, rate in RATES.items():
         for task in TASKS:
             for number in range(episodes):
-                record = {
-                    "group": group,
-                    "task": task,
-                    "seed": 500 + number,
-                    "status": "done",
-                    "success": number < round(rate * episodes),
-                    "steps": 250,
-                }
+                success = number < round(rate * episodes)
+                key = {"group": group, "task": task, "seed": 500 + number, "success": success}
+                records.append({**key, "status": "done", "steps": 250})
                 if group == "policy" and number in (0, episodes - 1):
-                    record["video"] = f"videos/{task}-{500 + number}.mp4"
-                    video(work_dir / "eval" / record["video"], 20 + number)
-                records.append(record)
-    write_lines(work_dir / "eval" / "episodes.jsonl", [{"format": "header"}, *records])
-    results = {"format": "fluxvla-eval-1", "checkpoint": "step-000000300"}
-    write_json(work_dir / "eval" / "results.json", {**results, "groups": summarise(records)})
+                    path = f"videos/{task}-{500 + number}.mp4"
+                    videos.append({**key, "path": path})
+                    video(work_dir / "eval" / path, 20 + number)
+    results = {
+        "format": "fluxvla-eval-1",
+        "policy": "checkpoint",
+        "checkpoint": {"path": "checkpoints/step-000000300", "step": 300, "sha256": "0"},
+        "settings": {"replan_every": 5, "dataset": None},
+        "groups": summarise(records),
+        "behaviours": {
+            "policy": {"hold it": {"episodes": 20, "neither": 3, "lift_hold": 17}},
+            "swapped": {"hand it over": {"episodes": 20, "neither": 1, "lift_hold": 1}},
+        },
+        "videos": sorted(videos, key=lambda row: row["success"]),
+        "timing": {
+            **{"episodes": 120, "steps": 30_000, "seconds": 100.0, "steps_per_s": 300.0},
+            **{"workers": 2, "policy_ms": 12.34},
+        },
+    }
+    write_json(work_dir / "eval" / "results.json", results)
 
 
 def inference(work_dir: Path, commands: int = 200) -> None:

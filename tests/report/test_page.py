@@ -64,6 +64,7 @@ def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
         "11280 frames, 2 instructions, LeRobot v3.0",
         "On the robot: lift the cube & hold it",
         "left_waist (rad) · 3 clamped",
+        "told the other task hand it over 20 1 1",
         "from nothing to this page 15 min",
         "train · 10 min 01 s",
         "2.13.0+cpu",

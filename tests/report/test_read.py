@@ -27,7 +27,12 @@ def test_a_complete_work_dir(complete: Path) -> None:
     ]
     assert evaluation.groups[0].tasks[0].rate == 0.85
     assert evaluation.groups[0].total.low == pytest.approx(0.709, abs=1e-3)
-    assert evaluation.details == {"checkpoint": "step-000000300"}
+    assert evaluation.details["checkpoint"] == "checkpoints/step-000000300"
+    assert evaluation.details["speed"] == "300 steps/s in 2 processes, 120 episodes in 100 s"
+    assert evaluation.details["the policy's answer"] == "12.3 ms on average"
+    assert evaluation.details["replan_every"] == 5
+    assert evaluation.behaviours[1].group == "told the other task"
+    assert evaluation.behaviours[1].counts == {"neither": 1, "lift_hold": 1}
     assert [v.success for v in evaluation.videos] == [False, False, True, True]
     (episode,) = facts.episodes
     assert (episode.task, episode.success) == ("lift the cube & hold it", True)
@@ -81,9 +86,9 @@ def test_results_without_rates_or_with_missing_videos_show_what_there_is(tmp_pat
     (folder / "results.json").write_text(json.dumps({"groups": groups}))
     assert read_evaluations(Reader(tmp_path), tmp_path) == []
     groups["acme"] = {"all": {**empty, "episodes": 2, "successes": 1}, "tasks": {}}
-    (folder / "results.json").write_text(json.dumps({"groups": groups}))
-    record = {"group": "acme", "status": "done", "success": True, "video": "gone.mp4"}
-    (folder / "episodes.jsonl").write_text(json.dumps(record) + "\n")
+    videos = [{"group": "acme", "success": True, "path": "gone.mp4"}, {"group": "acme"}, 7]
+    results = {"groups": groups, "policy": "expert", "videos": videos}
+    (folder / "results.json").write_text(json.dumps(results))
     (evaluation,) = read_evaluations(Reader(tmp_path), tmp_path)
     assert [group.label for group in evaluation.groups] == ["acme"]
     assert evaluation.groups[0].total.rate == 0.5

@@ -61,6 +61,16 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Behaviour:
+    """What a group did after one instruction: how many of its episodes did which task."""
+
+    group: str
+    instruction: str
+    episodes: int
+    counts: Mapping[str, int]
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """One evaluation: its groups, and videos in the order in which to show them.
 
@@ -69,6 +79,7 @@ class Evaluation:
 
     name: str
     groups: Sequence[Group]
+    behaviours: Sequence[Behaviour] = ()
     videos: Sequence[Video] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""Success rates and videos of evaluations, from ``results.json`` and ``episodes.jsonl``."""
+"""Success rates, behaviours and videos of evaluations, from their ``results.json``."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.report.facts import Evaluation, Group, Score, Video
+from fluxvla_core.report.facts import Behaviour, Evaluation, Group, Score, Video
 from fluxvla_core.report.files import Reader, mappings, number
 
 NAMES = {
     "policy": "trained policy",
     "swapped": "told the other task",
     "untrained": "untrained policy",
-    "expert": "scripted expert",
 }
 """What people call the groups of an evaluation; an unknown one keeps its own name."""
 
@@ -21,34 +20,33 @@ NAMES = {
 def read_evaluations(reader: Reader, work_dir: Path) -> list[Evaluation]:
     """Every ``results.json`` in a folder of the work dir that has success rates in it."""
     found = [
-        _evaluation(reader, path.parent, reader.mapping(path))
+        _evaluation(path.parent, reader.mapping(path))
         for path in sorted(work_dir.glob("*/results.json"))
     ]
     return [evaluation for evaluation in found if evaluation.groups]
 
 
-def _evaluation(reader: Reader, folder: Path, results: Mapping[str, Any]) -> Evaluation:
-    groups = [_group(name, table) for name, table in mappings(results.get("groups"))]
-    records = [r for r in reader.lines(folder / "episodes.jsonl") if r.get("status") == "done"]
+def _evaluation(folder: Path, results: Mapping[str, Any]) -> Evaluation:
+    names = dict(NAMES)
+    if results.get("policy") not in (None, "checkpoint"):
+        names["policy"] = f"{results['policy']} policy"
+    groups = [_group(name, names, table) for name, table in mappings(results.get("groups"))]
     return Evaluation(
         name=folder.name,
         groups=[group for group in groups if group is not None],
-        videos=_videos(folder, records),
-        details={
-            name: value
-            for name, value in results.items()
-            if name not in ("groups", "format") and not isinstance(value, (dict, list))
-        },
+        behaviours=_behaviours(names, results.get("behaviours")),
+        videos=_videos(folder, names, results.get("videos")),
+        details=_details(results),
     )
 
 
-def _group(name: str, table: Mapping[str, Any]) -> Group | None:
+def _group(name: str, names: Mapping[str, str], table: Mapping[str, Any]) -> Group | None:
     total = _score("all tasks", table.get("all"))
     if total is None:
         return None
     scores = [_score(task, counted) for task, counted in mappings(table.get("tasks"))]
     tasks = [score for score in scores if score is not None]
-    return Group(name, NAMES.get(name, name), total, tasks)
+    return Group(name, names.get(name, name), total, tasks)
 
 
 def _score(name: str, counted: Any) -> Score | None:
@@ -64,19 +62,44 @@ def _score(name: str, counted: Any) -> Score | None:
     )
 
 
-def _videos(folder: Path, records: list[dict[str, Any]]) -> list[Video]:
-    """Videos that records name; of the trained policy first, its failures before all."""
-    videos = []
-    for record in records:
-        named = record.get("video")
-        path = folder / str(named) if named else None
-        if path is None or not path.is_file():
-            continue
-        group = str(record.get("group", ""))
-        caption = (
-            f"{record.get('task', '')} · {NAMES.get(group, group)} · seed {record.get('seed')}"
+def _behaviours(names: Mapping[str, str], table: Any) -> list[Behaviour]:
+    return [
+        Behaviour(
+            group=names.get(group, group),
+            instruction=instruction,
+            episodes=int(number(row.get("episodes", 0))),
+            counts={name: int(number(count)) for name, count in row.items() if name != "episodes"},
         )
-        success = bool(record.get("success"))
-        order = (list(NAMES).index(group) if group in NAMES else len(NAMES), success)
-        videos.append((order, Video(path, caption, success)))
-    return [video for _, video in sorted(videos, key=lambda pair: pair[0])]
+        for group, said in mappings(table)
+        for instruction, row in mappings(said)
+    ]
+
+
+def _videos(folder: Path, names: Mapping[str, str], listed: Any) -> list[Video]:
+    """The videos that are there, in the order of the results: failures come first in it."""
+    rows = [row for row in listed if isinstance(row, Mapping)] if isinstance(listed, list) else []
+    return [
+        Video(
+            path=folder / str(row["path"]),
+            caption=f"{row.get('task', '')} · seed {row.get('seed', '?')} · "
+            f"{names.get(str(row.get('group')), row.get('group', ''))}",
+            success=bool(row.get("success")),
+        )
+        for row in rows
+        if row.get("path") and (folder / str(row["path"])).is_file()
+    ]
+
+
+def _details(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows on how the numbers came about: checkpoint, speed, settings."""
+    tables = dict(mappings(results))
+    checkpoint, timing = tables.get("checkpoint", {}), tables.get("timing", {})
+    rows: dict[str, Any] = {"checkpoint": checkpoint.get("path"), "step": checkpoint.get("step")}
+    if timing.get("episodes"):
+        rows["speed"] = (
+            f"{number(timing.get('steps_per_s')):.0f} steps/s in {timing.get('workers')} "
+            f"processes, {timing['episodes']} episodes in {number(timing.get('seconds')):.0f} s"
+        )
+    if "policy_ms" in timing:
+        rows["the policy's answer"] = f"{number(timing['policy_ms']):.1f} ms on average"
+    return {**rows, **tables.get("settings", {})}

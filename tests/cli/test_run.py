@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -275,6 +276,23 @@ def test_a_bug_in_a_runner_shows_its_line(run: Fluxvla) -> None:
     ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=boom")
     assert ended.code == 1
     assert 'raise ValueError("boom")' in ended.err
+
+
+def test_a_run_outside_of_the_main_thread_leaves_signals_alone(run: Fluxvla) -> None:
+    codes: list[int] = []
+    words = ("--config", "c.py", "--section", "eval")
+    thread = threading.Thread(target=lambda: codes.append(run(*words).code))
+    thread.start()
+    thread.join()
+    assert codes == [0]
+
+
+def test_other_os_errors_are_not_called_a_full_disk(run: Fluxvla, write: Write) -> None:
+    write("work_dirs/c/said-0.json/taken", "")
+    ended = run("--config", "c.py", "--section", "runner")
+    assert ended.code == 1
+    assert "IsADirectoryError" in ended.err
+    assert "no space" not in ended.err
 
 
 # -- dry runs --------------------------------------------------------------------------------

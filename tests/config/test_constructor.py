@@ -258,6 +258,33 @@ def test_the_cores_own_lazy_names_are_followed() -> None:
     assert found.place.startswith("fluxvla_core/build.py:")
 
 
+def test_relative_imports_over_several_levels(install: Install) -> None:
+    install(
+        "fluxvla-toy",
+        files={
+            "toy_deep/__init__.py": "from ._base import Base\n",
+            "toy_deep/_base.py": "class Base: ...\n",
+            "toy_deep/a/__init__.py": "",
+            "toy_deep/a/b.py": (
+                "from ... import toy_none\nfrom .. import _base\nfrom .._base import Base\n"
+                "class A(Base): ...\nclass B(_base.Base): ...\n"
+            ),
+        },
+    )
+    for name in "AB":
+        cls = find("toy_deep.a.b", name)
+        assert isinstance(cls, Source)
+        assert isinstance(linearize(cls)[1], Source)
+
+
+def test_bases_that_python_would_refuse_are_still_listed(install: Install) -> None:
+    text = "class A: ...\nclass B(A): ...\nclass C(A, B): ...\n"
+    install("fluxvla-toy", files={"toy_bad.py": text})
+    cls = find("toy_bad", "C")
+    assert isinstance(cls, Source)
+    assert len(linearize(cls)) == 3
+
+
 def test_circular_imports_end(install: Install) -> None:
     install(
         "fluxvla-toy",
@@ -346,6 +373,18 @@ def test_a_class_without_readable_source_is_taken_to_pass_its_kwargs_on() -> Non
     )
     signature = of_class(space["Cell"])
     assert required(signature) == {"x": True, "cfg": True, "rate": False}
+
+
+def test_a_torch_module_takes_no_parameters_of_its_own() -> None:
+    nn = pytest.importorskip("torch.nn")
+
+    class Net(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self, width: int, **kwargs: Any) -> None:
+            super().__init__(**kwargs)
+
+    signature = of_class(Net)
+    assert required(signature) == {"width": True}
+    assert not signature.open
 
 
 def test_what_is_no_class() -> None:

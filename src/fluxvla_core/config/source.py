@@ -36,10 +36,6 @@ class Module:
     names: dict[str, ast.AST]
     stars: tuple[str, ...]
 
-    @property
-    def package(self) -> str:
-        return self.name if self.path.name == "__init__.py" else self.name.rpartition(".")[0]
-
     def place(self, line: int) -> str:
         """``package/module.py:line``: short, and enough to find it."""
         top = self.name.partition(".")[0]

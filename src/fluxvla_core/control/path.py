@@ -61,6 +61,7 @@ class CommandPath:
         self._on_sent = on_sent or (lambda sent: None)
         self._rows: deque[Sent] = deque()
         self._between = False
+        self._unpaced = False
         rate.on_beat = self._beat
 
     def play(self, targets: npt.ArrayLike, filtered: bool = True) -> None:
@@ -78,8 +79,9 @@ class CommandPath:
         try:
             played = self._send(wanted, commands, clamps)
         except BaseException:
-            # The command that was being sent counts as sent; those after it were not.
-            played = len(commands) - len(self._rows) + (0 if self._between else 1)
+            if not self._unpaced:
+                # The command that was being sent counts as sent; those after it were not.
+                played = len(commands) - len(self._rows) + (0 if self._between else 1)
             raise
         finally:
             self._rows.clear()
@@ -107,13 +109,14 @@ class CommandPath:
         """Hand the commands over; how many were played."""
         rows = zip(wanted, commands, clamps, strict=True)
         self._rows = deque(Sent(t, c, tuple(found)) for t, c, found in rows)
-        self._between = False
+        self._between = self._unpaced = False
         handed = commands.copy()
         handed.flags.writeable = False
         beats = self.rate.beats
         self._execute(handed, self.rate)
         if self.rate.beats == beats:
             # A loop with a beat of its own: what it was given, it has played.
+            self._unpaced = True
             while self._rows:
                 self._on_sent(self._rows.popleft())
         return len(commands) - len(self._rows)

@@ -1,0 +1,141 @@
+"""What does not fit is refused before anything moves, and before the robot is connected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, UsageError
+from fluxvla_core.spec.embodiment import Camera
+
+
+def refused(bench, kind, match, **arguments):
+    with pytest.raises(kind, match=match) as caught:
+        bench.run(**arguments)
+    assert bench.arm.calls == []
+    assert bench.arm.sent == []
+    return caught.value
+
+
+def test_an_unknown_task_is_refused_with_the_known_ones(bench):
+    error = refused(bench, UsageError, "unknown task '99'; nothing was moved", task="99")
+
+    assert error.exit_code == 2
+    assert "1: wave at the camera\n  2: lift the red cube" in str(error)
+
+
+def test_no_task_and_no_terminal_is_an_error(bench, monkeypatch):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False)
+
+    with pytest.raises(UsageError, match="no task was given, and there is no terminal") as caught:
+        bench.run(task=None)
+    assert "--task with one of 1, 2, or an instruction in words" in str(caught.value)
+    assert caught.value.exit_code == 2
+    assert bench.arm.sent == []
+
+
+def test_a_policy_for_another_robot(bench):
+    joints = bench.policy.embodiment.joints
+    swapped = (joints[1], joints[0], joints[2])
+    bench.policy.embodiment = replace(bench.policy.embodiment, joints=swapped, name="other")
+
+    error = refused(bench, SpecMismatch, r"the policy \(other\) and the robot \(testarm\) do not")
+    assert "joints and their order: ['elbow', 'shoulder', 'jaw']" in str(error)
+    assert error.exit_code == 2
+
+
+def test_a_camera_that_the_robot_does_not_have(bench):
+    cameras = (*bench.policy.embodiment.cameras, Camera("wrist", 24, 32))
+    bench.policy.embodiment = replace(bench.policy.embodiment, cameras=cameras)
+
+    refused(bench, SpecMismatch, "cameras: wrist missing; there are")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["front", "back"], "camera_names 'back' is none of front"),
+        (["side"], "camera_names 'side' is none of front"),
+    ],
+)
+def test_camera_names_must_be_the_robots(bench, names, message):
+    refused(bench, ConfigError, message, camera_names=names)
+
+
+def test_the_cameras_that_the_policy_looks_at_must_be_observed(bench):
+    spec = replace(bench.arm.embodiment, cameras=(Camera("front", 24, 32), Camera("side", 8, 8)))
+    bench.arm.embodiment = spec
+
+    refused(
+        bench, ConfigError, "camera_names the policy looks at 'front' too", camera_names=["side"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ([0.0, 0.0], "prepare_pose has 2 values, testarm has 3 joints: shoulder, elbow, jaw"),
+        ([9.0, 0.0, 0.0], r"prepare_pose puts shoulder at 9, outside its limits \[-1, 1.5\] rad"),
+        ([0.0, float("nan"), 0.0], "prepare_pose puts elbow at nan"),
+    ],
+)
+def test_a_start_pose_that_cannot_be(bench, pose, message):
+    refused(bench, ConfigError, message, prepare_pose=pose)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"state_dim": 7}, "state_dim is 7; testarm has 3 state values"),
+        ({"publish_rate": 100}, "publish_rate is 100 Hz; testarm takes up to 50 commands"),
+        ({"publish_rate": 25}, "each command to this simulation lasts 1/50 s"),
+        ({"async_execution": True}, "async_execution needs a robot that lives in real time"),
+        ({"execute_horizon": 0}, "execute_horizon must be at least 1, got 0"),
+        ({"action_chunk": 0}, "action_chunk must be at least 1, got 0"),
+        ({"max_publish_step": 0}, "max_publish_step must be at least 1, got 0"),
+        ({"operator": None}, "BaseInferenceRunner has no operator"),
+        ({"safety": {"velocity_scale": 2}}, "safety.velocity_scale must be above 0 and at most 1"),
+        ({"safety": {"max_age": 1}}, "safety has no setting 'max_age'; did you mean max_age_s"),
+    ],
+)
+def test_values_that_make_no_sense(bench, arguments, message):
+    refused(bench, ConfigError, message, **arguments)
+
+
+def test_messages_name_the_place_in_the_config(bench):
+    from fluxvla_core.build import RunContext
+    from fluxvla_core.infer.base_runner import BaseInferenceRunner
+
+    context = RunContext(section="inference", origins={"inference.state_dim": "arm.py:12"})
+    with pytest.raises(ConfigError) as caught:
+        BaseInferenceRunner(context=context, operator=bench.arm, state_dim=7)
+    assert str(caught.value).startswith("arm.py:12: inference.state_dim: state_dim is 7")
+
+
+def test_a_slower_rate_is_allowed_on_a_robot(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+
+    assert bench.runner(publish_rate=25).publish_rate == 25.0
+
+
+def test_without_a_checkpoint_there_is_no_policy(bench):
+    error = refused(bench, CheckpointError, "there is no whole checkpoint in", policy=None)
+
+    assert "--section runner" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"a b": "wave now"}, "an id is one word, got 'a b'"),
+        ({"1": " "}, "task '1' has no instruction"),
+    ],
+)
+def test_task_descriptions_must_make_sense(bench, table, message):
+    refused(bench, UsageError, message, task_descriptions=table)
+
+
+def test_an_unknown_keyword_is_no_silent_default(bench):
+    with pytest.raises(TypeError, match="max_publish_steps"):
+        bench.runner(max_publish_steps=3)

@@ -1,0 +1,127 @@
+"""What processes tell each other."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, RunFailed
+from fluxvla_core.testing.training import run_ranks
+from fluxvla_core.train import distributed
+from fluxvla_core.train.distributed import World, explain, on_first, start
+
+ONE = World(0, 1, 0, torch.device("cpu"))
+TWO = World(1, 2, 1, torch.device("cpu"))
+
+
+class Own(FluxError):
+    """An error class that the core does not know."""
+
+
+def fail(error):
+    raise error
+
+
+def talk(folder):
+    world = start("cpu")
+    said = {
+        "rank": (world.rank, world.size, world.first, world.owned),
+        "agree": distributed.agree(world, 3 * world.rank),
+        "total": distributed.total(world, torch.tensor([1.0, world.rank])).tolist(),
+        "gather": [t.tolist() for t in distributed.gather(world, torch.tensor([world.rank]))],
+        "text": distributed.share_text(world, "grüße" if world.first else "other"),
+        "no text": distributed.share_text(world, ""),
+        "texts": distributed.texts(world, f"r{world.rank}" * (1 + 1500 * world.rank)),
+        "first": on_first(world, lambda: f"rank {world.rank}"),
+    }
+    for name, error in {
+        "error": CheckpointError("torn", where="here", cause="why", next="do"),
+        "own error": Own("mine"),
+    }.items():
+        try:
+            on_first(world, lambda: fail(error))  # noqa: B023 - called at once
+        except FluxError as caught:
+            said[name] = [type(caught).__name__, str(caught)]
+    (folder / f"{world.rank}.json").write_text(json.dumps(said))
+    distributed.stop(world)
+
+
+def test_two_ranks(tmp_path):
+    assert run_ranks(2, talk, tmp_path) == [0, 0]
+    first, second = (json.loads((tmp_path / f"{r}.json").read_text()) for r in range(2))
+    assert first["rank"] == [0, 2, True, True]
+    assert second["rank"] == [1, 2, False, True]
+    assert first.pop("gather") == [[0], [1]]
+    assert second.pop("gather") == []
+    assert second.pop("own error") == ["FluxError", "mine"]
+    assert first.pop("own error") == ["Own", "mine"]
+    first.pop("rank"), second.pop("rank")
+    assert first == second
+    assert first["agree"] == 3
+    assert first["total"] == [2.0, 1.0]
+    assert first["text"] == "grüße"
+    assert first["no text"] == ""
+    assert first["texts"] == ["r0", ("r1" * 1501)[:2000]]
+    assert first["first"] == "rank 0"
+    assert first["error"] == [
+        "CheckpointError",
+        "here: torn\n  likely cause: why\n  next: do",
+    ]
+
+
+def test_one_process_needs_no_group():
+    world = start("cpu")
+    assert (world.rank, world.size, world.control, world.owned) == (0, 1, None, False)
+    distributed.stop(world)
+    assert distributed.agree(ONE, 7) == 7
+    assert distributed.texts(ONE, "a") == ["a"]
+    assert distributed.share_text(ONE, "a") == "a"
+    assert on_first(ONE, lambda: "x") == "x"
+    with pytest.raises(CheckpointError, match="torn"):
+        on_first(ONE, lambda: fail(CheckpointError("torn")))
+
+
+def group_of_one():
+    world = start("cpu", group_of_one=True)
+    assert torch.distributed.is_initialized()
+    assert world.size == 1
+    distributed.stop(world)
+    assert not torch.distributed.is_initialized()
+
+
+def test_a_single_process_can_have_a_group():
+    assert run_ranks(1, group_of_one) == [0]
+
+
+def test_devices_that_are_not_there_are_refused(monkeypatch):
+    with pytest.raises(ConfigError, match="device 'gpu' is none of 'auto', 'cpu', 'cuda'"):
+        start("gpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="device is 'cuda', but torch finds no GPU here"):
+        start("cuda")
+    assert start("auto").device.type == "cpu"
+
+
+def test_a_lost_rank_is_explained_and_other_errors_are_not():
+    error = RuntimeError("[gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:4009")
+    lost = explain(error, TWO, 12)
+    assert isinstance(lost, RunFailed)
+    assert str(lost) == (
+        "rank 1 of 2 lost another rank during step 12\n"
+        "  likely cause: another process of this run ended; its own message says why "
+        "([gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:4009)\n"
+        "  next: mend what that message names, then run the same command with --resume auto"
+    )
+    assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), TWO, 12) is None
+    assert explain(error, ONE, 12) is None
+
+
+def leave():
+    print("last words", flush=False)
+    distributed.exit_now(3)
+
+
+def test_exit_now_keeps_the_code():
+    assert run_ranks(1, leave) == [3]

@@ -1,0 +1,100 @@
+"""The numbers of steps, fetched together."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.testing.training import run_ranks
+from fluxvla_core.train import distributed
+from fluxvla_core.train.distributed import World
+from fluxvla_core.train.window import Window
+
+ONE = World(0, 1, 0, torch.device("cpu"))
+
+
+def add(window, step, *losses, norm=1.0, ids=None, wait=0.0):
+    tensors = [torch.tensor(loss) for loss in losses]
+    numbers = ids or [torch.tensor([10 * step + i]) for i in range(len(losses))]
+    window.add(step, 0.5, 1e-3, tensors, numbers, torch.tensor(norm), 8, wait)
+
+
+def test_losses_are_means_over_the_batches_of_a_step():
+    window = Window(ONE)
+    add(window, 1, 1.0, 3.0)
+    add(window, 2, 5.0, 6.0, norm=2.0)
+    first, second = window.fetch()
+    assert (first.step, first.loss, first.grad_norm, first.lr) == (1, 2.0, 1.0, 1e-3)
+    assert (second.step, second.loss, second.grad_norm) == (2, 5.5, 2.0)
+    assert window.fetch() == []
+
+
+def test_times_add_up_and_a_save_is_left_out():
+    window = Window(ONE, began=0.0)
+    window._pending.clear()
+    add(window, 1, 1.0, wait=0.25)
+    window._pending[0].ended = 2.0
+    (record,) = window.fetch()
+    assert (record.step_time, record.data_wait, record.samples_per_s) == (2.0, 0.25, 4.0)
+    window.restart_clock()
+    assert window.began > 2.0
+
+
+def test_without_clipping_there_is_no_norm():
+    window = Window(ONE)
+    window.add(1, 0.0, 1e-3, [torch.tensor(1.0)], [None], None, 8, 0.0)
+    assert window.fetch()[0].grad_norm is None
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_names_step_and_samples(bad):
+    """O3 of the field notes: no NaN detection."""
+    window = Window(ONE)
+    add(window, 1, 1.0, 2.0)
+    add(window, 2, 1.0, bad)
+    add(window, 3, bad, bad)
+    with pytest.raises(RunFailed) as caught:
+        window.fetch()
+    assert str(caught.value) == (
+        f"the loss is {bad} at step 2\n"
+        f"    rank 0: loss {bad} on samples [21]\n"
+        "  likely cause: a learning rate that is too high, or samples with wrong or huge values\n"
+        "  next: look at those samples, or lower the learning rate, and resume from the last "
+        "checkpoint, which was saved before this"
+    )
+
+
+def test_ids_may_be_a_list_or_missing():
+    for ids, text in (([[4, 5]], "on samples [4, 5]"), ([None], "on a batch without sample_ids")):
+        window = Window(ONE)
+        add(window, 1, float("nan"), ids=ids)
+        with pytest.raises(RunFailed, match=text.replace("[", r"\[")):
+            window.fetch()
+
+
+def test_a_gradient_that_is_not_finite_is_told_from_a_loss():
+    window = Window(ONE)
+    add(window, 4, 0.5, norm=float("inf"))
+    with pytest.raises(RunFailed, match=r"the gradient norm is inf at step 4, with loss 0\.5"):
+        window.fetch()
+
+
+def two_ranks(folder):
+    world = distributed.start("cpu")
+    window = Window(world)
+    add(window, 1, 1.0 + world.rank)
+    (record,) = window.fetch()
+    add(window, 2, 1.0 if world.rank == 0 else float("nan"), ids=[torch.tensor([7, 9])])
+    try:
+        window.fetch()
+    except RunFailed as error:
+        (folder / f"{world.rank}").write_text(f"{record.loss}\n{error.what}")
+    distributed.stop(world)
+
+
+def test_losses_are_of_all_ranks_and_every_rank_hears_of_another_ones_nan(tmp_path):
+    """O1 of the field notes: the logged loss was the first rank's."""
+    assert run_ranks(2, two_ranks, tmp_path) == [0, 0]
+    said = [(tmp_path / str(rank)).read_text() for rank in range(2)]
+    assert said[0] == said[1] == "1.5\nthe loss is nan at step 2\n    rank 1: loss nan on samples [7, 9]"

@@ -1,0 +1,168 @@
+"""LeRobot itself as the judge: it reads what we write, and we read what it writes.
+
+Both sides decode with FFmpeg and convert with its swscale, so pictures are equal to the last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.merge import merge_datasets
+from fluxvla_core.data.parquet_dataset import ParquetDataset
+from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.validate import validate
+from tools import lerobot_env, shell
+
+SIDE = Path(__file__).with_name("lerobot_side.py")
+CAMERAS = ("top", "wrist")
+OURS = {"h264": "h264", "av1": "libsvtav1"}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A dataset, and what LeRobot showed of it."""
+
+    root: Path
+    arrays: dict[str, np.ndarray]
+    described: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def many(takes, take):
+    return [*takes, take(3, 5, takes[1].task)]
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory, recorder, takes, many):
+    """Datasets of ours and one of LeRobot's, all read by LeRobot in one process (it starts slowly).
+
+    Skips where LeRobot cannot be installed.
+    """
+    try:
+        env = lerobot_env.prepare(print)
+    except (shell.StepFailed, OSError) as error:
+        pytest.skip(f"LeRobot cannot be installed here: {str(error).strip().splitlines()[-1]}")
+    folder = tmp_path_factory.mktemp("oracle")
+    roots = {name: folder / name for name in (*OURS, "merged", "theirs")}
+    for name, codec in OURS.items():
+        # Small files, so that there are several of each kind.
+        limits = {"data_file_mb": 0.001, "video_file_mb": 0.006}
+        recorder(roots[name], many, video_codec=codec, **limits)
+    shards = [recorder(folder / f"shard-{w}", many[w::2]) for w in range(2)]
+    merge_datasets(shards, roots["merged"])
+    for shard in shards:
+        shutil.rmtree(shard)
+    save_takes(folder / "takes.npz", takes)
+    jobs = [["write", folder / "takes.npz", roots["theirs"], "libsvtav1"]]
+    jobs += [["read", root, folder / f"{name}.npz"] for name, root in roots.items()]
+    run(env, folder / "jobs.json", jobs)
+    return {name: load(root, folder / f"{name}.npz") for name, root in roots.items()}
+
+
+def save_takes(path, takes):
+    arrays = {"names": ["waist", "elbow", "gripper"], "tasks": [t.task for t in takes]}
+    for i, take in enumerate(takes):
+        arrays[f"{i}/state"], arrays[f"{i}/action"] = take.state, take.action
+        for camera in CAMERAS:
+            arrays[f"{i}/{camera}"] = enlarge(getattr(take, camera))
+    np.savez(path, **arrays)
+
+
+def enlarge(images):
+    # The AV1 encoder of LeRobot's PyAV crashes on pictures as small as ours.
+    return images.repeat(4, axis=1).repeat(4, axis=2)
+
+
+def run(env, path, jobs):
+    path.write_text(json.dumps(jobs, default=str))
+    done = subprocess.run(
+        [env.python, SIDE, path],
+        env={**os.environ, **env.variables(), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def load(root, path):
+    with np.load(path) as file:
+        arrays = dict(file)
+    return Seen(root, arrays, json.loads(str(arrays.pop("described"))))
+
+
+@pytest.mark.parametrize("name", [*OURS, "merged", "theirs"])
+def test_lerobot_and_we_see_the_same(name, seen):
+    theirs = seen[name]
+    dataset = ParquetDataset(str(theirs.root), [], CAMERAS, action_window_size=4)
+    assert len(dataset) == len(theirs.arrays["action"])
+    assert theirs.described["fps"] == dataset.fps
+    for i, sample in enumerate(dataset):
+        shown = {key: array[i] for key, array in theirs.arrays.items()}
+        for camera, image in zip(CAMERAS, sample["images"], strict=True):
+            np.testing.assert_array_equal(shown[camera], image)
+        np.testing.assert_array_equal(shown["observation.state"], sample["states"])
+        np.testing.assert_array_equal(shown["action"], sample["actions"])
+        np.testing.assert_array_equal(shown["action_is_pad"], sample["action_masks"] == 0)
+        assert shown["timestamp"] == sample["timestamp"]
+        assert shown["episode_index"] == sample["info"]["episode_index"]
+        assert theirs.described["tasks"][i] == sample["task_description"]
+
+
+@pytest.mark.parametrize("name", [*OURS, "merged"])
+def test_lerobot_reads_what_we_recorded(name, seen, many):
+    found = seen[name]
+    if name != "merged":
+        assert len(list(found.root.rglob("*.mp4"))) > 2
+    states = np.concatenate([t.state for t in many])
+    np.testing.assert_array_equal(found.arrays["observation.state"], states)
+    tops = np.concatenate([t.top for t in many]).transpose(0, 3, 1, 2)
+    assert np.abs(found.arrays["top"].astype(int) - tops).mean() < 8
+    assert found.described["episodes"] == 4
+    assert found.described["robot_type"] == "arm"
+    assert found.described["names"] == ["waist", "elbow", "gripper"]
+    stats = found.described["stats"]
+    np.testing.assert_allclose(
+        stats["observation.state"]["std"], states.astype(float).std(0), rtol=1e-9
+    )
+    assert np.shape(stats["observation.images.top"]["mean"]) == (3, 1, 1)
+
+
+def test_we_read_what_lerobot_recorded(seen, takes):
+    root = seen["theirs"].root
+    dataset = ParquetDataset(str(root), [], CAMERAS)
+    assert dataset.embodiment is None
+    assert dataset.tasks == ("hold the cube", "hand the cube over")
+    np.testing.assert_array_equal(dataset[7]["states"], takes[1].state[0])
+    top = dataset[12]["images"][0].transpose(1, 2, 0)
+    assert np.abs(top.astype(int) - enlarge(takes[1].top)[5]).mean() < 8
+    validate(root, print)
+
+
+def test_batches_of_a_dataset_that_lerobot_recorded(seen):
+    transforms = [
+        {"type": "ResizeImages", "height": 16, "width": 24},
+        {"type": "SimpleNormalizeImages"},
+        {"type": "NormalizeStatesAndActions", "std_floor": 0.01},
+        {"type": "SampleFlowNoise"},
+    ]
+    dataset = ParquetDataset(str(seen["theirs"].root), transforms, CAMERAS, cache_frames=True)
+    keys = ["images", "states", "actions", "action_masks", "noise", "time"]
+    rest = ["img_masks", "sample_ids", "timestamp", "task_description", "stats", "info"]
+    loader = make_loader(dataset, DictCollator(keys, rest), EpochSampler(len(dataset), 8))
+    for batch in islice(loader, 4):
+        assert batch["images"].shape == (8, 6, 16, 24)
+        assert all(torch.isfinite(batch[key]).all() for key in keys)
+    assert abs(float(batch["states"].mean())) < 1

@@ -1,0 +1,117 @@
+"""LeRobot in an environment of its own, to ask it whether it reads what we write and the reverse.
+
+LeRobot cannot share an environment with this project: it wants an older torch, its torchvision and
+its PyAV. Here it gets the torch of ``constraints.txt`` all the same, which its dataset code works
+with: torchvision is imported for its names only (the test's script declares the two operators
+that its import looks for), and torchcodec uses the FFmpeg that PyAV's wheel brings, so nothing has
+to be installed into the system.
+
+    python -m tools.lerobot_env          prints the environment's Python
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from tools import project, shell, torch_build
+from tools.envs import Env
+
+LEROBOT = ("lerobot==0.4.4", "torchcodec==0.13.0", "torchvision==0.28.0")
+# What LeRobot's dataset code imports, in the versions that go with 0.4.4.
+NEEDS = (
+    "accelerate",
+    "av<16",
+    "datasets>=4.8,<5",
+    "deepdiff",
+    "draccus==0.10.0",
+    "einops",
+    "gymnasium",
+    "huggingface-hub<2",
+    "imageio",
+    "jsonlines",
+    "opencv-python-headless",
+    "packaging<26",
+    "pandas<3",
+    "pyarrow<30",
+    "safetensors",
+    "termcolor",
+)
+FFMPEG = ("avcodec", "avdevice", "avfilter", "avformat", "avutil", "swresample", "swscale")
+
+
+class LeRobotEnv(Env):
+    """The environment; ``variables`` lets torchcodec find FFmpeg and keeps LeRobot off the net."""
+
+    @property
+    def ffmpeg(self) -> Path:
+        return self.root / "ffmpeg"
+
+    def create(self) -> None:
+        """Make it anew with ``venv``: pytest's environment has no virtualenv."""
+        shell.run([sys.executable, "-m", "venv", "--clear", self.root], quiet=True, echo=False)
+
+    def variables(self) -> dict[str, str]:
+        return {
+            **super().variables(),
+            "LD_LIBRARY_PATH": str(self.ffmpeg),
+            "HF_HUB_OFFLINE": "1",
+            "HF_HOME": str(self.root / "hf"),
+            "SVT_LOG": "1",
+        }
+
+
+def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "lerobot") -> Env:
+    """Install what is missing; about a minute the first time. Raises StepFailed if it cannot be."""
+    env = LeRobotEnv(root)
+    version = project.constrained_version("torch")
+    base = {"python": sys.version, "torch": version, "needs": " ".join(NEEDS)}
+
+    def install_base() -> None:
+        # No constraints: they are this project's, and LeRobot's needs are others.
+        nothing = root / "constraints.txt"
+        nothing.write_text("", encoding="utf-8")
+        torch_build.install(env, version, nothing, log)
+        _pip(env, *NEEDS)
+
+    def install_parts(changed: list[str], fresh: bool) -> None:
+        _pip(env, "--no-deps", *LEROBOT)
+        _link_ffmpeg(env)
+
+    env.filled(base, {"lerobot": " ".join(LEROBOT)}, install_base, install_parts)
+    return env
+
+
+def _pip(env: Env, *words: str) -> None:
+    pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
+    env.run(*pip, *words, quiet=True, echo=False)
+
+
+def _link_ffmpeg(env: LeRobotEnv) -> None:
+    """Give PyAV's FFmpeg libraries the names that torchcodec asks for, beside their own."""
+    env.ffmpeg.mkdir(exist_ok=True)
+    for library in env.root.glob("lib/python*/site-packages/av.libs/*.so*"):
+        stem, _, rest = library.name.partition("-")
+        names = [library.name]
+        if stem.removeprefix("lib") in FFMPEG:
+            major = rest.partition(".so.")[2].partition(".")[0]
+            names.append(f"{stem}.so.{major}")
+        for name in names:
+            link = env.ffmpeg / name
+            link.unlink(missing_ok=True)
+            link.symlink_to(library)
+
+
+def main() -> int:
+    try:
+        env = prepare(lambda text: print(text, file=sys.stderr))
+    except shell.StepFailed as error:
+        print(f"LeRobot cannot be installed: {error}", file=sys.stderr)
+        return 1
+    print(env.python)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

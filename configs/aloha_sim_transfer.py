@@ -95,5 +95,7 @@ inference = dict(
     task_descriptions=TASKS,
     execute_horizon=5,
     max_publish_step=300,
-    operator=dict(type="AlohaSimOperator", task="transfer_cube", camera_names=("top",), seed=7),
+    operator=dict(
+        type="AlohaSimOperator", camera_names=("top",), height=144, width=192, seed=7
+    ),
 )

@@ -145,7 +145,7 @@ def base_of(requirements: tuple[str, ...]) -> dict[str, str]:
     return {
         "python": sys.version,
         "constraints": project.CONSTRAINTS.read_text(encoding="utf-8"),
-        "gpu": str(torch_build.has_nvidia_gpu()),
+        "gpu": str(torch_build.nvidia_gpus() > 0),
         "requirements": " ".join(requirements),
     }
 

@@ -12,16 +12,18 @@ from tools.envs import Env
 from tools.shell import StepFailed
 
 
-def has_nvidia_gpu() -> bool:
-    """Whether ``nvidia-smi`` is there and reports at least one GPU."""
+def nvidia_gpus() -> int:
+    """How many GPUs ``nvidia-smi`` reports; 0 where there is no such program."""
     program = shutil.which("nvidia-smi")
     if program is None:
-        return False
+        return 0
     try:
         listing = subprocess.run([program, "-L"], capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
-        return False
-    return listing.returncode == 0 and "GPU" in listing.stdout
+        return 0
+    if listing.returncode:
+        return 0
+    return sum(line.startswith("GPU ") for line in listing.stdout.splitlines())
 
 
 def attempts(version: str, *, gpu: bool, platform: str = sys.platform) -> list[str]:
@@ -41,7 +43,7 @@ def install(env: Env, version: str, constraints: Path, log: Callable[[str], None
 
     ``constraints`` may hold ``torch==VERSION``: that admits ``VERSION+cpu`` as well.
     """
-    ways = attempts(version, gpu=has_nvidia_gpu())
+    ways = attempts(version, gpu=nvidia_gpus() > 0)
     reasons: list[str] = []
     for way in ways[:-1]:
         try:

@@ -77,8 +77,12 @@ def evaluation(work_dir: Path, episodes: int = 20) -> None:
         },
         "videos": sorted(videos, key=lambda row: row["success"]),
         "timing": {
-            **{"episodes": 120, "steps": 30_000, "seconds": 100.0, "steps_per_s": 300.0},
-            **{"workers": 2, "policy_ms": 12.34},
+            "episodes": 120,
+            "steps": 30_000,
+            "seconds": 100.0,
+            "steps_per_s": 300.0,
+            "workers": 2,
+            "policy_ms": 12.34,
         },
     }
     write_json(work_dir / "eval" / "results.json", results)

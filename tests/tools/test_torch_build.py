@@ -34,19 +34,23 @@ def fake_smi(folder: Path, text: str, status: int = 0) -> None:
 
 @pytest.mark.parametrize(
     ("text", "status", "answer"),
-    [("GPU 0: NVIDIA X", 0, True), ("No devices were found", 0, False), ("GPU 0", 9, False)],
+    [
+        ("GPU 0: NVIDIA X\nGPU 1: NVIDIA X", 0, 2),
+        ("No devices were found", 0, 0),
+        ("GPU 0", 9, 0),
+    ],
 )
 def test_a_gpu_is_what_nvidia_smi_lists(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, status: int, answer: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, status: int, answer: int
 ) -> None:
     fake_smi(tmp_path / "bin", text, status)
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    assert torch_build.has_nvidia_gpu() is answer
+    assert torch_build.nvidia_gpus() == answer
 
 
 def test_no_nvidia_smi_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert torch_build.has_nvidia_gpu() is False
+    assert torch_build.nvidia_gpus() == 0
 
 
 class Shop:
@@ -64,7 +68,7 @@ class Shop:
             return ""
 
         monkeypatch.setattr(Env, "run", run)
-        monkeypatch.setattr(torch_build, "has_nvidia_gpu", lambda: False)
+        monkeypatch.setattr(torch_build, "nvidia_gpus", lambda: 0)
 
     def install(self) -> str:
         where = Path("env")

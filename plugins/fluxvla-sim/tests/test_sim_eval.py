@@ -116,7 +116,7 @@ def test_an_inference_run_sends_the_commands_that_were_evaluated(tmp_path):
     scene, task = AlohaScene(), TASKS["transfer_cube"]
     evaluated = watched(scene)
     found = rollout(scene, ExpertPolicy(scene), task, task.instruction, 31, (), replan_every=5)
-    operator = AlohaSimOperator(camera_names=())
+    operator = AlohaSimOperator(camera_names=(), seed=31)
     operator.connect()
     sent = watched(operator._scene)
     inference = BaseInferenceRunner(
@@ -125,7 +125,6 @@ def test_an_inference_run_sends_the_commands_that_were_evaluated(tmp_path):
         operator=operator,
         execute_horizon=5,
         max_publish_step=300,
-        seed=31,
         record_fps=None,
     )
     inference.run_setup()

@@ -55,7 +55,7 @@ class AlohaSimOperator(SimOperator):
 
     Args:
         task: ``transfer_cube`` or ``lift_hold``: what :meth:`task_success` judges.
-        seed: places the cube.
+        seed: places the cube in the first episode; each later one adds 1.
         camera_names: cameras of the scene, in the order of the images.
         height, width: of every picture, in pixels.
         realtime: follow the wall clock instead of simulated time.
@@ -95,13 +95,13 @@ class AlohaSimOperator(SimOperator):
             super().reset(seed)
             self._facts = type(self._facts)()
 
-    def begin_episode(self, instruction: str, seed: int) -> None:
-        """Reset to ``seed``, and judge the task that ``instruction`` asks for, if any does."""
+    def begin_episode(self, instruction: str, episode: int) -> None:
+        """As every simulated robot; and judge the task that ``instruction`` asks for, if any."""
         from fluxvla_sim.aloha.tasks import task_of
 
         with self._lock:
             self.task = task_of(instruction) or self.task
-            self.reset(seed)
+            super().begin_episode(instruction, episode)
 
     def _after_step(self) -> None:
         self._facts = self._facts.after(self._scene)
@@ -111,12 +111,17 @@ class AlohaSimOperator(SimOperator):
         with self._lock:
             return self.task.success(self._facts)
 
+    def task_done(self) -> bool:
+        """Whether the episode can end: nothing that comes could change :meth:`task_success`."""
+        with self._lock:
+            return self.task.done(self._facts)
+
 
 class URSimOperator(SimOperator):
     """A UR5e with a Robotiq 2F-85 at a table with a cube, 50 Hz.
 
     Args:
-        seed: places the cube.
+        seed: places the cube in the first episode; each later one adds 1.
         camera_names: ``front`` and ``wrist``, in the order of the images.
         height, width: of every picture, in pixels.
         realtime: follow the wall clock instead of simulated time.

@@ -38,7 +38,7 @@ class SimOperator:
 
     Args:
         embodiment: joints, limits, cameras and rate.
-        seed: of the first :meth:`reset`, which :meth:`connect` does.
+        seed: of the first episode; :meth:`connect` resets to it.
         realtime: follow the wall clock.
     """
 
@@ -78,14 +78,15 @@ class SimOperator:
             NotReady: not connected.
         """
         with self._lock:
-            scene = self._connected()
-            self.seed = seed
-            scene.reset(seed)
+            self._connected().reset(seed)
             self._target = self._measured()
 
-    def begin_episode(self, instruction: str, seed: int) -> None:
-        """Reset to ``seed``; inference runners call this before each episode."""
-        self.reset(seed)
+    def begin_episode(self, instruction: str, episode: int) -> None:
+        """Reset for episode number ``episode``, counted from 0; runners call this before each.
+
+        Objects go where ``seed + episode`` puts them.
+        """
+        self.reset(self.seed + episode)
 
     def get_state(self) -> npt.NDArray[np.float64]:
         """``(dim,)`` the state alone, without drawing anything.

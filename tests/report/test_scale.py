@@ -41,6 +41,18 @@ def test_known_axes() -> None:
     assert axis([0.0]).ticks[0] == -1.0
 
 
+def test_a_tight_axis_ends_at_the_values() -> None:
+    found = axis([1, 97], count=6, tight=True)
+    assert (found.low, found.high) == (1, 97)
+    assert found.ticks == (20, 40, 60, 80)
+
+
+def test_a_flat_line_is_shown_as_one() -> None:
+    found = axis([0.500, 0.502], least=0.1)
+    assert found.high - found.low >= 0.1
+    assert axis([0.0, 3.0], least=0.1).high == 3.0
+
+
 @pytest.mark.parametrize("values", [[], [math.nan, math.inf]])
 def test_nothing_to_show_is_an_empty_axis(values: list[float]) -> None:
     assert axis(values) == Axis(0.0, 1.0, (0.0, 0.5, 1.0))

@@ -28,6 +28,8 @@ CURVES = (
     ("grad_norm", "Gradient norm", True),
     ("samples_per_s", "Samples per second", False),
 )
+# Joint plots show at least this much (rad, m or gripper units).
+LEAST_RANGE = 0.1
 SMOOTHED = ("loss", "grad_norm", "samples_per_s")
 
 
@@ -188,7 +190,7 @@ def _training_tile(training: Training) -> dict[str, str]:
     return {"name": "training steps", "figure": f"{training.steps[-1]:,.0f}", "detail": detail}
 
 
-def curves(training: Training) -> list[dict[str, str]]:
+def curves(training: Training) -> list[dict[str, Any]]:
     """A chart for each column that was logged, noisy ones with their running mean."""
     charts = []
     for name, label, log in CURVES:
@@ -203,7 +205,7 @@ def curves(training: Training) -> list[dict[str, str]]:
         else:
             lines = [Series(label, training.steps, values)]
         chart = line_chart(lines, x_label="step", title=f"{label} over the steps", log=log)
-        charts.append({"name": label, "svg": chart, "mean": str(len(lines) > 1)})
+        charts.append({"name": label, "svg": chart, "smoothed": len(lines) > 1})
     return charts
 
 
@@ -228,7 +230,7 @@ def joint_chart(joint: JointTrace) -> dict[str, Any]:
         Series("clamped", times, values, css="bad", kind="dots"),
     ]
     title = f"{joint.name}: command and state"
-    chart = line_chart(series, x_label="s", title=title, width=340, height=150)
+    chart = line_chart(series, x_label="s", title=title, least=LEAST_RANGE, width=340, height=150)
     return {"name": joint.name, "unit": joint.unit, "svg": chart, "clamps": len(times)}
 
 

@@ -32,11 +32,19 @@ class Axis:
         return min(1.0, max(0.0, share))
 
 
-def axis(values: Iterable[float], *, log: bool = False, count: int = 5) -> Axis:
+def axis(
+    values: Iterable[float],
+    *,
+    log: bool = False,
+    count: int = 5,
+    tight: bool = False,
+    least: float = 0.0,
+) -> Axis:
     """An axis that holds all finite values, with about ``count`` round ticks.
 
     A log axis needs positive values; without any (or none that are finite) the axis is linear
-    from 0 to 1.
+    from 0 to 1. A ``tight`` one ends at the values, not at the ticks around them. A linear one
+    shows at least a range of ``least``, so that a flat line does not look like a mountain range.
     """
     finite = [v for v in values if math.isfinite(v) and (v > 0 or not log)]
     if not finite:
@@ -44,11 +52,17 @@ def axis(values: Iterable[float], *, log: bool = False, count: int = 5) -> Axis:
     low, high = min(finite), max(finite)
     if log:
         return _log_axis(low, high)
+    if high - low < least:
+        middle = (low + high) / 2
+        low, high = middle - least / 2, middle + least / 2
     if low == high:
         low, high = (low - abs(low) * 0.1, high + abs(high) * 0.1) if low else (-1.0, 1.0)
     step = round_step((high - low) / max(1, count - 1))
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     ticks = tuple(step * n for n in range(first, last + 1))
+    if tight:
+        slack = 1e-9 * step
+        return Axis(low, high, tuple(t for t in ticks if low - slack <= t <= high + slack))
     return Axis(ticks[0], ticks[-1], ticks)
 
 

@@ -53,12 +53,16 @@ def line_chart(
     x_label: str,
     title: str,
     log: bool = False,
+    least: float = 0.0,
     width: int = 520,
     height: int = 210,
 ) -> str:
-    """Lines and dots over common axes; the title is what a screen reader says."""
-    x_axis = axis([x for s in series for x in s.xs], count=6)
-    y_axis = axis([y for s in series for y in s.ys], log=log, count=5)
+    """Lines and dots over common axes; the title is what a screen reader says.
+
+    The y axis is by decades if ``log``, and shows at least a range of ``least``.
+    """
+    x_axis = axis([x for s in series for x in s.xs], count=6, tight=True)
+    y_axis = axis([y for s in series for y in s.ys], log=log, count=5, least=least)
     inner = _Inner(x_axis, y_axis, width, height)
     body = [_frame(inner, x_label)]
     body += [_draw(inner, s) for s in series]

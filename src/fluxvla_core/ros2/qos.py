@@ -16,7 +16,7 @@ def reliability(offers: Iterable[Any]) -> str:
     is matched with any; and best effort loses pictures that a reliable one would have repaired.
 
     Args:
-        offers: what ``Node.get_publishers_info_by_topic`` gives; none yet counts as best effort.
+        offers: what ``Node.get_publishers_info_by_topic`` gives.
     """
     kinds = [offer.qos_profile.reliability.name for offer in offers]
     return RELIABLE if kinds and all(kind == "RELIABLE" for kind in kinds) else BEST_EFFORT

@@ -81,6 +81,8 @@ class Startup:
     def _problem(self, hurry: bool) -> FluxError | None:
         """What is still wrong; ``hurry`` leaves out what only makes the message better."""
         quiet = [s for spec in self._specs if not (s := self._stream(spec)).newest()]
+        for stream in quiet:
+            stream.refresh()
         if quiet:
             return NotReady("waiting") if hurry else self._why(quiet)
         deaf = [t for t in self._exclusive if not self._node.count_subscribers(t)]

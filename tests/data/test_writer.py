@@ -230,6 +230,14 @@ def test_nothing_is_written_over(shared, tmp_path, spec):
     LeRobotWriter(tmp_path / "empty", 10, spec())
 
 
+def test_a_place_that_cannot_be_written_to(tmp_path, spec):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError) as caught:
+        LeRobotWriter(tmp_path / "file" / "dataset", 10, spec())
+    assert f"{tmp_path / 'file'}: no dataset can be written here" in str(caught.value)
+    assert "there is no permission to write, or a file is where a folder" in str(caught.value)
+
+
 def test_frames_without_an_episode_and_episodes_without_frames(tmp_path, spec):
     writer = LeRobotWriter(tmp_path / "d", 10, spec())
     with pytest.raises(DataError, match="save_episode: no frame was added since the last episode"):

@@ -13,7 +13,13 @@ from fluxvla_core.data.assemble import Episode, Recording, assemble
 from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.encode import CODECS, Clip
 from fluxvla_core.data.metadata import Metadata, read_metadata, read_table
-from fluxvla_core.data.writer import check_absent, publish, staging_of
+from fluxvla_core.data.writer import (
+    check_absent,
+    explain_disk,
+    make_staging,
+    publish,
+    staging_of,
+)
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import check_match
 
@@ -29,6 +35,7 @@ def merge_datasets(roots: Sequence[str | Path], out: str | Path) -> Path:
         DataError: a source is damaged, was written by another program, or differs in fps, codec
             or cameras; a key occurs twice; ``out`` exists.
         SpecMismatch: the sources were recorded with different robots.
+        RunFailed: the disk is full.
     """
     target = Path(out)
     check_absent(target)
@@ -46,10 +53,13 @@ def merge_datasets(roots: Sequence[str | Path], out: str | Path) -> Path:
             cause="another merge or recording is under way, or was interrupted",
             next="delete that folder if nothing is writing there",
         )
-    staging.mkdir(parents=True)
+    make_staging(staging)
     try:
         assemble(episodes, staging, recording)
         publish(staging, target)
+    except OSError as error:
+        safe = "the datasets that were to be merged are as they were"
+        raise explain_disk(error, target, safe, "make room and merge again") from error
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return target

@@ -76,7 +76,7 @@ class LeRobotWriter:
         self._saved: list[Path] = []
         if self._staging.exists():
             self._take_over(recover)
-        self._staging.mkdir(parents=True, exist_ok=True)
+        make_staging(self._staging)
         self._draft = self._new_draft()
 
     @property
@@ -209,18 +209,39 @@ class LeRobotWriter:
         return replace(self._recording, embodiment=replace(spec, cameras=cameras))
 
     def _disk(self, error: OSError) -> Exception:
-        if error.errno != errno.ENOSPC:
-            return error
-        return RunFailed(
-            f"{self.root}: no space left on the disk",
-            cause=f"{len(self._saved)} saved episodes are safe in {self._staging}",
-            next="make room, then LeRobotWriter(..., recover=True).finalize()",
+        return explain_disk(
+            error,
+            self.root,
+            f"{len(self._saved)} saved episodes are safe in {self._staging}",
+            "make room, then LeRobotWriter(..., recover=True).finalize()",
         )
 
 
 def staging_of(root: Path) -> Path:
     """Where a dataset is while it is written."""
     return root.with_name(f".{root.name}.writing")
+
+
+def make_staging(staging: Path) -> None:
+    """Make the folder that a dataset is written in.
+
+    Raises:
+        DataError: it cannot be made.
+    """
+    try:
+        staging.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{staging.parent}: no dataset can be written here ({error.strerror})",
+            cause="there is no permission to write, or a file is where a folder should be",
+        ) from error
+
+
+def explain_disk(error: OSError, root: Path, safe: str, next: str) -> Exception:
+    """What to raise for ``error``: RunFailed when the disk is full, else ``error`` itself."""
+    if error.errno != errno.ENOSPC:
+        return error
+    return RunFailed(f"{root}: no space left on the disk", cause=safe, next=next)
 
 
 def check_absent(root: Path) -> None:

@@ -123,6 +123,24 @@ def test_changing_a_sample_changes_nothing_else(shared):
         np.testing.assert_array_equal(after[key], value)
 
 
+@pytest.mark.parametrize("cache", [True, False])
+def test_the_cache_cannot_be_written_to(shared, cache):
+    sample = load(shared, cache_frames=cache)[3]
+    before = sample["images"][0].copy()
+    if cache:
+        with pytest.raises(ValueError, match="read-only"):
+            sample["images"][0][...] = 0
+    resized = load(shared, [{"type": "ResizeImages", "height": 8, "width": 8}], cache_frames=cache)
+    assert resized[3]["images"].shape == (6, 8, 8)
+    np.testing.assert_array_equal(load(shared, cache_frames=cache)[3]["images"][0], before)
+
+
+def test_without_cameras_there_are_no_pictures(shared):
+    sample = load(shared, img_keys=[])[3]
+    assert not {"images", "img_masks"} & set(sample)
+    assert sample["states"].shape == (3,)
+
+
 def test_cached_frames_are_the_decoded_ones(shared):
     shown = []
 

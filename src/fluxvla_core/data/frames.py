@@ -108,6 +108,7 @@ class Frames:
             if count % 200 == 0:
                 reporter.progress("decode frames", done + count, total)
         reporter.progress("decode frames", done + len(rows), total)
+        out.flags.writeable = False  # samples are views of it
         return out
 
 

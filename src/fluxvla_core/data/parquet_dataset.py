@@ -33,14 +33,16 @@ class ParquetDataset:
     A sample begins as ``images`` (a list of ``(3, H, W)`` uint8, one a camera), ``img_masks``
     ``(N,)`` bool, ``states`` ``(D,)`` float32, ``actions`` ``(T, D)`` float32, ``action_masks``
     ``(T,)`` float32 (0 beyond the episode's end, where the last action is repeated),
-    ``task_description``, ``timestamp`` (seconds in the episode), ``sample_ids`` int64, ``stats``
-    and ``info``, and ends as the transforms leave it; pictures that are still a list are stacked
-    to ``(3N, H, W)``. What transforms draw follows from (``seed``, epoch, index) alone.
+    ``task_description``, ``timestamp`` (seconds in the episode), ``sample_ids`` int64, ``info``
+    and ``stats``, and ends as the transforms leave it, without ``stats``; pictures that are still
+    a list are stacked to ``(3N, H, W)`` if they can be. What transforms draw follows from
+    (``seed``, epoch, index) alone.
 
     Args:
         data_root_path: one dataset's folder, or several, one after the other.
         transforms: tables of ``fluxvla.transforms``, or callables.
-        img_keys: cameras, by feature (``observation.images.top``) or short name (``top``).
+        img_keys: cameras, by feature (``observation.images.top``) or short name (``top``);
+            with none, samples have no pictures.
         action_window_size: T.
         action_key, state_key: features; ``action_key`` may be the state, see
             ``window_start_idx``.
@@ -187,8 +189,6 @@ class ParquetDataset:
         first, end = row + self.window_start_idx, int(recorded.end[row])
         actions, masks = window(recorded.actions, first, end, self.action_window_size)
         sample: Sample = {
-            "images": images,
-            "img_masks": np.ones(len(images), np.bool_),
             "states": recorded.states[row].copy(),
             "actions": actions,
             "action_masks": masks,
@@ -202,12 +202,17 @@ class ParquetDataset:
                 "frame_index": row - int(recorded.start[row]),
             },
         }
+        if images:
+            sample["images"] = images
+            sample["img_masks"] = np.ones(len(images), np.bool_)
         if self.embodiment_id is not None:
             sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
         return sample
 
     def _finish(self, sample: Sample, key: SampleKey) -> Sample:
         sample = self.pipeline(sample, sample_rng(self.seed, key.epoch, key.index))
+        # The same for every sample, and with one row a step too much to send from workers.
+        sample.pop("stats", None)
         images = sample.get("images")
         if isinstance(images, list) and len({image.shape for image in images}) == 1:
             sample["images"] = np.concatenate(split(images))

@@ -1,0 +1,1 @@
+"""Tokenizers, and where pretrained files are found."""

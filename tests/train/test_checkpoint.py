@@ -64,7 +64,9 @@ def test_no_embodiment_is_none_and_no_file_is_an_error(tmp_path):
 def test_json_that_is_no_object_is_named(tmp_path, text):
     path = write(tmp_path, 1)
     (path / "policy.json").write_text(text)
-    with pytest.raises(CheckpointError, match=r"policy\.json (holds no JSON object|cannot be read)"):
+    with pytest.raises(
+        CheckpointError, match=r"policy\.json (holds no JSON object|cannot be read)"
+    ):
         Checkpoint.open(path).policy()
 
 

@@ -112,8 +112,8 @@ def test_scalars_that_are_no_tensors_are_kept():
 def test_another_optimizer_or_other_groups_are_refused():
     net = model()
     tensors, described = named_state(net, trained(net))
+    sgd = torch.optim.SGD(net.parameters(), lr=0.1)
     with pytest.raises(CheckpointError, match=r"\(AdamW, groups of \[2, 4\] parameters\) is not"):
-        sgd = torch.optim.SGD(net.parameters(), lr=0.1)
         torch_state(net, sgd, tensors, described, "here")
     net[2].requires_grad_(False)
     with pytest.raises(CheckpointError, match=r"\(AdamW, \[1, 3\]\)"):

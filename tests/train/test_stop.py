@@ -38,9 +38,20 @@ def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch):
 
 def test_a_second_interrupt_ends_at_once(monkeypatch):
     monkeypatch.setattr(stop, "_SECOND_S", -1.0)
-    with StopRequest(ONE), pytest.raises(KeyboardInterrupt):
+    with StopRequest(ONE):
         os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_forked_data_worker_ignores_what_is_meant_for_its_parent():
+    with StopRequest(ONE) as request:
+        pid = os.fork()
+        if pid == 0:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os._exit(request.wanted(1))
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+        assert request.wanted(1) == 0
 
 
 def test_other_threads_set_no_handlers():

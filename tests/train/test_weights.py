@@ -104,7 +104,9 @@ def test_weights_of_another_model_are_refused():
     model = Model()
     tensors = {**model_tensors(model), "head.weight": torch.zeros(9, 4)}
     del tensors["scale"]
-    with pytest.raises(CheckpointError, match=r"1 missing in the checkpoint: scale\n.*head\.weight"):
+    with pytest.raises(
+        CheckpointError, match=r"1 missing in the checkpoint: scale\n.*head\.weight"
+    ):
         check_model_tensors(model, tensors, left_out(model), {}, "here")
 
 

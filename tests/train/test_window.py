@@ -97,4 +97,8 @@ def test_losses_are_of_all_ranks_and_every_rank_hears_of_another_ones_nan(tmp_pa
     """O1 of the field notes: the logged loss was the first rank's."""
     assert run_ranks(2, two_ranks, tmp_path) == [0, 0]
     said = [(tmp_path / str(rank)).read_text() for rank in range(2)]
-    assert said[0] == said[1] == "1.5\nthe loss is nan at step 2\n    rank 1: loss nan on samples [7, 9]"
+    assert (
+        said[0]
+        == said[1]
+        == "1.5\nthe loss is nan at step 2\n    rank 1: loss nan on samples [7, 9]"
+    )

@@ -72,9 +72,7 @@ def test_a_kill_at_any_file_operation_keeps_the_checkpoint_before(tmp_path):
         assert newest.step == (20 if number == total else 10), number
         Checkpoint.open(before).verify()
         clear_leftovers(work)
-        assert {p.name for p in (work / "checkpoints").iterdir()} == {
-            p.name for p in folders(work)
-        }
+        assert {p.name for p in (work / "checkpoints").iterdir()} == {p.name for p in folders(work)}
         write(work, 30).joinpath("manifest.json").read_bytes()
         assert latest(work).step == 30
 
@@ -125,18 +123,21 @@ def test_a_limit_on_file_sizes_is_a_full_disk(tmp_path):
     latest(tmp_path).verify()
 
 
+def write_trainer(tmp_path, value):
+    with CheckpointWriter(tmp_path, 1, 0) as writer:
+        writer.write_bytes("model.safetensors", b"x")
+        writer.write_json("trainer.json", value)
+
+
 def test_an_exception_in_between_leaves_nothing(tmp_path):
     with pytest.raises(RunFailed, match=r"trainer\.json of the checkpoint cannot be written"):
-        with CheckpointWriter(tmp_path, 1, 0) as writer:
-            writer.write_bytes("model.safetensors", b"x")
-            writer.write_json("trainer.json", {"state": object()})
+        write_trainer(tmp_path, {"state": object()})
     assert list((tmp_path / "checkpoints").iterdir()) == []
 
 
 def test_nan_is_no_json(tmp_path):
     with pytest.raises(RunFailed, match="cannot be written as JSON: Out of range float"):
-        with CheckpointWriter(tmp_path, 1, 0) as writer:
-            writer.write_json("trainer.json", {"loss": float("nan")})
+        write_trainer(tmp_path, {"loss": float("nan")})
 
 
 def test_a_step_that_is_there_already_is_kept_beside(tmp_path):

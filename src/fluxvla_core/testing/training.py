@@ -1,8 +1,6 @@
 """A model, a dataset and a launcher small enough to prove a training strategy with.
 
-A new train runner is right when ``run_ranks(2, train, settings)`` killed at any moment and run
-again with ``resume="auto"`` leaves the folder of a run that was never killed: ``differences`` of
-the two must be empty. The runners of FluxVLA are tested with exactly this.
+``testing.train_runner`` has the proofs; FluxVLA's own runners are tested with them.
 """
 
 from __future__ import annotations
@@ -27,6 +25,7 @@ from fluxvla_core.data.rng import sample_rng
 from fluxvla_core.metrics.vla_metric import WALL_CLOCK
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.train import stop
 from fluxvla_core.train.base_runner import BaseTrainRunner
 from fluxvla_core.train.checkpoint import folders
 from fluxvla_core.train.disk import Disk
@@ -53,13 +52,21 @@ class Block(nn.Module):
 
 @VLAS.register_module()
 class TinyVLA(nn.Module):
-    """A frozen encoder, two blocks, a head, and a buffer that training changes."""
+    """A frozen encoder, two blocks, a head, and a buffer that training changes.
 
-    def __init__(self, width: int = 8, dropout: float = 0.1, bad_sample: int = -1) -> None:
+    Args:
+        bad_sample: id of a sample whose loss is NaN; -1 for none.
+        spare: have a layer that the forward pass does not use.
+    """
+
+    def __init__(
+        self, width: int = 8, dropout: float = 0.1, bad_sample: int = -1, spare: bool = False
+    ) -> None:
         super().__init__()
         self.encoder = nn.Linear(STATES, width).requires_grad_(False)
         self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(2))
         self.head = nn.Linear(width, HORIZON * ACTIONS)
+        self.spare = nn.Linear(1, 1) if spare else None
         self.bad_sample = bad_sample
         self.batches: Tensor
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
@@ -152,8 +159,9 @@ def train(settings: Mapping[str, Any]) -> Any:
 
     Args:
         settings: ``work_dir`` and ``config``; ``resume`` (None), ``length`` of the dataset (37),
-            ``kill_batch`` (rank, n): SIGKILL when the rank collates its n-th batch;
-            ``kill_write`` n: SIGKILL before the n-th file operation of checkpoints.
+            ``signal`` (rank, n, number): the rank sends itself signal ``number`` when it collates
+            its n-th batch; ``kill_write`` n: SIGKILL before the n-th file operation of checkpoints;
+            ``notice_s`` (0.5): seconds within which ranks hear of each other's signals.
     """
     config = settings["config"]
     context = RunContext(
@@ -164,10 +172,11 @@ def train(settings: Mapping[str, Any]) -> Any:
         reporter=Notes(Path(settings["work_dir"])),
     )
     table = dict(config["runner"])
-    if settings.get("kill_batch"):
-        rank, number = settings["kill_batch"]
+    if settings.get("signal"):
+        rank, batch, number = settings["signal"]
         if rank == int(os.environ.get("RANK", "0")):
-            table["collator"] = KillingCollator(number)
+            table["collator"] = SignallingCollator(batch, number)
+    stop.NOTICE_S = settings.get("notice_s", stop.NOTICE_S)
     if settings.get("kill_write"):
         kill_at_operation(settings["kill_write"])
     runner = build_runner_from_cfg(table, context)
@@ -177,17 +186,25 @@ def train(settings: Mapping[str, Any]) -> Any:
     return runner
 
 
-class KillingCollator(DictCollator):
-    """Ends this process by SIGKILL instead of giving the ``number``-th batch."""
+def train_all(*runs: Mapping[str, Any]) -> None:
+    """Several runs one after the other, in one process group."""
+    if "RANK" in os.environ:
+        torch.distributed.init_process_group("gloo")
+    for settings in runs:
+        train(settings)
 
-    def __init__(self, number: int) -> None:
+
+class SignallingCollator(DictCollator):
+    """Sends this process signal ``number`` on the way to the ``batch``-th batch."""
+
+    def __init__(self, batch: int, number: int) -> None:
         super().__init__(KEYS)
-        self.left = number
+        self.left, self.number = batch, number
 
     def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         self.left -= 1
-        if self.left <= 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+        if self.left == 0:
+            os.kill(os.getpid(), self.number)
         return super().__call__(samples)
 
 

@@ -368,6 +368,8 @@ class BaseTrainRunner:
                 raise
             raise lost from error
         finally:
+            if self._loop is not None:
+                self._loop.close()
             if self.world.first:
                 self.metric.finalize()
             self.hooks.call("run_finished", outcome=outcome)

@@ -63,7 +63,7 @@ class StepLoop:
 
     def __init__(self, run: Strategy, batches: Iterator[Any], stop: StopRequest) -> None:
         self._run = run
-        self._batches = batches
+        self._source = self._batches = batches
         self._stop = stop
         self._window = Window(run.world)
 
@@ -90,6 +90,13 @@ class StepLoop:
             if save:
                 self.save()
         return stopped
+
+    def close(self) -> None:
+        """End the loader's workers now; left to the garbage collector it takes them seconds."""
+        self._batches = iter(())
+        close = getattr(self._source, "close", None)
+        if close is not None:
+            close()
 
     def _step(self, step: int) -> None:
         run = self._run

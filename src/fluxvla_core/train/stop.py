@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -11,7 +12,8 @@ from typing import Any
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.train.distributed import World, agree
 
-_NOTICE_S = 0.5
+NOTICE_S = 0.5
+"""Seconds within which ranks hear of each other's signals, if steps are shorter."""
 _SECOND_S = 1.0
 
 
@@ -25,6 +27,7 @@ class StopRequest:
 
     def __init__(self, world: World) -> None:
         self._world = world
+        self._process = os.getpid()
         self._signal = 0
         self._since = 0.0
         self._previous: dict[int, Any] = {}
@@ -48,6 +51,10 @@ class StopRequest:
         self._previous = {}
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._process:
+            # A data worker, forked from here: it ends when this process is done with it. A
+            # signal to the whole group must not take the data away from the last step.
+            return
         if number == signal.SIGINT and self._signal and time.monotonic() - self._since > _SECOND_S:
             raise KeyboardInterrupt
         if not self._signal:
@@ -55,7 +62,7 @@ class StopRequest:
 
     def pace(self, step_time: float) -> None:
         """Choose how often ranks compare notes; ``step_time`` (s) must be equal on all ranks."""
-        self._every = max(1, int(_NOTICE_S / step_time)) if step_time > 0 else 1
+        self._every = max(1, int(NOTICE_S / step_time)) if step_time > 0 else 1
 
     def wanted(self, step: int) -> int:
         """The signal that some rank got, or 0; every rank gets the same answer."""

@@ -1,0 +1,503 @@
+"""Whole runs of the base class in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, UsageError
+from fluxvla_core.plugins.registry import HOOKS
+from fluxvla_core.testing.training import KEYS, TinyDataset, differences, tiny_config
+from fluxvla_core.train import disk
+from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
+
+
+class Said(SilentReporter):
+    def __init__(self):
+        self.lines, self.steps, self.artifacts = [], [], []
+
+    def info(self, text):
+        self.lines.append(text)
+
+    def warn(self, text):
+        self.lines.append(f"warning: {text}")
+
+    def progress(self, name, done, total, **fields):
+        self.steps.append((name, done, total, fields))
+
+    def artifact(self, kind, path):
+        self.artifacts.append((kind, path.name))
+
+
+def make(work_dir, resume=None, batch=4, model=None, reporter=None, hooks=None, **settings):
+    table = {"type": "OneProcessRunner", **settings}
+    if "max_epochs" not in settings:
+        table.setdefault("max_steps", 6)
+    config = tiny_config(table, batch, **(model or {}))
+    if hooks:
+        config["hooks"] = hooks
+    context = RunContext(
+        config=config,
+        section="runner",
+        work_dir=Path(work_dir),
+        resume=resume,
+        reporter=reporter or Said(),
+    )
+    return build_runner_from_cfg(config["runner"], context)
+
+
+def run(work_dir, resume=None, length=37, **settings):
+    runner = make(work_dir, resume, **settings)
+    runner.run_setup(length)
+    runner.run(TinyDataset(length))
+    return runner
+
+
+def test_a_run_ends_with_a_checkpoint_that_is_enough_by_itself(tmp_path):
+    """T4 of the field notes: the final state was not saved."""
+    said = Said()
+    run(tmp_path, reporter=said, ema_decay=0.9)
+    found = latest(tmp_path)
+    found.verify()
+    assert found.step == 6
+    assert set(found.manifest.files) == {
+        "model.safetensors",
+        "ema.safetensors",
+        "optimizer.safetensors",
+        "optimizer.json",
+        "trainer.json",
+        "rng/rank-00000.safetensors",
+        "config.resolved.json",
+        "environment.json",
+        "policy.json",
+        "embodiment.json",
+        "dataset_statistics.json",
+    }
+    assert found.policy() == {"action_rate_hz": 10.0, "horizon": 2}
+    assert found.embodiment() == TinyDataset.embodiment
+    assert found.statistics() == TinyDataset.statistics
+    assert found.config()["model"] == {"type": "TinyVLA"}
+    assert found.json("environment.json")["packages"]["torch"] == torch.__version__
+    assert not list(tmp_path.rglob("*.pt"))
+    assert said.artifacts == [("checkpoint", "step-000000006")]
+
+
+def test_progress_and_metrics_of_every_step(tmp_path):
+    said = Said()
+    run(tmp_path, reporter=said, log_iter_interval=4, warmup_ratio=0.5)
+    assert [(name, done, total) for name, done, total, _ in said.steps] == [
+        ("train", 1, 6),
+        ("train", 4, 6),
+        ("train", 6, 6),
+    ]
+    assert set(said.steps[0][3]) == {
+        "epoch",
+        "loss",
+        "grad_norm",
+        "lr",
+        "step_time",
+        "samples_per_s",
+        "data_wait",
+    }
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4, 5, 6]
+    rates = pytest.approx([0.01 / 3, 0.02 / 3, 0.01, 0.01, 0.01, 0.01])
+    assert [row["lr"] for row in rows] == rates
+    assert rows[1]["epoch"] == pytest.approx(4 / 37)
+
+
+def test_training_learns(tmp_path):
+    run(tmp_path, max_steps=60, model={"dropout": 0.0, "width": 32}, length=8, batch=8)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["loss"] < 0.3 * rows[0]["loss"]
+
+
+def test_epochs_save_by_epoch_and_at_the_end(tmp_path):
+    run(tmp_path, max_epochs=3, save_epoch_interval=2, max_keep_ckpts=0)
+    assert [(p.name, Checkpoint.open(p).epoch) for p in folders(tmp_path)] == [
+        ("step-000000020", 2),
+        ("step-000000030", 3),
+    ]
+
+
+def test_epochs_can_save_by_steps_too_and_only_the_newest_are_kept(tmp_path):
+    run(tmp_path, max_epochs=2, save_iter_interval=7, max_keep_ckpts=3)
+    assert [p.name for p in folders(tmp_path)] == [
+        "step-000000010",
+        "step-000000014",
+        "step-000000020",
+    ]
+
+
+def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
+    run(tmp_path)
+    with pytest.raises(UsageError) as caught:
+        make(tmp_path).run_setup(37)
+    assert str(caught.value) == (
+        f"{tmp_path} already has checkpoints, up to step-000000006\n"
+        "  next: go on from there with --resume auto, or name another --work-dir"
+    )
+    run(tmp_path / "other")
+    with pytest.raises(UsageError, match="already has checkpoints"):
+        make(tmp_path, resume=str(tmp_path / "other/checkpoints/step-000000006")).run_setup(37)
+
+
+def test_auto_starts_afresh_and_says_so(tmp_path):
+    said = Said()
+    run(tmp_path, resume="auto", reporter=said)
+    assert said.lines == [f"no checkpoint in {tmp_path} yet: training starts afresh"]
+
+
+def test_a_path_must_exist(tmp_path):
+    with pytest.raises(CheckpointError, match="there is no checkpoint at"):
+        make(tmp_path, resume=str(tmp_path / "checkpoints/step-000000003")).run_setup(37)
+
+
+def test_a_finished_run_has_nothing_left_to_do(tmp_path):
+    run(tmp_path)
+    before = latest(tmp_path).manifest
+    run(tmp_path, resume="auto")
+    assert latest(tmp_path).manifest == before
+    assert len(folders(tmp_path)) == 1
+
+
+def test_more_steps_go_on_from_the_end_as_if_they_had_been_asked_for(tmp_path):
+    run(tmp_path / "whole", max_steps=9, save_iter_interval=6)
+    run(tmp_path / "twice", save_iter_interval=6)
+    run(tmp_path / "twice", resume="auto", max_steps=9, save_iter_interval=6)
+    (found,) = (d for d in [differences(tmp_path / "whole", tmp_path / "twice")])
+    # The configs differ in max_steps, and nothing else does.
+    assert set(found) == {
+        "step-000000006/config.resolved.json",
+        "step-000000006/manifest.json",
+    }
+
+
+def test_resume_from_in_the_config_and_the_command_line_before_it(tmp_path):
+    run(tmp_path, save_iter_interval=2, max_keep_ckpts=0)
+    said = Said()
+    here = f"{tmp_path}/checkpoints/step-00000000"
+    make(tmp_path, reporter=said, resume_from=f"{here}4").run_setup(37)
+    assert said.lines == [
+        "warning: a later checkpoint is set aside as step-000000006.set-aside",
+        f"resuming from {here}4 (step 4)",
+    ]
+    said = Said()
+    make(tmp_path, f"{here}2", reporter=said, resume_from=f"{here}4").run_setup(37)
+    assert said.lines[-1] == f"resuming from {here}2 (step 2)"
+
+
+def test_a_damaged_newest_one_is_named_and_passed_over_by_auto_and_refused_by_path(tmp_path):
+    run(tmp_path / "whole", save_iter_interval=2, max_keep_ckpts=0)
+    run(tmp_path / "hurt", save_iter_interval=2, max_keep_ckpts=0)
+    newest = folders(tmp_path / "hurt")[-1]
+    data = bytearray((newest / "model.safetensors").read_bytes())
+    data[-1] ^= 1
+    (newest / "model.safetensors").write_bytes(data)
+    with pytest.raises(CheckpointError) as caught:
+        make(tmp_path / "hurt", resume=str(newest)).run_setup(37)
+    assert "model.safetensors is damaged" in str(caught.value)
+    assert f"the one before it is whole: {folders(tmp_path / 'hurt')[-2]}" in str(caught.value)
+    said = Said()
+    run(tmp_path / "hurt", resume="auto", reporter=said, save_iter_interval=2, max_keep_ckpts=0)
+    assert said.lines[0].startswith(
+        f"warning: not resuming from a damaged checkpoint: {newest}: model.safetensors is damaged"
+    )
+    assert differences(tmp_path / "whole", tmp_path / "hurt") == []
+
+
+def test_when_all_are_damaged_nothing_starts_afresh(tmp_path):
+    run(tmp_path)
+    (folders(tmp_path)[0] / "policy.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"policy\.json is damaged"):
+        make(tmp_path, resume="auto").run_setup(37)
+
+
+def resume_error(tmp_path, length=37, **settings):
+    run(tmp_path, max_steps=2)
+    with pytest.raises(CheckpointError) as caught:
+        run(tmp_path, resume="auto", length=length, **settings)
+    assert caught.value.exit_code == 2
+    return str(caught.value)
+
+
+def test_another_models_checkpoint_is_refused(tmp_path):
+    """T3, T8 of the field notes: wrong weights and optimizer states resumed with a warning."""
+    message = resume_error(tmp_path, model={"width": 16})
+    assert "the weights of the checkpoint are not this model's" in message
+    assert "of another size: blocks.0.linear.bias: (8,) in the checkpoint, (16,) here" in message
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seed": 7}, "the seed is 7, the checkpoint's run had 42"),
+        ({"length": 38}, "the number of samples in the dataset is 38, the checkpoint's run had 37"),
+        ({"ema_decay": 0.9}, "ema_decay is set, and the checkpoint's run kept no averaged"),
+    ],
+)
+def test_another_runs_checkpoint_is_refused(tmp_path, settings, message):
+    assert message in resume_error(tmp_path, **settings)
+
+
+def test_an_optimizer_that_is_not_taken_is_an_error(tmp_path, monkeypatch):
+    """T8 of the field notes: training went on with a fresh optimizer."""
+    run(tmp_path, max_steps=2)
+    runner = make(tmp_path, resume="auto")
+    monkeypatch.setattr(type(runner), "_load_optimizer_state", lambda self, state: False)
+    runner.run_setup(37)
+    with pytest.raises(CheckpointError, match="OneProcessRunner did not take the checkpoint's opt"):
+        runner.run(TinyDataset())
+
+
+def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):
+    said = Said()
+    run(tmp_path, max_steps=2)
+    runner = run(tmp_path, resume="auto", reporter=said, batch=8, max_steps=3)
+    assert said.lines[-1] == (
+        "warning: steps use 8 samples now and 4 in the checkpoint's run: the order of samples "
+        "stays, the result will differ"
+    )
+    assert runner.progress.cursor.samples == 2 * 4 + 8
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_the_run_goes_on_exactly(tmp_path, number):
+    """O3 of the field notes: no SIGTERM handling."""
+
+    class Interrupting(TinyDataset):
+        def get_sample(self, index, epoch):
+            self.asked = getattr(self, "asked", 0) + 1
+            if self.asked == 4 * 3:
+                os.kill(os.getpid(), number)
+            return super().get_sample(index, epoch)
+
+    run(tmp_path / "whole", max_keep_ckpts=0)
+    runner = make(tmp_path / "cut", max_keep_ckpts=0)
+    runner.run_setup(37)
+    with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else RunFailed) as caught:
+        runner.run(Interrupting())
+    assert f"step 3 in {tmp_path}/cut" in str(caught.value)
+    assert [p.name for p in folders(tmp_path / "cut")] == ["step-000000003"]
+    run(tmp_path / "cut", resume="auto", max_keep_ckpts=0)
+    assert [d for d in differences(tmp_path / "whole", tmp_path / "cut") if "step" in d] == [
+        "checkpoints: ['step-000000006'] / ['step-000000003', 'step-000000006']",
+        *[d for d in differences(tmp_path / "whole", tmp_path / "cut") if "step-" in d][1:],
+    ]
+    pair = [latest(tmp_path / d).manifest.files for d in ("whole", "cut")]
+    assert pair[0] == pair[1]
+    assert "metrics.jsonl" not in differences(tmp_path / "whole", tmp_path / "cut")
+
+
+def test_a_nan_names_its_sample_and_spoils_no_checkpoint(tmp_path):
+    runner = make(tmp_path, model={"bad_sample": 11}, max_epochs=1, save_iter_interval=2)
+    runner.run_setup(37)
+    with pytest.raises(RunFailed) as caught:
+        runner.run(TinyDataset())
+    assert "the loss is nan at step" in str(caught.value)
+    assert "11" in str(caught.value).splitlines()[1]
+    for folder in folders(tmp_path):
+        weights = Checkpoint.open(folder).tensors("model.safetensors")
+        assert all(torch.isfinite(t).all() for t in weights.values())
+
+
+def test_a_full_disk_ends_the_run_and_keeps_the_checkpoints_before(tmp_path, monkeypatch):
+    write, left = disk.Disk.write, [100]
+
+    def filling(self, file, data):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(28, "No space left on device")
+        write(self, file, data)
+
+    monkeypatch.setattr(disk.Disk, "write", filling)
+    runner = make(tmp_path, save_iter_interval=1, max_keep_ckpts=0)
+    runner.run_setup(37)
+    with pytest.raises(RunFailed, match="the disk is full: the checkpoint of step") as caught:
+        runner.run(TinyDataset())
+    assert caught.value.exit_code == 1
+    kept = folders(tmp_path)
+    assert kept
+    assert [p for p in (tmp_path / "checkpoints").iterdir() if p not in kept] == []
+    monkeypatch.undo()
+    said = Said()
+    run(tmp_path, resume="auto", reporter=said, save_iter_interval=1, max_keep_ckpts=0)
+    assert f"resuming from {kept[-1]}" in said.lines[-1]
+    assert latest(tmp_path).step == 6
+
+
+def test_checkpoints_that_cannot_be_removed_are_only_warned_of(tmp_path, monkeypatch):
+    def refuse(self, path):
+        raise OSError(13, "Permission denied")
+
+    monkeypatch.setattr(disk.Disk, "remove_folder", refuse)
+    said = Said()
+    run(tmp_path, save_iter_interval=2, max_keep_ckpts=1, reporter=said)
+    assert "warning: old checkpoints could not be removed: [Errno 13] Permission" in said.lines[0]
+    assert latest(tmp_path).step == 6
+
+
+def test_accumulation_equals_the_big_batch(tmp_path):
+    for name, batch, parts in (("big", 8, 1), ("split", 2, 4)):
+        run(
+            tmp_path / name,
+            batch=batch,
+            grad_accumulation_steps=parts,
+            model={"dropout": 0.0},
+            max_steps=12,
+        )
+    weights = [latest(tmp_path / d).tensors("model.safetensors") for d in ("big", "split")]
+    for name, tensor in weights[0].items():
+        if name != "batches":
+            assert torch.allclose(tensor, weights[1][name], atol=2e-5), name
+    rows = [
+        [json.loads(line)["loss"] for line in (tmp_path / d / "metrics.jsonl").open()]
+        for d in ("big", "split")
+    ]
+    assert rows[0] == pytest.approx(rows[1], rel=1e-4)
+
+
+def test_bf16_computes_over_fp32_weights(tmp_path):
+    """T6 of the field notes: weights themselves were bf16."""
+    plain = run(tmp_path / "a", max_steps=2)
+    mixed = run(tmp_path / "b", max_steps=2, enable_mixed_precision_training=True)
+    weights = latest(tmp_path / "b").tensors("model.safetensors")
+    assert {t.dtype for n, t in weights.items() if n != "batches"} == {torch.float32}
+    assert plain.progress.loss != mixed.progress.loss
+    assert plain.progress.loss == pytest.approx(mixed.progress.loss, rel=0.05)
+
+
+def test_recomputing_activations_changes_nothing(tmp_path):
+    run(tmp_path / "a")
+    run(tmp_path / "b", enable_gradient_checkpointing=True)
+    pair = [latest(tmp_path / d).manifest.files["optimizer.safetensors"] for d in "ab"]
+    assert pair[0] == pair[1]
+
+
+def test_no_clipping(tmp_path):
+    run(tmp_path, max_grad_norm=None)
+    assert "grad_norm" not in (tmp_path / "metrics.jsonl").read_text()
+
+
+def test_two_workers_change_nothing(tmp_path):
+    run(tmp_path / "a")
+    runner = make(tmp_path / "b")
+    object.__setattr__(runner.loader_options, "per_device_num_workers", 2)
+    runner.run_setup(37)
+    runner.run(TinyDataset())
+    pair = [latest(tmp_path / d).manifest.files["model.safetensors"] for d in "ab"]
+    assert pair[0] == pair[1]
+
+
+def test_the_seed_makes_the_run(tmp_path):
+    """T7 of the field notes: training was never seeded."""
+    found = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        run(tmp_path / name, seed=seed)
+        found.append(latest(tmp_path / name).manifest.files["model.safetensors"].sha256)
+    assert found[0] == found[1] != found[2]
+
+
+@HOOKS.register_module()
+class TrainLog:
+    calls: list = []  # noqa: RUF012 - read by the test
+
+    def run_started(self):
+        self.calls.append("started")
+
+    def before_step(self, step):
+        self.calls.append(f"before {step}")
+
+    def after_step(self, step, metrics):
+        self.calls.append(f"after {step} {sorted(metrics)[2]}")
+
+    def checkpoint_saved(self, path, step):
+        self.calls.append(f"saved {path.name} {step}")
+
+    def run_finished(self, outcome):
+        self.calls.append(outcome)
+
+
+def test_hooks_of_a_run(tmp_path):
+    run(tmp_path, max_steps=2, hooks=["TrainLog"])
+    assert TrainLog.calls == [
+        "started",
+        "before 1",
+        "after 1 grad_norm",
+        "before 2",
+        "after 2 grad_norm",
+        "saved step-000000002 2",
+        "ok",
+    ]
+
+
+def test_a_batch_key_that_the_model_does_not_take_is_refused_at_the_first_step(tmp_path):
+    class Extra(TinyDataset):
+        def get_sample(self, index, epoch):
+            sample = super().get_sample(index, epoch)
+            return {**sample, "action_mask": sample["noise"]}
+
+    collator = {"type": "DictCollator", "keys": [*KEYS, "action_mask"]}
+    runner = make(tmp_path, collator=collator)
+    runner.run_setup(37)
+    with pytest.raises(ConfigError, match=r"TinyVLA\.forward takes no 'action_mask'"):
+        runner.run(Extra())
+
+
+def test_processors_are_saved_with_the_checkpoint(tmp_path):
+    class Tokenizer:
+        def save_pretrained(self, folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "vocab.txt").write_text("a")
+
+    class WithPipeline(TinyDataset):
+        pipeline = Tokenizer()
+
+    run(tmp_path / "own", tokenizer=Tokenizer(), max_steps=1)
+    assert "processors/tokenizer/vocab.txt" in latest(tmp_path / "own").manifest.files
+    runner = make(tmp_path / "data", max_steps=1)
+    runner.run_setup(37)
+    runner.run(WithPipeline())
+    assert "processors/vocab.txt" in latest(tmp_path / "data").manifest.files
+
+
+def test_several_processes_need_a_strategy(tmp_path):
+    runner = make(tmp_path)
+    runner._prepare()
+    runner._world = type(runner.world)(0, 2, 0, torch.device("cpu"))
+    with pytest.raises(ConfigError) as caught:
+        runner._wrap_model(torch.nn.Linear(1, 1))
+    assert str(caught.value) == (
+        "OneProcessRunner trains on one process, and there are 2\n"
+        "  next: use DDPTrainRunner or FSDPTrainRunner, or override _wrap_model"
+    )
+
+
+def test_without_a_context_a_config_is_enough(tmp_path, monkeypatch):
+    """The specification constructs runners with keywords only."""
+    from fluxvla_core import BaseTrainRunner
+
+    monkeypatch.chdir(tmp_path)
+    config = tiny_config({})
+    runner = BaseTrainRunner(cfg=config, max_steps=2, **config["runner"])
+    runner.run_setup(37)
+    assert runner.run(TinyDataset()) == Path("work_dirs/run")
+    assert latest(tmp_path / "work_dirs/run").step == 2
+
+
+def test_what_only_exists_inside_a_run_says_so(tmp_path):
+    runner = make(tmp_path)
+    with pytest.raises(RuntimeError, match="the world is known from _build_vla on"):
+        _ = runner.world
+    with pytest.raises(RuntimeError, match=r"there is a loop only inside run\(\)"):
+        _ = runner.loop
+    runner.run_setup(37)
+    with pytest.raises(RuntimeError, match=r"a batch's arguments are known inside run\(\) only"):
+        runner._training_step({})

@@ -162,12 +162,21 @@ def test_action_filters_come_in_their_order_before_the_limits(bench):
 
 
 def test_a_filter_is_told_where_an_episode_begins(bench):
-    smooth = LowPass(0.5)
+    bench.run(action_filters=[LowPass(0.1, columns=[0])], max_publish_step=5)
 
-    bench.run(action_filters=[smooth], max_publish_step=5)
+    wanted = bench.trace()[1]["wanted"][0]
+    assert bench.arm.sent[0][0] == pytest.approx(0.1 * wanted)
 
-    assert bench.arm.sent[0][1] == 0.0
-    assert bench.arm.sent[0][2] == pytest.approx(0.5)
+
+def test_filters_are_built_from_tables_in_the_config(bench):
+    tables = [
+        {"type": "LowPass", "share": 0.5},
+        {"type": "SnapGripper", "columns": [2], "threshold": 1.1},
+    ]
+
+    bench.run(action_filters=tables)
+
+    assert bench.arm.sent[-1][2] == 0.0
 
 
 def test_snapping_closes_nearly_closed_grippers_only(bench):

@@ -1,0 +1,1 @@
+"""An example: a robot with a runner and an operator of its own."""

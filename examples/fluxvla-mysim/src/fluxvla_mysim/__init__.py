@@ -1,0 +1,1 @@
+"""An example: an evaluation in a simulation of one's own."""

@@ -1,0 +1,1 @@
+"""An example: a training strategy of one's own."""

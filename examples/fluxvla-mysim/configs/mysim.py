@@ -1,6 +1,6 @@
 """Evaluate the policy of fluxvla-myrobot in a simulation of one's own.
 
-    fluxvla run --config configs/mysim.py --section eval
+fluxvla run --config configs/mysim.py --section eval
 """
 
 _base_ = "../../fluxvla-myrobot/configs/myrobot.py"

@@ -1,7 +1,7 @@
 """The page's training section, on the demonstrations and the model of fluxvla-myrobot.
 
-    python -m fluxvla_myrobot.demos work_dirs/myrobot/dataset
-    fluxvla run --config configs/mytrain.py --section runner
+python -m fluxvla_myrobot.demos work_dirs/myrobot/dataset
+fluxvla run --config configs/mytrain.py --section runner
 """
 
 _base_ = "../../fluxvla-myrobot/configs/myrobot.py"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -64,6 +65,20 @@ def test_tied_weights_are_stored_once_and_come_back_under_both_names(tmp_path):
     assert set(found) == {"a.weight", "b.weight"}
     with safe_open(path, "pt") as file:
         assert json.loads(file.metadata()["aliases"]) == {"b.weight": "a.weight"}
+
+
+def test_reading_takes_no_memory_before_it_is_used(tmp_path):
+    """T11 of the field notes: every rank held the whole checkpoint in memory."""
+    path = saved(tmp_path, {str(i): torch.ones(1 << 20) for i in range(20)})
+    before = anonymous_kib()
+    found = read_tensors(path)
+    assert anonymous_kib() - before < 8_000  # of 80 MiB
+    assert {tensor.device.type for tensor in found.values()} == {"cpu"}
+
+
+def anonymous_kib():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
 
 
 def test_a_dtype_that_the_format_lacks_is_named(tmp_path):

@@ -160,6 +160,8 @@ def install_base(session: nox.Session, env: envs.Env, requirements: tuple[str, .
     session.log(f"installing torch {version} into {env.root.relative_to(ROOT)}")
     way = torch_build.install(env, version, project.CONSTRAINTS, session.log)
     session.log(f"torch came by way of: {way}")
+    if sys.version_info >= (3, 13):  # fluxvla-sim's pyproject.toml says why
+        env.pip_install("--no-deps", "gym-aloha", constraints=project.CONSTRAINTS)
     if requirements:
         session.log(f"installing {len(requirements)} tools and their dependencies")
         env.pip_install(*requirements, constraints=project.CONSTRAINTS)

@@ -122,7 +122,7 @@ def test_a_missing_gym_aloha_is_named_with_its_install_command(monkeypatch):
     monkeypatch.setattr(scene_module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RunFailed, match="not installed") as caught:
         scene_module.load_model()
-    assert "pip install gym-aloha" in str(caught.value)
+    assert "pip install --no-deps gym-aloha" in str(caught.value)
 
 
 def test_loading_the_model_leaves_gymnasium_alone():

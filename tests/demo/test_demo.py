@@ -92,8 +92,8 @@ def test_every_stage_in_its_order(programs: Programs, said: list[str]) -> None:
     assert "--config configs/aloha_sim_transfer.py --section runner" in lines[1]
     assert f"--set train_dataloader.dataset.data_root_path={programs.root}/dataset" in lines[1]
     assert "--set runner.max_steps=12" in lines[1]
-    assert "--set eval.baseline=true" in lines[2]
-    assert "--set eval.instruction_swap=true" in lines[2]
+    assert "--section eval" in lines[2]
+    assert "--set eval.episodes=1" in lines[2]
     assert "--task 1" in lines[3]
     assert "--task 2" in lines[4]
     told = "\n".join(said)

@@ -88,12 +88,7 @@ def evaluate(size: Size, places: Places) -> Stage:
     """The trained policy, the same one told the other task, and an untrained one."""
     words = ["fluxvla", "run", "--config", str(CONFIG), "--section", "eval"]
     words += ["--work-dir", str(places.work), "--nproc", str(cores())]
-    for override in (
-        f"eval.episodes={size.episodes}",
-        "eval.instruction_swap=true",
-        "eval.baseline=true",
-    ):
-        words += ["--set", override]
+    words += ["--set", f"eval.episodes={size.episodes}"]
     title = f"evaluate {size.episodes} unseen seeds for each task and way of acting"
     return Stage("evaluate", title, tuple(words), (), (places.work / "eval",))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 
 import pytest
@@ -63,6 +64,23 @@ def test_a_missed_deadline_is_skipped_not_made_up_for():
     assert rate.late_s == pytest.approx(0.01)
     rate.sleep()
     assert clock.slept[-1] == pytest.approx(100.12)
+
+
+def test_a_beat_that_came_late_is_not_followed_by_one_at_once():
+    clock = Stepped()
+    rate = Rate(50, clock)
+    rate.sleep()
+    wakes = []
+    for late in (0.008, 0.031, 0.0, 0.012, 0.0):
+        clock.late = late
+        rate.sleep()
+        wakes.append(clock.time)
+
+    gaps = [b - a for a, b in itertools.pairwise(wakes)]
+    assert min(gaps) >= 0.01 - 1e-9
+    assert rate.skipped == 3
+    # Back on the grid of the first deadline, not shifted.
+    assert (wakes[-1] - 100.0) / 0.02 == pytest.approx(round((wakes[-1] - 100.0) / 0.02))
 
 
 def test_after_a_reset_a_long_pause_is_no_miss():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from fluxvla_core.contracts.protocols import Clock
@@ -11,8 +12,8 @@ from fluxvla_core.control.clock import MonotonicClock, in_lockstep
 class Rate:
     """``sleep()`` returns at the next deadline; deadlines are ``1 / hz`` apart.
 
-    A deadline that was missed by more than a period is skipped, never made up for: two commands
-    sent at once would ask the arm for twice the speed.
+    Deadlines that were missed are skipped, never made up for: two commands sent at once would ask
+    the arm for a jump. Two beats are at least half a period apart, however late the first one was.
 
     In a lockstep simulation it returns at once.
 
@@ -42,10 +43,12 @@ class Rate:
         self.skipped = 0
         self.late_s = 0.0
         self._deadline: float | None = None
+        self._woke: float | None = None
 
     def reset(self) -> None:
         """Begin anew: the next deadline is one period from the next ``sleep``'s call."""
         self._deadline = None
+        self._woke = None
 
     def sleep(self) -> float:
         """Wait for the next deadline.
@@ -60,11 +63,17 @@ class Rate:
         now = self.clock.now()
         # The first call comes right after the first command: the deadline is a period later.
         deadline = now + self.period if self._deadline is None else self._deadline
-        missed = int(max(0.0, now - deadline) / self.period)
+        # Deadlines that are over, but for the last of them, and those too near to a late beat.
+        over = int(max(0.0, now - deadline) / self.period)
+        near = 0
+        if self._woke is not None:
+            near = math.ceil((self._woke + self.period / 2 - deadline) / self.period - 1e-6)
+        missed = max(over, near, 0)
         self.skipped += missed
         deadline += missed * self.period
         self.clock.sleep_until(deadline)
-        self.late_s = max(0.0, self.clock.now() - deadline)
+        self._woke = self.clock.now()
+        self.late_s = max(0.0, self._woke - deadline)
         self._deadline = deadline + self.period
         self._beat()
         return self.late_s

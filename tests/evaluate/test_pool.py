@@ -10,7 +10,7 @@ import types
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.evaluate.pool import run_jobs
+from fluxvla_core.evaluate.pool import WorkerPool, run_jobs
 from tests.evaluate import workers
 
 
@@ -114,6 +114,25 @@ def test_closing_the_iterator_ends_the_workers(tmp_path):
     iterator.close()
     assert multiprocessing.active_children() == []
     assert len(list(tmp_path.iterdir())) < 10
+
+
+def test_a_pool_keeps_its_workers_from_one_run_to_the_next():
+    with WorkerPool(workers.report_environment, 2) as pool:
+        assert pool.ready_s is None
+        first = {o.result[2] for o in pool.run(range(8))}
+        assert pool.ready_s > 0
+        second = {o.result[2] for o in pool.run(range(8))}
+    assert second <= first
+    assert len(first) <= 2
+
+
+def test_a_pool_grows_with_its_jobs_and_replaces_who_died(tmp_path):
+    with WorkerPool(workers.Recorder(str(tmp_path)), 3) as pool:
+        assert [o.result for o in pool.run(["fine-1"])] == ["fine-1 done"]
+        assert len(multiprocessing.active_children()) == 1
+        assert next(pool.run(["kill-1"])).error == "its process died (SIGKILL)"
+        found = {o.result for o in pool.run(["slow-1", "slow-2", "slow-3"])}
+        assert found == {"slow-1 done", "slow-2 done", "slow-3 done"}
 
 
 def test_workers_below_one_are_refused():

@@ -15,7 +15,7 @@ from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.evaluate.ledger import DONE, ERROR, EpisodeKey, Ledger
-from fluxvla_core.evaluate.pool import Outcome, run_jobs
+from fluxvla_core.evaluate.pool import Outcome, WorkerPool
 
 EpisodeFactory = Callable[[], Callable[[EpisodeKey], dict[str, Any]]]
 
@@ -28,12 +28,25 @@ def run_episodes(
     reporter: Reporter,
     timeout_s: float | None = None,
 ) -> list[dict[str, Any]]:
+    """:func:`run_in_pool` with processes of its own.
+
+    Args:
+        factory: makes, in a worker process, the function from a key to a result.
+        workers: processes.
+        timeout_s: how long one attempt at an episode may take.
+    """
+    with WorkerPool(factory, workers, timeout_s=timeout_s) as pool:
+        return run_in_pool(pool, keys, ledger, reporter)
+
+
+def run_in_pool(
+    pool: WorkerPool, keys: Sequence[EpisodeKey], ledger: Ledger, reporter: Reporter
+) -> list[dict[str, Any]]:
     """Run the episodes of ``keys`` that ``ledger`` does not have yet.
 
     Args:
-        factory: makes, in a worker process, a function from a key to a result: JSON values with
-            at least ``success`` (bool) and ``steps`` (int).
-        timeout_s: how long one attempt at an episode may take.
+        pool: its factory makes, in a worker process, a function from a key to a result: JSON
+            values with at least ``success`` (bool) and ``steps`` (int).
 
     Returns:
         One record for each key, in their order: the result with ``group``, ``task``, ``seed``,
@@ -50,7 +63,7 @@ def run_episodes(
     succeeded = sum(bool(record["success"]) for record in ledger.records(keys))
     if done and missing:
         reporter.info(f"{done} of {len(keys)} episodes are there already; going on with the others")
-    with closing(run_jobs(factory, missing, workers, timeout_s=timeout_s)) as outcomes:
+    with closing(pool.run(missing)) as outcomes:
         for outcome in outcomes:
             key = missing[outcome.index]
             record = _record(key, outcome)

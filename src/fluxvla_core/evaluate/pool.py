@@ -62,29 +62,9 @@ def run_jobs(
     retries: int = 1,
     timeout_s: float | None = None,
 ) -> Generator[Outcome, None, None]:
-    """Outcomes of ``jobs`` in the order in which they end.
-
-    Closing the iterator, or an exception in the loop over it, ends the workers.
-
-    Args:
-        factory: makes the worker, in its process; it, the jobs and the results are pickled.
-        jobs: given out in this order.
-        workers: processes; never more than there are jobs.
-        retries: how often a job that failed is tried again.
-        timeout_s: how long one attempt may take before its process is ended.
-
-    Raises:
-        RunFailed: a worker cannot be started.
-        FluxError: one that means bad input, from the factory or a job, as it was raised.
-        ValueError: ``workers`` is below 1.
-    """
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, got {workers}")
-    pool = _Pool(factory, jobs, retries, timeout_s)
-    try:
-        yield from pool.run(min(workers, len(jobs)))
-    finally:
-        pool.stop()
+    """Outcomes of ``jobs`` from a :class:`WorkerPool` of their own; see there."""
+    with WorkerPool(factory, workers, retries, timeout_s) as pool:
+        yield from pool.run(jobs)
 
 
 class _Worker:
@@ -120,28 +100,75 @@ class _Worker:
             self.process.join()
 
 
-class _Pool:
+class WorkerPool:
+    """Worker processes, started when there are jobs and kept until :meth:`close`.
+
+    Use as a context manager.
+
+    Args:
+        factory: makes the worker, in its process; it, the jobs and the results are pickled.
+        workers: processes; never more than there are jobs.
+        retries: how often a job that failed is tried again.
+        timeout_s: how long one attempt may take before its process is ended.
+
+    Attributes:
+        ready_s: how long the first worker took to be built; None before there is one.
+
+    Raises:
+        ValueError: ``workers`` is below 1.
+    """
+
     def __init__(
-        self, factory: Factory, jobs: Sequence[Any], retries: int, timeout_s: float | None
+        self,
+        factory: Factory,
+        workers: int,
+        retries: int = 1,
+        timeout_s: float | None = None,
     ) -> None:
+        if workers < 1:
+            raise ValueError(f"workers must be at least 1, got {workers}")
+        self.ready_s: float | None = None
         self._factory = factory
-        self._jobs = jobs
+        self._most = workers
         self._retries = retries
         self._timeout_s = timeout_s
-        self._waiting = deque(range(len(jobs)))
-        self._attempts = [0] * len(jobs)
         self._workers: list[_Worker] = []
         self._failed_starts = 0
+        self._began = 0.0
+        self._jobs: Sequence[Any] = ()
+        self._waiting: deque[int] = deque()
+        self._attempts: list[int] = []
 
-    def run(self, workers: int) -> Iterator[Outcome]:
-        self._workers = [_Worker(self._factory) for _ in range(workers)]
-        left = len(self._jobs)
-        while left:
-            for outcome in self._wait():
-                left -= 1
-                yield outcome
+    def run(self, jobs: Sequence[Any]) -> Generator[Outcome, None, None]:
+        """Outcomes of ``jobs``, which are given out in their order, as they end.
 
-    def stop(self) -> None:
+        Closing the generator, or an exception in it, closes the pool.
+
+        Raises:
+            RunFailed: a worker cannot be started.
+            FluxError: one that means bad input, from the factory or a job, as it was raised.
+        """
+        self._jobs, self._waiting = jobs, deque(range(len(jobs)))
+        self._attempts = [0] * len(jobs)
+        left = len(jobs)
+        try:
+            if not self._workers:
+                self._began = time.monotonic()
+            for worker in self._workers:
+                if worker.ready:
+                    self._next(worker)
+            while len(self._workers) < min(self._most, left):
+                self._workers.append(_Worker(self._factory))
+            while left:
+                for outcome in self._wait():
+                    left -= 1
+                    yield outcome
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the workers; any number of times."""
         # Idle workers leave by themselves when their pipe closes; busy ones are ended.
         for worker in self._workers:
             with suppress(OSError):
@@ -149,6 +176,12 @@ class _Pool:
         for worker in self._workers:
             worker.end(0.0 if worker.job is not None else _GRACE_S)
         self._workers = []
+
+    def __enter__(self) -> WorkerPool:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self.close()
 
     def _wait(self) -> list[Outcome]:
         readable = wait([w.connection for w in self._workers], timeout=self._patience())
@@ -176,13 +209,17 @@ class _Pool:
             return self._lost(worker, f"its process died ({_cause(worker.process.exitcode)})")
         if kind == "refused":
             raise value
-        index, worker.job, worker.deadline = worker.job, None, None
         if kind == "unusable":
             raise RunFailed(f"a worker process could not be set up:\n{value}")
-        worker.ready = True
-        self._next(worker)
-        if index is None:
+        if kind == "ready":
+            worker.ready = True
+            if self.ready_s is None:
+                self.ready_s = time.monotonic() - self._began
+            self._next(worker)
             return None
+        index, worker.job, worker.deadline = worker.job, None, None
+        assert index is not None
+        self._next(worker)
         if kind == "raised":
             return self._again(index, str(value))
         return Outcome(index, value, None, self._attempts[index])

@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, RunFailed
-from fluxvla_core.evaluate.episodes import open_ledger, run_episodes
+from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import DONE, EpisodeKey
-from fluxvla_core.evaluate.pool import run_jobs
+from fluxvla_core.evaluate.pool import WorkerPool
 from fluxvla_core.evaluate.summary import describe, summarise
 from fluxvla_sim.eval_worker import (
     POLICY,
@@ -158,37 +158,31 @@ class AlohaSimEvalRunner:
             SpecMismatch: the policy is for another robot.
             RunFailed: no episode gave a result, or results cannot be written.
         """
-        reporter, settings = self.context.reporter, self._worker_settings()
-        keys = self._keys()
+        reporter, keys = self.context.reporter, self._keys()
         ledger = open_ledger(self.folder / "episodes.jsonl", self._what(), reporter)
-        began = time.monotonic()
         new = sum(key not in ledger for key in keys)
-        records = run_episodes(
-            partial(AlohaEvalWorker, settings),
-            keys,
-            ledger,
-            self.workers,
-            reporter,
-            self.episode_timeout_s,
-        )
-        seconds = time.monotonic() - began
-        if not any(record["status"] == DONE for record in records):
-            raise RunFailed(
-                f"none of the {len(records)} episodes gave a result; the last one:\n"
-                f"{records[-1]['error']}",
-                where=str(ledger.path),
-            )
+        factory = partial(AlohaEvalWorker, self._worker_settings())
+        with WorkerPool(factory, self.workers, timeout_s=self.episode_timeout_s) as pool:
+            began = time.monotonic()
+            records = run_in_pool(pool, keys, ledger, reporter)
+            # Loading libraries and models is not what is measured.
+            seconds = time.monotonic() - began - (pool.ready_s or 0.0)
+            if not any(record["status"] == DONE for record in records):
+                raise RunFailed(
+                    f"none of the {len(records)} episodes gave a result; the last one:\n"
+                    f"{records[-1]['error']}",
+                    where=str(ledger.path),
+                )
+            videos = self._videos(pool, records)
         results = {
-            "format": FORMAT,
-            "policy": self.policy,
-            "checkpoint": self._checkpoint,
-            "settings": self._what()["settings"],
             "groups": summarise(records),
             "behaviours": count_behaviours(records),
-            "videos": self._videos(settings, records),
+            "checkpoint": self._checkpoint,
+            "settings": self._what()["settings"],
+            "videos": videos,
             "timing": _timing(records, new, seconds, self.workers),
         }
-        self._write(results)
+        self._write({"format": FORMAT, "policy": self.policy, **results})
         self._tell(results)
         return results
 
@@ -268,7 +262,7 @@ class AlohaSimEvalRunner:
         }
 
     def _videos(
-        self, settings: Settings, records: Sequence[Mapping[str, Any]]
+        self, pool: WorkerPool, records: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
         """Run the chosen episodes once more, watched: they go as they went before."""
         chosen = choose_videos(records, self.record_videos)
@@ -283,10 +277,7 @@ class AlohaSimEvalRunner:
             kept = {name: record[name] for name in ("group", "task", "seed", "success")}
             videos.append({**kept, "path": f"videos/{path.name}"})
         reporter, made = self.context.reporter, [False] * len(jobs)
-        factory = partial(AlohaEvalWorker, settings)
-        with closing(
-            run_jobs(factory, jobs, self.workers, timeout_s=self.episode_timeout_s)
-        ) as outcomes:
+        with closing(pool.run(jobs)) as outcomes:
             for done, outcome in enumerate(outcomes, 1):
                 reporter.progress("videos", done, len(jobs))
                 made[outcome.index] = outcome.error is None

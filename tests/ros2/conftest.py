@@ -1,5 +1,23 @@
 """ROS 2 for tests: a domain of their own, drivers in processes of their own."""
 
-from fluxvla_core.testing.ros2 import drivers, ros_domain
+from __future__ import annotations
 
-__all__ = ["drivers", "ros_domain"]
+import pytest
+
+from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
+from tests.ros2.arm import Arm
+
+__all__ = ["drivers", "lasting_drivers", "operators", "ros_domain"]
+
+
+@pytest.fixture
+def operators(ros_domain):
+    made = []
+
+    def make(**settings):
+        made.append(Arm(**settings))
+        return made[-1]
+
+    yield make
+    for operator in made:
+        operator.close()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fluxvla_core.errors import NotReady
 from fluxvla_core.ros2.ring import Received
-from fluxvla_core.ros2.sync import match, silent
+from fluxvla_core.ros2.sync import check_age, match, silent
 
 
 def stream(*stamps, latency=0.0, clock=0.0):
@@ -79,6 +79,21 @@ def test_silent_streams_are_those_whose_newest_is_old_or_missing():
     streams = {"cam": stream(1.0), "state": stream(1.9), "base": []}
 
     assert silent(streams, now=2.0, max_age=0.5) == {"cam": 1.0, "base": None}
+
+
+def test_messages_that_belong_together_may_still_be_too_old():
+    streams = {
+        "cam": stream(0.3, latency=0.7),
+        "state": stream(*[i / 100 for i in range(100)]),
+    }
+    matched = match(streams, max_skew=0.01)
+    check_age(matched, now=1.0, max_age=0.8)
+
+    with pytest.raises(NotReady) as caught:
+        check_age(matched, now=1.0, max_age=0.5)
+    assert caught.value.what == (
+        "cam is late: what belongs to its newest message arrived 0.70 s ago; 0.5 s is allowed"
+    )
 
 
 times = st.lists(st.integers(0, 2000), min_size=1, max_size=30, unique=True).map(

@@ -33,8 +33,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")
 
-# A burst on one stream puts it apart from the others for a moment; a driver that is late, for good.
-_PATIENCE_S = 0.25
+# How often a wait for messages that belong together looks again.
 _LOOK_S = 0.002
 # How long a last command may take to be acknowledged before the connection is given up.
 _FLUSH_S = 0.2
@@ -283,13 +282,16 @@ class RosOperator(ABC):
 
     def _matched(self) -> tuple[dict[str, tuple[Received, ...]], Mapping[str, Received]]:
         """Messages of all streams, and those that belong together, waiting a little for them."""
-        until = time.monotonic() + _PATIENCE_S
+        # A burst puts a stream apart from the others for a moment; one that fell silent is named
+        # as such in this time; only a driver that is late stays apart.
+        until = time.monotonic() + self.max_age_s
         specs = self._specs_of(STATE, CAMERA, DEPTH)
         while True:
             rings = self._fresh()
             by = "receipt" if self._clock_stepped() else self.sync_on
             try:
                 match = sync.match({s.name: rings[s.name] for s in specs}, self.max_skew_s, by)
+                sync.check_age(match, time.monotonic(), self.max_age_s)
             except NotReady:
                 if time.monotonic() >= until:
                     raise
@@ -347,5 +349,8 @@ class RosOperator(ABC):
     def _flush(self) -> None:
         from rclpy.duration import Duration
 
-        for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(Duration(seconds=_FLUSH_S))
+        for topic, publisher in self._publishers.items():
+            try:
+                publisher.wait_for_all_acked(Duration(seconds=_FLUSH_S))
+            except Exception as error:  # noqa: BLE001 - a broken publisher has nothing to flush
+                log.error("the last message on %s may not have arrived: %s", topic, error)

@@ -57,6 +57,7 @@ class Startup:
 
         Raises:
             NotReady: a stream loses most messages.
+            Rejected: another commander was discovered meanwhile.
         """
         if seconds <= 0:
             return []
@@ -65,7 +66,7 @@ class Startup:
         start = time.monotonic()
         time.sleep(seconds)
         span = time.monotonic() - start
-        return rates.check(
+        warnings = rates.check(
             Reception(
                 stream.label,
                 stream.reliability,
@@ -77,6 +78,10 @@ class Startup:
             )
             for (spec, stream), (received, lost) in zip(streams, before, strict=True)
         )
+        contested = self._contested()
+        if contested is not None:
+            raise contested
+        return warnings
 
     def _problem(self, hurry: bool) -> FluxError | None:
         """What is still wrong; ``hurry`` leaves out what only makes the message better."""
@@ -88,6 +93,9 @@ class Startup:
         deaf = [t for t in self._exclusive if not self._node.count_subscribers(t)]
         if deaf:
             return discovery.nobody_listens(deaf)
+        return self._contested()
+
+    def _contested(self) -> FluxError | None:
         others = discovery.commanders(self._node, self._exclusive, self._connection.name)
         return discovery.contested(others) if others else None
 

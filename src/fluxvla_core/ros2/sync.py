@@ -20,10 +20,15 @@ Streams = Mapping[str, Sequence[Received]]
 
 @dataclass(frozen=True)
 class Matched:
-    """One message of each stream; ``skew`` is how far apart they are, in seconds."""
+    """One message of each stream.
+
+    ``skew`` is how far apart they are, in seconds; ``slowest`` the stream whose newest message is
+    the one that the others were matched with.
+    """
 
     messages: Mapping[str, Received]
     skew: float
+    slowest: str
 
 
 def silent(streams: Streams, now: float, max_age: float) -> dict[str, float | None]:
@@ -50,13 +55,32 @@ def match(streams: Streams, max_skew: float, by: str = "stamp") -> Matched:
     """
     if any(items[-1].stamp is None for items in streams.values()):
         by = "receipt"
-    instant = min(_time(items[-1], by) for items in streams.values())
+    reached = {name: _time(items[-1], by) for name, items in streams.items()}
+    slowest = min(reached, key=reached.__getitem__)
+    instant = reached[slowest]
     chosen = {name: _nearest(items, instant, by) for name, items in streams.items()}
     times = {name: _time(message, by) for name, message in chosen.items()}
     skew = max(times.values()) - min(times.values())
     if skew > max_skew:
         raise _apart(chosen, times, skew, max_skew, by)
-    return Matched(chosen, skew)
+    return Matched(chosen, skew, slowest)
+
+
+def check_age(matched: Matched, now: float, max_age: float) -> None:
+    """Refuse what belongs together but happened too long ago.
+
+    Raises:
+        NotReady: the oldest of the messages arrived more than ``max_age`` s ago, because the
+            slowest stream is that late; names it.
+    """
+    age = now - min(message.receipt for message in matched.messages.values())
+    if age > max_age:
+        raise NotReady(
+            f"{matched.slowest} is late: what belongs to its newest message arrived {age:.2f} s "
+            f"ago; {max_age:g} s is allowed",
+            cause="its driver or the network delays it",
+            next="look at its driver's load; if that is how it is, allow more with max_age_s",
+        )
 
 
 def _nearest(items: Sequence[Received], instant: float, by: str) -> Received:

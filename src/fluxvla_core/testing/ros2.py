@@ -1,6 +1,6 @@
 """Fixtures for tests with real ROS 2: a domain of one's own, and drivers in processes.
 
-    from fluxvla_core.testing.ros2 import drivers, ros_domain  # noqa: F401
+    from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain  # noqa: F401
 
 Tests that use them are skipped where ``rclpy`` cannot be imported, with the way to get it.
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from importlib import resources
-from typing import Any
 
 import pytest
 
@@ -22,32 +22,33 @@ from fluxvla_core.testing.ros2_driver import Driver
 _DOMAINS = 100
 
 
-@pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch) -> int:
+@pytest.fixture(scope="module")
+def ros_domain() -> Iterator[int]:
     """A domain that only this process and its children use; nothing leaves the machine."""
     try:
         require_rclpy()
     except LoadFailed as error:
         pytest.skip(f"{error.what}; {error.next}")
     domain = 1 + os.getpid() % _DOMAINS
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    # What Humble has in its place.
-    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     profile = resources.files("fluxvla_core.testing") / "fastdds_quick_discovery.xml"
-    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(profile))
-    return domain
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("ROS_DOMAIN_ID", str(domain))
+        environment.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        # What Humble has in its place.
+        environment.setenv("ROS_LOCALHOST_ONLY", "1")
+        environment.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(profile))
+        yield domain
 
 
 @pytest.fixture
 def drivers(ros_domain: int) -> Iterator[Callable[..., Driver]]:
     """Call it as ``Driver``; every process is ended after the test."""
-    started: list[Driver] = []
+    with ExitStack() as stack:
+        yield lambda *args, **options: stack.enter_context(Driver(*args, **options))
 
-    def start(*args: Any, **options: Any) -> Driver:
-        started.append(Driver(*args, **options))
-        return started[-1]
 
-    yield start
-    for driver in started:
-        driver.close()
+@pytest.fixture(scope="module")
+def lasting_drivers(ros_domain: int) -> Iterator[Callable[..., Driver]]:
+    """Like ``drivers``, for processes that serve all tests of a module."""
+    with ExitStack() as stack:
+        yield lambda *args, **options: stack.enter_context(Driver(*args, **options))

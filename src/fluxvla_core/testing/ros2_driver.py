@@ -70,7 +70,8 @@ class Driver:
             raise RuntimeError(f"the driver did not start (exit code {self._process.returncode})")
 
     def tell(self, **order: Any) -> None:
-        """``fault="TOPIC=MODE:AMOUNT"``, ``well="TOPIC"``, ``change={topic: {key: value}}``."""
+        """``fault="TOPIC=MODE:AMOUNT"``, ``change={topic: {key: value}}``, ``reset=True``: back to
+        how it was started, without faults."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(order) + "\n")
         self._process.stdin.flush()
@@ -116,18 +117,20 @@ class _Publisher:
     """One stream of the process."""
 
     def __init__(self, connection: Connection, spec: dict[str, Any]) -> None:
-        self.spec = spec
+        self._started = spec
+        self.reset()
         self.topic: str = spec["topic"]
         self.cls = message_class(spec["message"])
         kind = qos.BEST_EFFORT if spec.get("best_effort") else qos.RELIABLE
         profile = qos.profile(kind, depth=5, latched=bool(spec.get("latched")))
         self.publisher = connection.node.create_publisher(self.cls, self.topic, profile)
         self.next = time.monotonic()
-        self.count = 0
+
+    def reset(self) -> None:
+        self.spec: dict[str, Any] = dict(self._started)
 
     def make(self, connection: Connection, commands: Mapping[str, Any]) -> Any:
         spec, message, kind = self.spec, self.cls(), self.cls.__name__
-        self.count += 1
         if kind == "JointState":
             known = commands.get(spec.get("follows", ""))
             here = dict(zip(spec["names"], spec["positions"], strict=False))
@@ -240,8 +243,10 @@ def _plain(message: Any) -> dict[str, Any]:
 def _order(order: Mapping[str, Any], faults: Faults, publishers: Sequence[_Publisher]) -> None:
     if "fault" in order:
         faults.set(*Fault.parse(order["fault"]))
-    if "well" in order:
-        faults.clear(order["well"])
+    if order.get("reset"):
+        for publisher in publishers:
+            faults.clear(publisher.topic)
+            publisher.reset()
     for topic, changes in order.get("change", {}).items():
         for publisher in publishers:
             if publisher.topic == topic:
@@ -298,6 +303,8 @@ def _publish(
             continue
         if order is None:
             return
+        if order.get("reset"):
+            late.clear()
         _order(order, faults, publishers)
 
 

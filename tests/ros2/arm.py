@@ -1,0 +1,93 @@
+"""A small robot for these tests: three joints, a camera, and the driver that serves it."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from fluxvla_core.errors import Faulted, NotReady, Rejected
+from fluxvla_core.ros2 import joints
+from fluxvla_core.ros2.operator import RosOperator
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, CommandSpec, StreamSpec, camera_stream
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+
+NAMES = ("elbow", "wrist", "grip")
+CAM = Camera("cam", 48, 64)
+SPEC = EmbodimentSpec(
+    "arm",
+    (
+        Joint("elbow", "rad", -1.0, 1.0, 1.0, 1.0),
+        Joint("wrist", "rad", -2.0, 2.0, 1.0, 1.0),
+        Joint("grip", "normalized", 0.0, 1.0, 1.0, 1.0, kind="gripper", open=1.0, closed=0.0),
+    ),
+    (CAM,),
+    50.0,
+)
+STATE = {
+    "topic": "/arm/state",
+    "message": JOINT_STATE,
+    "hz": 100,
+    "names": ["grip", "finger", "elbow", "wrist"],
+    "positions": [0.5, 9.0, 0.1, 0.2],
+}
+PICTURES = {"topic": "/cam/image", "message": IMAGE, "hz": 30, "height": 48, "width": 64}
+COMMANDS = {"topic": "/arm/command", "message": JOINT_STATE}
+
+
+class Arm(RosOperator):
+    """Three joints and a camera."""
+
+    embodiment = SPEC
+
+    def __init__(self, **settings):
+        super().__init__(**{"connect_timeout_s": 8.0, "rate_window_s": 0.0, **settings})
+
+    def streams(self):
+        return [StreamSpec("arm", "/arm/state", JOINT_STATE), camera_stream(CAM, "/cam/image")]
+
+    def commands(self):
+        return [CommandSpec("/arm/command")]
+
+    def read_state(self, messages):
+        return joints.positions(messages["arm"], NAMES, "arm (/arm/state)")
+
+    def publish_action(self, action):
+        message = message_class(JOINT_STATE)()
+        self.publish("/arm/command", joints.fill(message, NAMES, action))
+
+
+def wait_for(condition, seconds=8.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "did not happen in time"
+        time.sleep(0.01)
+
+
+def frame_error(operator, seconds=4.0):
+    """The first error of ``get_frame``, waiting for it."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        try:
+            operator.get_frame()
+        except (NotReady, Faulted) as error:
+            return error
+        time.sleep(0.01)
+    pytest.fail("get_frame went on working")
+
+
+def frames_for(operator, seconds):
+    """Frames of a while; any error fails the test."""
+    until, frames = time.monotonic() + seconds, []
+    while time.monotonic() < until:
+        frames.append(operator.get_frame())
+        time.sleep(0.02)
+    return frames
+
+
+def refusal_of(operators, **settings):
+    operator = operators(connect_timeout_s=2.0, **settings)
+    with pytest.raises((NotReady, Rejected)) as caught:
+        operator.connect()
+    return caught.value

@@ -1,0 +1,301 @@
+"""A connected ROS 2 operator: commands, stops, and a driver that falls ill; in two processes."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from fluxvla_core.errors import Faulted, NotReady, Rejected
+from tests.ros2.arm import (
+    COMMANDS,
+    NAMES,
+    PICTURES,
+    STATE,
+    frame_error,
+    frames_for,
+    refusal_of,
+    wait_for,
+)
+
+
+@pytest.fixture(scope="module")
+def lasting_robot(lasting_drivers):
+    return lasting_drivers([STATE, PICTURES], [COMMANDS], name="robot")
+
+
+@pytest.fixture
+def robot(lasting_robot):
+    """A robot that is well, and has heard nothing yet."""
+    lasting_robot.tell(reset=True)
+    lasting_robot.heard.clear()
+    yield lasting_robot
+    lasting_robot.tell(reset=True)
+
+
+@pytest.fixture
+def arm(operators, robot):
+    operator = operators()
+    operator.connect()
+    return operator
+
+
+def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
+    frame = arm.get_frame()
+
+    np.testing.assert_array_equal(frame.state, [0.1, 0.2, 0.5])
+    assert frame.images["cam"].shape == (48, 64, 3)
+    assert (frame.images["cam"] == [10, 20, 30]).all()
+    assert set(frame.stamps) == {"state", "cam"}
+    assert all(0 <= time.monotonic() - stamp < 1.0 for stamp in frame.stamps.values())
+
+
+def test_the_state_alone(arm):
+    state, stamp = arm.get_state()
+
+    np.testing.assert_array_equal(state, [0.1, 0.2, 0.5])
+    assert 0 <= time.monotonic() - stamp < 1.0
+
+
+def test_connecting_twice_is_connecting_once(arm):
+    before = threading.active_count()
+    arm.connect()
+
+    assert threading.active_count() == before
+
+
+def test_it_can_be_closed_and_connected_again(arm):
+    arm.close()
+    arm.connect()
+
+    assert arm.get_frame().state.shape == (3,)
+
+
+def test_the_wrong_domain_is_named(operators, robot, ros_domain):
+    other = ros_domain % 100 + 1
+    operator = operators(domain_id=other, connect_timeout_s=0.3)
+
+    with pytest.raises(NotReady, match=f"nobody publishes anything on ROS domain {other}"):
+        operator.connect()
+
+
+class TestCommanding:
+    def test_commands_arrive_by_name(self, arm, robot):
+        arm.send_action(np.array([0.5, -0.5, 1.0]))
+        wait_for(lambda: robot.on("/arm/command"))
+
+        (heard,) = robot.on("/arm/command")
+        assert dict(zip(heard["name"], heard["position"], strict=True)) == {
+            "elbow": 0.5,
+            "wrist": -0.5,
+            "grip": 1.0,
+        }
+
+    def test_a_refused_action_sends_nothing(self, arm, robot):
+        for bad in ([np.nan, 0, 0], [0, 0], [5.0, 0, 0]):
+            with pytest.raises(Rejected):
+                arm.send_action(bad)
+        time.sleep(0.2)
+
+        assert robot.on("/arm/command") == []
+
+    def test_stop_repeats_the_last_command(self, arm, robot):
+        arm.send_action([0.15, 0.1, 0.3])
+        arm.stop()
+        wait_for(lambda: len(robot.on("/arm/command")) == 2)
+
+        assert [h["position"] for h in robot.on("/arm/command")] == [[0.15, 0.1, 0.3]] * 2
+
+    def test_stop_leaves_an_arm_alone_that_was_never_commanded(self, arm, robot):
+        arm.stop()
+        arm.close()
+        time.sleep(0.2)
+
+        assert robot.on("/arm/command") == []
+
+    def test_stop_holds_a_blocked_joint_where_it_is(self, arm, robot):
+        arm.send_action([0.9, 0.2, 0.0])
+        arm.stop()
+        wait_for(lambda: len(robot.on("/arm/command")) == 2)
+
+        assert robot.on("/arm/command")[-1]["position"] == [0.1, 0.2, 0.0]
+
+    def test_stop_holds_the_last_command_when_the_state_is_gone(self, arm, robot):
+        arm.send_action([0.9, 0.2, 0.0])
+        robot.tell(fault="/arm/state=drop")
+        frame_error(arm)
+        arm.stop()
+        wait_for(lambda: len(robot.on("/arm/command")) == 2)
+
+        assert robot.on("/arm/command")[-1]["position"] == [0.9, 0.2, 0.0]
+
+    def test_the_hold_of_close_arrives(self, arm, robot):
+        arm.send_action([0.15, 0.1, 0.3])
+        arm.close()
+        wait_for(lambda: len(robot.on("/arm/command")) == 2)
+
+        with pytest.raises(NotReady, match="arm is not connected"):
+            arm.send_action([0.0, 0.0, 0.0])
+
+    def test_what_fails_while_stopping_is_logged_and_the_rest_is_done(self, arm, caplog):
+        done = []
+        arm.send_action([0.1, 0.2, 0.5])
+        arm.publish_action = lambda action: 1 / 0
+        arm.on_stop = lambda: done.append("base")
+        arm.stop()
+
+        assert done == ["base"]
+        assert "arm: stopping failed: division by zero" in caplog.text
+
+    def test_a_publisher_that_breaks_is_a_fault(self, arm):
+        arm._publishers["/arm/command"].destroy()
+
+        with pytest.raises(Faulted, match="a command on /arm/command could not be sent"):
+            arm.send_action([0.1, 0.2, 0.5])
+
+    def test_another_commander_is_refused_at_the_start(self, operators, robot, drivers):
+        drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
+        error = refusal_of(operators, rate_window_s=1.0)
+
+        assert isinstance(error, Rejected)
+        assert "/teleop_" in error.what
+        assert "also publishes on /arm/command" in error.what
+
+    def test_another_commander_stops_the_commands_and_its_leaving_frees_them(self, arm, drivers):
+        arm.send_action([0.1, 0.2, 0.5])
+        teleop = drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
+        wait_for(lambda: arm._fault)
+        with pytest.raises(Faulted, match="also publishes on /arm/command: two commanders"):
+            arm.send_action([0.1, 0.2, 0.5])
+
+        teleop.close()
+        wait_for(lambda: not arm._fault)
+        arm.send_action([0.1, 0.2, 0.5])
+
+
+class TestFaults:
+    def test_a_camera_that_falls_silent_is_named(self, arm, robot):
+        robot.tell(fault="/cam/image=drop")
+        error = frame_error(arm)
+
+        assert error.what.startswith("cam (/cam/image) is silent for 0.5")
+        assert error.what.endswith("; 0.5 s is allowed")
+        assert error.cause == "the device froze, or its driver was killed or hangs"
+
+    def test_a_camera_that_repeats_its_last_picture_is_silent_too(self, arm, robot):
+        robot.tell(fault="/cam/image=freeze")
+
+        assert frame_error(arm).what.startswith("cam (/cam/image) is silent for 0.5")
+
+    def test_joint_states_that_stop_are_named(self, arm, robot):
+        robot.tell(fault="/arm/state=drop")
+
+        assert frame_error(arm).what.startswith("arm (/arm/state) is silent for 0.5")
+
+    @pytest.mark.parametrize(
+        ("changes", "what"),
+        [
+            (
+                {"/cam/image": {"height": 24, "width": 32}},
+                "cam (/cam/image) sends 32x24 pictures, the embodiment says 64x48",
+            ),
+            (
+                {"/cam/image": {"encoding": "16UC1"}},
+                "cam (/cam/image) sends 16UC1 pictures, which have no colours",
+            ),
+            (
+                {"/arm/state": {"names": ["elbow", "wrist"], "positions": [0.1, 0.2]}},
+                "arm (/arm/state): no joint called grip; there are elbow, wrist",
+            ),
+        ],
+    )
+    def test_messages_that_change_are_a_fault(self, arm, robot, changes, what):
+        robot.tell(change=changes)
+        error = frame_error(arm)
+
+        assert isinstance(error, Faulted)
+        assert error.what == what
+
+    def test_other_encodings_and_orders_are_understood(self, arm, robot):
+        robot.tell(
+            change={
+                "/cam/image": {"encoding": "bgr8"},
+                "/arm/state": {"names": list(NAMES), "positions": [0.1, 0.2, 0.5]},
+            }
+        )
+        for frame in frames_for(arm, 0.5):
+            assert (frame.images["cam"] == [10, 20, 30]).all()
+            np.testing.assert_array_equal(frame.state, [0.1, 0.2, 0.5])
+
+    def test_a_state_that_is_no_number_is_a_fault(self, arm, robot):
+        robot.tell(fault="/arm/state=nan")
+
+        assert "the position of elbow, wrist, grip is not a finite number" in frame_error(arm).what
+
+    @pytest.mark.parametrize("fault", ["duplicate", "out_of_order"])
+    def test_repeated_and_overtaken_messages_change_nothing(self, arm, robot, fault):
+        robot.tell(fault=f"/arm/state={fault}")
+        robot.tell(fault=f"/cam/image={fault}")
+        stamps = [frame.stamps for frame in frames_for(arm, 0.8)]
+
+        for name in ("state", "cam"):
+            times = [stamp[name] for stamp in stamps]
+            assert times == sorted(times)
+            assert times[-1] > times[0]
+        rings = [stream.ring for stream in arm._connection.streams.values()]
+        assert all(ring.duplicates + ring.overtaken > 0 for ring in rings)
+
+    def test_a_late_camera_is_named(self, arm, robot):
+        """Not only its pictures are old then, but the state that belongs to them."""
+        robot.tell(fault="/cam/image=delay:0.7")
+        time.sleep(0.8)
+        error = frame_error(arm)
+
+        assert isinstance(error, NotReady)
+        assert error.what.startswith("cam is late: what belongs to its newest message arrived 0.")
+
+    @pytest.mark.parametrize("step", [-3600.0, 3600.0])
+    def test_a_stepped_wall_clock_changes_nothing(self, arm, robot, step):
+        robot.tell(fault=f"/cam/image=clock:{step}")
+        robot.tell(fault=f"/arm/state=clock:{step}")
+
+        assert len(frames_for(arm, 1.0)) > 20
+        assert arm._connection.streams["cam"].ring.clock_steps == 1
+
+    def test_clocks_that_differ_are_named_and_receipts_mend_it(self, arm, robot, operators):
+        robot.tell(fault="/cam/image=clock:-100")
+        error = frame_error(arm)
+        assert error.cause == "they arrive together, so the clocks that stamp them differ"
+        arm.close()
+
+        forgiving = operators(sync_on="receipt")
+        forgiving.connect()
+        assert frames_for(forgiving, 0.3)
+
+    def test_a_flood_on_a_topic_changes_nothing(self, arm, drivers):
+        flood = {**STATE, "hz": 2000, "names": [f"j{i}" for i in range(200)] + list(NAMES)}
+        drivers([{**flood, "positions": [0.0] * 200 + [0.1, 0.2, 0.5]}], name="flood")
+        wait_for(lambda: arm._connection.streams["arm"].ring.received > 1000)
+
+        assert len(frames_for(arm, 0.5)) > 5
+        assert len(arm._connection.streams["arm"].ring.items()) <= 128
+
+    def test_a_ros_thread_that_ended_is_a_fault(self, arm):
+        def fail():
+            raise RuntimeError("broken")
+
+        arm._connection.every(0.01, fail)
+        wait_for(lambda: arm._connection.failure)
+
+        for call in (arm.get_frame, lambda: arm.send_action([0.1, 0.2, 0.5])):
+            with pytest.raises(Faulted, match="the ROS thread of fluxvla_arm_"):
+                call()
+
+
+def test_a_second_connection_to_the_same_robot_is_refused(arm, operators):
+    error = refusal_of(operators, rate_window_s=1.0)
+
+    assert isinstance(error, Rejected)
+    assert "/fluxvla_arm_" in error.what

@@ -199,6 +199,26 @@ def test_the_specifications_dataset_and_denormalisation_override(tmp_path):
     np.testing.assert_allclose(chunk, expected, rtol=1e-4)
 
 
+def test_pictures_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tmp_path):
+    crop = {"type": "CropImages", "top": 0, "left": 0, "height": 12, "width": 32}
+    transforms = [
+        crop,
+        {"type": "NormalizeImages", "means": [[0] * 3], "stds": [[1] * 3]},
+        {"type": "NormalizeStatesAndActions"},
+    ]
+    policy = load(save(tmp_path, dataset={"transforms": transforms}))
+    policy.reset(0)
+    large = observation()
+    large["images"]["front"] = np.zeros((96, 128, 3), np.uint8)
+    large["images"]["front"][:48] = 200
+
+    policy.predict_action(large)
+
+    # The upper half of the view, whatever its pixels.
+    assert policy.model.batch["images"].shape == (1, 3, 12, 32)
+    assert float(policy.model.batch["images"].min()) == pytest.approx(200, rel=1e-6)
+
+
 def test_bf16_computes_and_still_gives_float64(tmp_path):
     policy = load(save(tmp_path), mixed_precision_dtype="bf16")
     policy.reset(0)

@@ -52,6 +52,27 @@ def test_a_camera_that_the_robot_does_not_have(bench):
     refused(bench, SpecMismatch, "cameras: wrist missing; there are")
 
 
+def test_a_camera_with_another_view_than_in_training(bench):
+    trained = replace(bench.policy.embodiment, cameras=(Camera("front", 32, 32),))
+    bench.policy.embodiment = trained
+
+    refused(
+        bench,
+        SpecMismatch,
+        "camera front gives 24 x 32 pictures; the policy was trained on 32 x 32: another view",
+    )
+
+
+def test_a_camera_with_more_pixels_than_in_training_is_said(bench):
+    trained = replace(bench.policy.embodiment, cameras=(Camera("front", 12, 16),))
+    bench.policy.embodiment = trained
+
+    bench.run(max_publish_step=5)
+
+    (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
+    assert line.endswith("24 x 32 pictures; the policy was trained on 12 x 16; they are scaled")
+
+
 @pytest.mark.parametrize(
     ("names", "message"),
     [

@@ -20,7 +20,7 @@ from fluxvla_core.contracts.protocols import Policy
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.joining import LatestOnly, Synchronous
 from fluxvla_core.control.worker import Worker
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.infer.episode import Episode
 from fluxvla_core.infer.plan import Plan
@@ -158,7 +158,7 @@ class BaseInferenceRunner:
 
         Raises:
             CheckpointError: there is no policy to load.
-            SpecMismatch: the policy is for another robot.
+            SpecMismatch: the policy is for another robot, or for other views.
             ConfigError, UsageError: a pose, a camera or the task does not fit.
         """
         if self.context.task is not None:
@@ -184,6 +184,7 @@ class BaseInferenceRunner:
                 raise self._wrong("camera_names", f"{name!r} is none of {', '.join(known)}")
             if name not in self._cameras:
                 raise self._wrong("camera_names", f"the policy looks at {name!r} too")
+        self._check_views(self.policy.embodiment, looks_at)
         if self.prepare_pose is not None:
             check_pose(self.prepare_pose, self.embodiment)
 
@@ -299,6 +300,28 @@ class BaseInferenceRunner:
                 reporter.warn(problem)
         if not worker.close(1.0):
             reporter.warn("the policy still hangs; its thread ends with the program")
+
+    def _check_views(self, trained: EmbodimentSpec, names: Sequence[str]) -> None:
+        """A camera may have more pixels than in training; it may not show another view."""
+        here = {camera.name: camera for camera in self.embodiment.cameras}
+        for then in trained.cameras:
+            now = here.get(then.name)
+            if then.name not in names or now is None:
+                continue
+            if (now.height, now.width) == (then.height, then.width):
+                continue
+            sizes = (
+                f"camera {then.name} gives {now.height} x {now.width} pictures; the policy was "
+                f"trained on {then.height} x {then.width}"
+            )
+            if abs(now.width * then.height - then.width * now.height) > 0.01 * (
+                now.height * then.width
+            ):
+                raise SpecMismatch(
+                    f"{sizes}: another view",
+                    next="set the camera to the size, or at least the aspect, of the recordings",
+                )
+            self.context.reporter.warn(f"{sizes}; they are scaled")
 
     def _checked_rate(self, publish_rate: float | None) -> float:
         most = self.embodiment.rate_hz

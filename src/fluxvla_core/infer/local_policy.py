@@ -95,7 +95,7 @@ class LocalPolicy:
         import torch
 
         start = time.perf_counter()
-        batch = self._prepare(observation)
+        batch = self._prepare(self._sized(observation))
         if "noise" in self._takes:
             batch["noise"] = torch.from_numpy(self._noise())
         if not self._takes_all:
@@ -120,6 +120,24 @@ class LocalPolicy:
             "postprocess": time.perf_counter() - inferred,
         }
         return chunk
+
+    def _sized(self, observation: Observation) -> dict[str, Any]:
+        """The observation with pictures of the size that the policy was trained on.
+
+        The transforms may cut pixels by number. A camera with more pixels of the same view is
+        scaled down; ``run_setup`` has refused another view.
+        """
+        images = dict(observation["images"])
+        for camera in self.embodiment.cameras:
+            image = images.get(camera.name)
+            if image is not None and image.shape[:2] != (camera.height, camera.width):
+                import cv2
+
+                size = (camera.width, camera.height)
+                images[camera.name] = np.asarray(
+                    cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
+                )
+        return {**observation, "images": images}
 
     def _noise(self) -> npt.NDArray[np.float32]:
         # A key of its own for each call; counter-based, so that calls share no numbers.

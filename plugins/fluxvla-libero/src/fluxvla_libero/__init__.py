@@ -1,0 +1,1 @@
+"""LIBERO for FluxVLA: evaluation, inference, and demonstrations of a scripted expert."""

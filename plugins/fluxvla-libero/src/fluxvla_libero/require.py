@@ -1,0 +1,81 @@
+"""Importing LIBERO: quietly, told to draw without a display, or with a message on what to do."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import io
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from types import ModuleType
+
+from fluxvla_core.errors import MissingPlugin, RunFailed
+
+INSTALL = "pip install 'fluxvla-libero[libero]'"
+APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri"
+
+
+def is_installed() -> bool:
+    """Whether there is a LIBERO to import; imports nothing."""
+    try:
+        return importlib.util.find_spec("libero.libero") is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def require_libero() -> ModuleType:
+    """The package ``libero.libero``, told to draw by EGL if nothing else was said.
+
+    Raises:
+        MissingPlugin: it is not installed.
+        RunFailed: it is, and cannot be imported; or EGL is wanted and missing.
+    """
+    if not is_installed():
+        raise MissingPlugin(
+            "LIBERO is not installed",
+            cause="fluxvla-libero alone brings no simulator: its scenes are 340 MB",
+            next=INSTALL,
+        )
+    if sys.platform == "linux":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        if os.environ["MUJOCO_GL"].lower() == "egl" and "mujoco" not in sys.modules:
+            _check_egl()
+    try:
+        with quiet():
+            import libero.libero
+            import libero.libero.benchmark
+            import libero.libero.envs
+    except Exception as error:
+        raise RunFailed(
+            f"LIBERO is installed and cannot be imported: {type(error).__name__}: {error}",
+            cause="a version of robosuite or mujoco that it was not written for",
+            next=INSTALL,
+        ) from error
+    return libero.libero
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without what LIBERO and robosuite print while they are imported and set up."""
+    log = logging.getLogger("robosuite_logs")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        log.setLevel(before)
+
+
+def _check_egl() -> None:
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError as error:
+        raise RunFailed(
+            f"the simulator cannot draw: libEGL.so.1 cannot be loaded ({error})",
+            cause="Mesa's EGL is not installed",
+            next=APT,
+        ) from error

@@ -1,0 +1,94 @@
+"""``results.json`` of an evaluation: what every evaluation runner writes alike."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.evaluate.ledger import DONE
+from fluxvla_core.evaluate.summary import describe
+
+FORMAT = "fluxvla-eval-1"
+
+
+def write_results(path: Path, results: Mapping[str, Any]) -> None:
+    """Write JSON beside ``path`` and rename it, so that what is there is whole.
+
+    Raises:
+        RunFailed: the disk is full, or the folder was taken away.
+    """
+    part = path.with_suffix(".json.part")
+    try:
+        part.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        full = error.errno == errno.ENOSPC
+        raise RunFailed(
+            f"results cannot be written: {error}",
+            where=str(path),
+            next="make room and run the same command again" if full else None,
+        ) from error
+
+
+def timing(
+    records: Sequence[Mapping[str, Any]], new: int, seconds: float, workers: int
+) -> dict[str, Any]:
+    """How fast the episodes were, as JSON values.
+
+    Args:
+        records: with ``steps``, ``calls`` (of the policy) and ``timing.policy_seconds``.
+        new: how many of them this run made; where it is not all of them, only the policy's
+            answer has a meaningful mean.
+        seconds: this run's wall time.
+        workers: this run's processes.
+    """
+    done = [r for r in records if r["status"] == DONE]
+    calls = sum(r["calls"] for r in done)
+    policy = sum(r["timing"]["policy_seconds"] for r in done)
+    found: dict[str, Any] = {
+        "episodes": 0,
+        "workers": workers,
+        "policy_ms": 1e3 * policy / max(calls, 1),
+    }
+    if new == len(records):
+        steps = sum(r["steps"] for r in done)
+        per_s = steps / max(seconds, 1e-9)
+        found |= {"episodes": new, "steps": steps, "seconds": seconds, "steps_per_s": per_s}
+    return found
+
+
+def check_any_done(records: Sequence[Mapping[str, Any]], ledger: Path) -> None:
+    """Refuse to call it a result when every episode ended in an error.
+
+    Raises:
+        RunFailed: with the last episode's reason.
+    """
+    if not any(record["status"] == DONE for record in records):
+        raise RunFailed(
+            f"none of the {len(records)} episodes gave a result; the last one:\n"
+            f"{records[-1]['error']}",
+            where=str(ledger),
+        )
+
+
+def tell(reporter: Reporter, results: Mapping[str, Any], folder: Path) -> None:
+    """Say the rates of each group and task, the speed, and where the videos are."""
+    for group, found in results["groups"].items():
+        for task, counted in found["tasks"].items():
+            reporter.info(describe(f"{group} {task}", counted))
+        if len(found["tasks"]) > 1:
+            reporter.info(describe(f"{group} all tasks", found["all"]))
+    speed = results["timing"]
+    if speed["episodes"]:
+        reporter.info(
+            f"{speed['steps']} steps in {speed['seconds']:.0f} s: "
+            f"{speed['steps_per_s']:.0f} steps/s in {speed['workers']} processes"
+        )
+    for video in results["videos"]:
+        reporter.artifact("video", folder / video["path"])

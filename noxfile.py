@@ -19,7 +19,7 @@ import nox
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
-from tools import envs, project, rendering, shell, torch_build, wheels  # noqa: E402
+from tools import envs, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
 
 nox.needs_version = ">=2024.4.15"
 nox.options.sessions = ["tests"]
@@ -44,6 +44,7 @@ def tests(session: nox.Session) -> None:
         make_renderable(session, dev)
         step("pytest", lambda: dev.run("pytest", *PYTEST, cwd=ROOT, env=rendering.VARIABLES))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
+        step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))
 
 
 @nox.session
@@ -189,6 +190,12 @@ def run_demo(session: nox.Session, arguments: list[str]) -> None:
     env, build = demo_env(session)
     words = ["--build", build, "--installed-in", f"{time.monotonic() - began:.1f}", *arguments]
     env.run("python", "-m", "tools.demo", *words, cwd=ROOT, env=rendering.VARIABLES)
+
+
+def check_stranger(session: nox.Session) -> None:
+    env, _ = demo_env(session)
+    builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
+    unseen.check(env, builder, ROOT / ".nox" / "stranger")
 
 
 class steps:

@@ -5,10 +5,12 @@ They stand for what a third party publishes: a wheel with entry points, installe
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
 from tools.envs import Env
+from tools.shell import StepFailed
 
 PYPROJECT = """
 [build-system]
@@ -173,3 +175,38 @@ def install(env: Env, *wheels: Path) -> None:
 def remove(env: Env, *names: str) -> None:
     """Uninstall distributions again."""
     env.run("python", "-m", "pip", "uninstall", "-q", "-y", *names, quiet=True, echo=False)
+
+
+def check(env: Env, builder: Env, folder: Path) -> None:
+    """Install a stranger's plugin into ``env``, run it by config alone, also beside broken ones.
+
+    ``env`` is as before when this returns or raises.
+
+    Raises:
+        StepFailed: a command failed, or did not say what it must.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    config = folder / "acme.toml"
+    projects = [good(folder), failing(folder), mistyped(folder)]
+    config.write_text(CONFIG, encoding="utf-8")
+    fine, *broken = (wheel(project, folder / "dist", builder) for project in projects)
+    run = ("run", "--config", str(config), "--work-dir", str(folder / "work"))
+    info: Path | None = None
+    try:
+        install(env, fine)
+        _expect(env, "AcmeEvalRunner", "plugins", "list")
+        _expect(env, "reached: True", *run)
+        install(env, *broken)
+        info = corrupt(env)
+        _expect(env, "AcmeEvalRunner", "plugins", "list")
+        _expect(env, "reached: True", *run)
+    finally:
+        remove(env, "fluxvla-acme", "fluxvla-broken", "fluxvla-typo")
+        if info is not None:
+            shutil.rmtree(info)
+
+
+def _expect(env: Env, words: str, *command: str) -> None:
+    said = env.run("fluxvla", *command, quiet=True)
+    if words not in said:
+        raise StepFailed(["fluxvla", *command], 0, f"did not say {words!r}:\n{said}")

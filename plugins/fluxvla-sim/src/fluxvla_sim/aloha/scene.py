@@ -66,7 +66,9 @@ def load_model(quality: str = "cheap", height: int = 480, width: int = 640) -> A
     # Found without importing the package, which would pull in gymnasium.
     package = importlib.util.find_spec("gym_aloha")
     if package is None or package.origin is None:
-        raise RunFailed("the ALOHA scene is not installed", next="pip install --no-deps gym-aloha==0.1.5")
+        raise RunFailed(
+            "the ALOHA scene is not installed", next="pip install --no-deps gym-aloha==0.1.5"
+        )
     model = mujoco.MjModel.from_xml_path(str(Path(package.origin).parent / "assets" / _SCENE))
     set_quality(model, quality, height, width)
     return model

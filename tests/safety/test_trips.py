@@ -97,13 +97,17 @@ def test_what_is_only_too_fast_or_a_little_too_far_is_left_to_the_limits():
     checked([[1.0, 0.5, 0.0], [2.9, 0.5, -0.1], [3.2, 0.5, 0.0]])
 
 
+def test_a_gripper_may_be_wanted_well_beyond_closed():
+    checked([[0.0, 0.5, -0.9], [0.0, 0.5, 1.9]])
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
         ([[2.5, 0.5, 0.0]], "keyframe 0 wants turn to jump by 2.5; at full speed that takes 1.15"),
-        ([[0, 0.5, 0], [0, 1.2, 0]], "keyframe 1 wants slide to jump by 0.7"),
+        ([[0, 0.05, 0], [0, 1.0, 0]], r"keyframe 1 wants slide to jump by 0\.95"),
         ([[0, 1.3, 0]], r"keyframe 0 wants slide at 1.3, far beyond its limits \[0, 1\] m"),
-        ([[0, 0.5, -0.3]], "keyframe 0 wants jaw at -0.3, far beyond"),
+        ([[0, 0.5, -1.1]], r"keyframe 0 wants jaw at -1\.1, far beyond"),
         ([[0, 0.5, 0], [0, np.nan, 0]], "not finite: keyframe 1, slide is nan"),
         ([[0, 0.5]], r"has shape \(1, 2\); arm takes \(T, 3\)"),
     ],

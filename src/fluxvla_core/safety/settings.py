@@ -26,7 +26,7 @@ class SafetySettings:
         jump_s: a chunk that asks a joint to be further away than it could go in this time at full
             speed is no motion, and stops.
         excess: a chunk that lies further beyond a position limit than this share of the joint's
-            range stops; less is clamped.
+            range stops; less is clamped. Grippers may be wanted four times as far beyond.
         starvation_s: how long the arm may hold and wait for the next chunk while it runs.
         first_chunk_s: how long the first answer of a policy may take (it may have to warm up), and
             any answer in a simulation whose time stands still meanwhile.

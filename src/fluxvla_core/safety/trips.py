@@ -16,6 +16,8 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 Array = npt.NDArray[np.float64]
 # A prismatic joint's tracking error in m, as a share of a revolute one's in rad.
 PRISMATIC_SHARE = 0.1
+# How much further beyond its limits a gripper may be wanted: pressing is how policies hold things.
+GRIPPER_EXCESS = 4.0
 
 
 @dataclass(frozen=True)
@@ -178,16 +180,20 @@ def check_chunk(
         )
     joints = embodiment.joints
     lower, upper = np.array([(j.lower, j.upper) for j in joints]).T
-    excess = np.maximum(lower - keyframes, keyframes - upper) / (upper - lower)
+    allowed = np.array(
+        [settings.excess * (GRIPPER_EXCESS if j.kind == "gripper" else 1.0) for j in joints]
+    )
+    excess = np.maximum(lower - keyframes, keyframes - upper) / (upper - lower) / allowed
     row, column = np.unravel_index(np.argmax(excess), excess.shape)
-    if excess[row, column] > settings.excess:
+    if excess[row, column] > 1.0:
         joint = joints[column]
         raise BadChunk(
             f"keyframe {row} wants {joint.name} at {keyframes[row, column]:.4g}, far beyond its "
             f"limits [{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
             cause="the policy's units or statistics are not this robot's",
         )
-    moves = np.diff(np.vstack([last, keyframes]), axis=0)
+    reachable = np.clip(keyframes, lower, upper)
+    moves = np.diff(np.vstack([last, reachable]), axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
     seconds = np.abs(moves) / np.array([j.velocity for j in joints]) - 1.0 / rate_hz
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.data.metadata import read_json
+from fluxvla_core.data.files import read_json
 from fluxvla_core.data.recording import Recorded
 from fluxvla_core.errors import DataError, SpecMismatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match

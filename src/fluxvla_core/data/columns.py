@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.metadata import Metadata, read_table
+from fluxvla_core.data.episodes import FileId
+from fluxvla_core.data.files import read_table
+from fluxvla_core.data.metadata import Metadata
 from fluxvla_core.data.optional import arrow
 from fluxvla_core.errors import DataError
 
@@ -30,15 +31,12 @@ def read_columns(meta: Metadata, vectors: Sequence[str]) -> dict[str, Array]:
     scalars = ("timestamp", "episode_index", "task_index")
     names = [*widths, *scalars]
     parts: dict[str, list[Array]] = {name: [] for name in names}
-    files = sorted(set(meta.episodes.files))
-    for file in files:
+    rows: dict[FileId, int] = {}
+    for length, file in zip(meta.episodes.lengths, meta.episodes.files, strict=True):
+        rows[file] = rows.get(file, 0) + int(length)
+    for file, expected in sorted(rows.items()):
         path = meta.data_file(file)
         table = read_table(path, names)
-        expected = sum(
-            int(n)
-            for n, f in zip(meta.episodes.lengths, meta.episodes.files, strict=True)
-            if f == file
-        )
         if table.num_rows != expected:
             raise DataError(f"{path}: {expected} frames expected, {table.num_rows} found")
         for name in names:
@@ -59,7 +57,7 @@ def _check_rows(meta: Metadata, episode_of_row: Array) -> None:
     if not inside or not np.array_equal(episode_of_row, expected):
         raise DataError(
             f"{meta.root}: the rows of the data files are not those that the episode table lists",
-            cause=f"files of two recordings were mixed, or {v3.EPISODES} was edited",
+            cause="files of two recordings were mixed, or the episode table was edited",
         )
 
 

@@ -12,7 +12,8 @@ from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data.assemble import Episode, Recording, assemble
 from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.encode import CODECS, Clip
-from fluxvla_core.data.metadata import Metadata, read_metadata, read_table
+from fluxvla_core.data.files import read_table
+from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.writer import (
     check_absent,
     explain_disk,

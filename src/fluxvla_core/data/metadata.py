@@ -1,49 +1,21 @@
-"""What a dataset says about itself: ``meta/`` of LeRobot v3.0, read and checked, no frames yet."""
+"""What a dataset says about itself: its ``meta/``, read and checked, no frames yet."""
 
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.optional import arrow, parquet
+from fluxvla_core.data import tables_v2, tables_v3
+from fluxvla_core.data.episodes import Episodes, FileId
+from fluxvla_core.data.files import read_json
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-Ints = npt.NDArray[np.int64]
-FileId = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class VideoPlaces:
-    """Where each episode's video is: ``(chunk_index, file_index)`` and its start in seconds."""
-
-    files: Sequence[FileId]
-    starts: npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """The episode table, one entry an episode; rows count over the whole dataset."""
-
-    first_row: Ints
-    end_row: Ints
-    files: Sequence[FileId]
-    videos: Mapping[str, VideoPlaces]
-
-    def __len__(self) -> int:
-        return len(self.first_row)
-
-    @property
-    def lengths(self) -> Ints:
-        return self.end_row - self.first_row
+VERSIONS = ("v2.0", "v2.1", v3.VERSION)
 
 
 @dataclass(frozen=True)
@@ -55,6 +27,15 @@ class Metadata:
     tasks: tuple[str, ...]
     episodes: Episodes
     embodiment: EmbodimentSpec | None
+
+    @property
+    def version(self) -> str:
+        """``v2.0``, ``v2.1`` or ``v3.0``."""
+        return str(self.info["codebase_version"])
+
+    @property
+    def tasks_file(self) -> str:
+        return v3.TASKS if self.version == v3.VERSION else tables_v2.TASKS
 
     @property
     def fps(self) -> float:
@@ -71,12 +52,10 @@ class Metadata:
         return [k for k, f in self.features.items() if f["dtype"] in ("video", "image")]
 
     def data_file(self, file: FileId) -> Path:
-        pattern: str = self.info["data_path"]
-        return self.root / pattern.format(chunk_index=file[0], file_index=file[1])
+        return self.root / _path(self.info["data_path"], file)
 
     def video_file(self, key: str, file: FileId) -> Path:
-        pattern: str = self.info["video_path"]
-        return self.root / pattern.format(video_key=key, chunk_index=file[0], file_index=file[1])
+        return self.root / _path(self.info["video_path"], file, video_key=key)
 
     def camera(self, name: str) -> str:
         """The feature that ``name`` (a feature, or a camera's short name) means.
@@ -131,8 +110,10 @@ def read_metadata(root: Path) -> Metadata:
         DataError: no such folder, not a dataset, of another version, empty, or damaged.
     """
     info = _read_info(root)
-    episodes = _read_episodes(root, info)
-    tasks = _read_tasks(root)
+    tables = tables_v3 if info["codebase_version"] == v3.VERSION else tables_v2
+    episodes = tables.read_episodes(root, info)
+    numbered = tables.read_tasks(root)
+    tasks = tuple(numbered.get(i, "") for i in range(max(numbered, default=-1) + 1))
     frames = int(episodes.lengths.sum())
     for what, stated, found in (
         ("episodes", info["total_episodes"], len(episodes)),
@@ -172,13 +153,11 @@ def _read_info(root: Path) -> dict[str, Any]:
         )
     info = read_json(path)
     version = info.get("codebase_version")
-    if not str(version).startswith(v3.VERSION):
+    if version not in VERSIONS:
         raise DataError(
-            f"{root}: LeRobot dataset of version {version}, {v3.VERSION} is what is read here",
-            next="convert a copy: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30 "
-            f"--repo-id=NAME --root={root}"
-            if str(version).startswith("v2.")
-            else None,
+            f"{root}: LeRobot dataset of version {version}, "
+            f"{', '.join(VERSIONS[:-1])} and {VERSIONS[-1]} are what is read here",
+            next="convert a copy with the LeRobot that reads it",
         )
     missing = sorted({"fps", "features", "data_path", "total_episodes", "total_frames"} - set(info))
     if missing:
@@ -204,83 +183,9 @@ def _inner_dataset(root: Path) -> str | None:
     return f"did you mean {inner.parent.parent}?" if inner else None
 
 
-def _read_tasks(root: Path) -> tuple[str, ...]:
-    table = read_table(root / v3.TASKS)
-    text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
-    if text is None or "task_index" not in table.column_names:
-        raise DataError(f"{root / v3.TASKS}: columns {table.column_names} hold no tasks")
-    found = dict(zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True))
-    return tuple(found.get(i, "") for i in range(max(found, default=-1) + 1))
-
-
-def _read_episodes(root: Path, info: Mapping[str, Any]) -> Episodes:
-    pa = arrow()
-
-    paths = sorted(root.glob("meta/episodes/*/*.parquet"))
-    if not paths:
-        raise DataError(f"{root}: meta/episodes holds no episode table")
-    videos = [k for k, f in info["features"].items() if f["dtype"] == "video"]
-    columns = [
-        *("episode_index", "dataset_from_index", "dataset_to_index"),
-        *("data/chunk_index", "data/file_index"),
-        *(
-            f"videos/{k}/{n}"
-            for k in videos
-            for n in ("chunk_index", "file_index", "from_timestamp")
-        ),
-    ]
-    table = pa.concat_tables([read_table(path, columns) for path in paths])
-    table = table.sort_by("episode_index")
-    index = table["episode_index"].to_numpy()
-    if not np.array_equal(index, np.arange(len(index))):
-        raise DataError(f"{root}: the episode table does not number its episodes 0, 1, 2, …")
-
-    def files(prefix: str) -> list[FileId]:
-        chunk, file = (table[f"{prefix}/{n}_index"].to_pylist() for n in ("chunk", "file"))
-        return list(zip(chunk, file, strict=True))
-
-    return Episodes(
-        table["dataset_from_index"].to_numpy().astype(np.int64),
-        table["dataset_to_index"].to_numpy().astype(np.int64),
-        files("data"),
-        {
-            k: VideoPlaces(files(f"videos/{k}"), table[f"videos/{k}/from_timestamp"].to_numpy())
-            for k in videos
-        },
+def _path(pattern: str, file: FileId, **names: str) -> str:
+    """``pattern`` filled in; version 2 counts chunks and files of episodes under other names."""
+    chunk, number = file
+    return pattern.format(
+        chunk_index=chunk, file_index=number, episode_chunk=chunk, episode_index=number, **names
     )
-
-
-def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """A parquet file as a pyarrow table.
-
-    Raises:
-        DataError: it is missing, damaged, or lacks a column.
-    """
-    pa = arrow()
-    pq = parquet()
-
-    if not path.is_file():
-        raise DataError(f"{path}: the file is missing")
-    try:
-        with pq.ParquetFile(path) as file:
-            lacking = sorted(set(columns or ()) - set(file.schema_arrow.names))
-            if lacking:
-                raise DataError(f"{path}: column {', '.join(map(repr, lacking))} is missing")
-            return file.read(columns=list(columns) if columns else None, use_threads=False)
-    except (pa.ArrowException, OSError) as error:
-        raise DataError(
-            f"{path}: cannot be read as parquet ({str(error).splitlines()[0]})",
-            cause="the file is truncated, or its writer was stopped before its end",
-            next="copy the file again from where it came from",
-        ) from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises DataError if it cannot be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error})") from error
-    if not isinstance(found, dict):
-        raise DataError(f"{path}: holds a {type(found).__name__}, not a table")
-    return found

@@ -1,4 +1,4 @@
-"""Training samples from LeRobot datasets of version 3.0."""
+"""Training samples from LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ Sample = dict[str, Any]
 
 
 class ParquetDataset:
-    """Frames of LeRobot v3.0 datasets as training samples: map style, random access.
+    """Frames of LeRobot datasets as training samples: map style, random access.
+
+    Versions 2.0, 2.1 and 3.0; each dataset's ``meta/info.json`` says which it is.
 
     A sample begins as ``images`` (a list of ``(3, H, W)`` uint8, one a camera), ``img_masks``
     ``(N,)`` bool, ``states`` ``(D,)`` float32, ``actions`` ``(T, D)`` float32, ``action_masks``

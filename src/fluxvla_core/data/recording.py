@@ -123,7 +123,7 @@ def _check_tasks(meta: Metadata, index: npt.NDArray[Any]) -> None:
     if index.min() < 0 or index.max() >= known:
         raise DataError(
             f"{meta.root}: task_index runs from {index.min()} to {index.max()}, "
-            f"meta/tasks.parquet lists {known} tasks"
+            f"{meta.tasks_file} lists {known} tasks"
         )
 
 
@@ -134,15 +134,11 @@ def _track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[np.b
     wanted = [f for f, use in zip(places.files, chosen, strict=True) if use]
     numbers = {f: i for i, f in enumerate(dict.fromkeys(wanted))}
     files = tuple(meta.video_file(key, f) for f in numbers)
-    for number, path in enumerate(files):
-        ends = [
-            round(start * meta.fps) + int(length)
-            for start, length, file, use in zip(
-                places.starts, lengths, places.files, chosen, strict=True
-            )
-            if use and numbers[file] == number
-        ]
-        check_video(path, max(ends))
+    ends = [0] * len(files)
+    for start, length, place in zip(places.starts[chosen], lengths[chosen], wanted, strict=True):
+        ends[numbers[place]] = max(ends[numbers[place]], round(start * meta.fps) + int(length))
+    for path, end in zip(files, ends, strict=True):
+        check_video(path, end)
     file = [numbers.get(f, -1) for f in places.files]
     height, width, _ = meta.features[key]["shape"]
     return Track(

@@ -229,6 +229,14 @@ def test_a_robot_that_never_gives_a_reading(bench):
     assert_stopped(bench, "operator", "no complete reading")
 
 
+def test_a_robot_whose_get_frame_hangs(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+    bench.arm.faults["get_frame"] = lambda: time.sleep(2)
+
+    fails(bench, NotReady, r"Arm\.get_frame does not return", ready_timeout=0.2)
+    assert bench.arm.sent == []
+
+
 def test_a_robot_that_is_ready_after_a_while(bench):
     begin = time.monotonic()
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import threading
+
 import numpy as np
 import pytest
 
@@ -267,3 +271,47 @@ def test_hooks_watch_and_cannot_touch(bench, monkeypatch):
         ("episode_finished", "max_steps"),
         ("run_finished", "ok"),
     ]
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_on_a_robot_all_readings_are_made_in_one_thread_and_all_commands_in_another(
+    bench, make_arm, asynchronous
+):
+    bench.arm = make_arm(realtime=True)
+    reading, sending = set(), set()
+    get_frame, send_action = bench.arm.get_frame, bench.arm.send_action
+
+    def read():
+        reading.add(threading.current_thread())
+        return get_frame()
+
+    def send(action):
+        sending.add(threading.current_thread())
+        send_action(action)
+
+    bench.arm.get_frame, bench.arm.send_action = read, send
+
+    bench.run(max_publish_step=40, async_execution=asynchronous, record_fps=None)
+
+    assert len(reading) == 1
+    assert sending == {threading.main_thread()}
+    bench.assert_within_limits()
+
+
+def test_while_it_moves_the_policy_is_asked_again_and_again(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+
+    bench.run(max_publish_step=50, async_execution=True)
+
+    assert len(bench.policy.asked) > 10
+    assert bench.arm.state[0] > 0.3
+
+
+def test_nothing_heavy_is_imported_to_drive_a_robot():
+    code = (
+        "import sys, fluxvla_core.infer.base_runner, fluxvla_core.record.trace;"
+        "print([m for m in ('torch', 'cv2', 'av', 'pyarrow', 'rich') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == "[]"

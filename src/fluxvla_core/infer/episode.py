@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,7 @@ class Episode:
         while True:
             self._plan.interrupts.check()
             try:
-                window, frame = self._plan.look()
+                window, frame = self._look(until)
                 _check_complete(window, self._plan.cameras)
                 return window, frame
             except NotReady as error:
@@ -160,6 +161,19 @@ class Episode:
                         next=error.next,
                     ) from error
                 time.sleep(0.02)
+
+    def _look(self, until: float) -> tuple[dict[str, Any], Frame | None]:
+        """A reading in the thread that all readings are made in: cameras may be bound to one."""
+        plan = self._plan
+        if plan.robot.lockstep:
+            return plan.look()
+        future = plan.worker.submit(plan.look)
+        while not future.done() and time.monotonic() < until:
+            plan.interrupts.check()
+            wait((future,), timeout=0.02)
+        if not future.done():
+            raise NotReady(f"{plan.robot.name}.get_frame does not return")
+        return future.result()
 
     def _checked(self, window: dict[str, Any], frame: Frame | None) -> Array:
         """The state of a reading that is what the embodiment describes, ``(state_dim,)``."""

@@ -75,7 +75,10 @@ class Robot:
         self.sent_s = time.perf_counter() - began
 
     def state(self) -> npt.NDArray[np.float64] | None:
-        """The ``(state_dim,)`` state alone, from an operator that has ``get_state``; else None."""
+        """The ``(state_dim,)`` state alone, from an operator that has ``get_state``; else None.
+
+        It is read after each command, on a real robot while another thread may read frames.
+        """
         read = getattr(self.operator, "get_state", None)
         return None if read is None else np.asarray(read(), dtype=np.float64)
 

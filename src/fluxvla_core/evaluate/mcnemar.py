@@ -72,7 +72,8 @@ def one_sided_p(for_it: int, against: int) -> float:
     if for_it < 0 or against < 0:
         raise ValueError(f"counts cannot be below 0: {for_it}, {against}")
     tosses = for_it + against
-    return sum(comb(tosses, heads) for heads in range(for_it, tosses + 1)) / 2**tosses
+    tail = sum(comb(tosses, heads) for heads in range(for_it, tosses + 1))
+    return float(tail / 2**tosses)
 
 
 def compare(a: Iterable[Mapping[str, Any]], b: Iterable[Mapping[str, Any]]) -> Comparison:

@@ -12,6 +12,10 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-aloha": {"runners": ("AlohaInferenceRunner",)},
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-libero": {
+        "commands": ("collect-libero",),
+        "runners": ("LiberoEvalRunner", "LiberoInferenceRunner"),
+    },
     "fluxvla-models": {
         "heads": ("FlowMatchingHead",),
         "llm_backbones": ("SentenceEncoder",),

@@ -144,9 +144,7 @@ class LiberoEvalWorker:
 
         def watch(action: Any) -> None:
             if scene.steps % stride == 0:
-                writer.add(
-                    np.hstack([scene.render(name, height, width) for name in SCENE_CAMERAS])
-                )
+                writer.add(np.hstack([scene.render(name, height, width) for name in SCENE_CAMERAS]))
 
         return watch, writer.close
 

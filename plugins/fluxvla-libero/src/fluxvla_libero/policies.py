@@ -56,9 +56,7 @@ def make_policy(name: str, loading: Loading) -> Policy:
     dataset, denormalize = loading.dataset, loading.denormalize_action
     if loading.norm_stats_key is not None:
         dataset, denormalize = _with_statistics(loading)
-    policy = load_policy(
-        loading.ckpt_path, loading.device, dataset, denormalize, loading.precision
-    )
+    policy = load_policy(loading.ckpt_path, loading.device, dataset, denormalize, loading.precision)
     if name == "untrained":
         policy.model = untrained_model(loading.ckpt_path, loading.device)
     return policy

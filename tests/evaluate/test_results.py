@@ -1,0 +1,120 @@
+"""What every evaluation writes alike: results, timing, which episodes are shown, what is said."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import pytest
+
+from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.errors import CheckpointError, RunFailed
+from fluxvla_core.evaluate import results
+from fluxvla_core.evaluate.showing import choose_episodes, video_name
+from fluxvla_core.evaluate.subject import chosen_checkpoint
+from fluxvla_core.evaluate.summary import summarise
+
+
+def record(task, seed, success, group="policy", **more):
+    head = {"group": group, "task": task, "seed": seed, "status": "done", "success": success}
+    return {**head, "steps": 10, "calls": 2, "timing": {"policy_seconds": 0.004}, **more}
+
+
+def test_failures_come_first_and_tasks_in_turn():
+    records = [record(t, s, s > 2) for s in range(6) for t in ("a", "b")]
+    chosen = [(r["task"], r["seed"]) for r in choose_episodes(records, 4)]
+    assert chosen == [("a", 0), ("b", 0), ("a", 3), ("b", 3)]
+    assert len(choose_episodes(records, 100)) == 12
+    assert choose_episodes(records, 0) == []
+
+
+def test_what_there_is_fills_up_what_there_is_not():
+    only = [record("a", s, True) for s in range(5)]
+    assert [r["seed"] for r in choose_episodes(only, 3)] == [0, 1, 2]
+    one = [record("a", 0, False), *only[1:]]
+    assert [r["seed"] for r in choose_episodes(one, 4)] == [0, 1, 2, 3]
+
+
+def test_other_groups_and_errors_are_not_shown():
+    records = [record("a", 0, False, group="untrained"), record("a", 1, False, status="error")]
+    assert choose_episodes(records, 3) == []
+    assert len(choose_episodes(records, 3, group="untrained")) == 1
+
+
+def test_a_videos_name_says_what_it_shows():
+    assert video_name(3, record("lift", 7, False)) == "03-failure-lift-seed-7.mp4"
+    assert video_name(0, record("lift", 7, True)) == "00-success-lift-seed-7.mp4"
+
+
+def test_results_appear_whole(tmp_path):
+    path = tmp_path / "results.json"
+    results.write_results(path, {"a": 1})
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_named_and_can_be_mended(tmp_path, monkeypatch):
+    def full(source, target):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(RunFailed, match="No space left on device") as caught:
+        results.write_results(tmp_path / "results.json", {})
+    assert "make room and run the same command again" in str(caught.value)
+
+
+def test_a_folder_that_is_gone_is_no_full_disk(tmp_path):
+    with pytest.raises(RunFailed, match="results cannot be written") as caught:
+        results.write_results(tmp_path / "gone" / "results.json", {})
+    assert "make room" not in str(caught.value)
+
+
+def test_speed_is_told_of_whole_runs_only():
+    records = [record("a", 0, True), record("a", 1, False), {"status": "error"}]
+    whole = results.timing(records, 3, 2.0, 4)
+    assert whole["steps"] == 20
+    assert whole["steps_per_s"] == 10.0
+    assert whole["policy_ms"] == pytest.approx(2.0)
+    rest = results.timing(records, 1, 2.0, 4)
+    assert rest == {"episodes": 0, "workers": 4, "policy_ms": pytest.approx(2.0)}
+
+
+def test_errors_alone_are_no_result(tmp_path):
+    results.check_any_done([record("a", 0, True)], tmp_path)
+    with pytest.raises(RunFailed, match=r"none of the 1 episodes gave a result.*\nit blew up"):
+        results.check_any_done([{"status": "error", "error": "it blew up"}], tmp_path)
+
+
+def test_people_are_told_rates_speed_and_videos(tmp_path):
+    class Listener(SilentReporter):
+        lines: list[str]
+
+        def info(self, text):
+            self.lines.append(text)
+
+        def artifact(self, kind, path):
+            self.lines.append(f"{kind} {path.name}")
+
+    listener = Listener()
+    listener.lines = []
+    records = [record("a", 0, True), record("b", 0, False)]
+    found = {
+        "groups": summarise(records),
+        "timing": results.timing(records, 2, 4.0, 2),
+        "videos": [{"path": "videos/x.mp4"}],
+    }
+    results.tell(listener, found, tmp_path)
+    assert listener.lines == [
+        "policy a: 1/1 = 100% (95% interval 21% to 100%)",
+        "policy b: 0/1 = 0% (95% interval 0% to 79%)",
+        "policy all tasks: 1/2 = 50% (95% interval 9% to 91%)",
+        "20 steps in 4 s: 5 steps/s in 2 processes",
+        "video x.mp4",
+    ]
+
+
+def test_no_checkpoint_is_said_with_what_to_do(tmp_path):
+    with pytest.raises(CheckpointError, match="no whole checkpoint") as caught:
+        chosen_checkpoint(None, tmp_path)
+    assert "train first" in str(caught.value)

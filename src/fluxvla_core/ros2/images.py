@@ -170,7 +170,7 @@ def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) 
         raise Faulted(
             f"{source} sends {pixels.shape[1]}x{pixels.shape[0]} pictures, "
             f"the embodiment says {width}x{height}",
-            next="set the camera driver's resolution, or the operator's image_size",
+            next="set the camera driver's resolution, or the operator's height and width",
         )
 
 

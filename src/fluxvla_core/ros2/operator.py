@@ -118,9 +118,9 @@ class RosOperator(ABC):
         """Called in every ``stop``, after the arm holds: stop what else can move."""
         return
 
-    def check_robot(self) -> None:
-        """Called before every action; raises Faulted when the robot says that it cannot move."""
-        return
+    def admit(self, action: Array) -> Array:
+        """What of an action is sent, given what the robot says now; raises Faulted if nothing."""
+        return action
 
     # The contract.
 
@@ -141,7 +141,7 @@ class RosOperator(ABC):
             self._fault, self._last = None, None
             connection = Connection(f"fluxvla_{self.embodiment.name}", self.domain_id)
             try:
-                self._open(connection)
+                self._subscribe_all(connection)
                 self._connection = connection
                 self.get_frame()
                 self.on_connected(connection)
@@ -192,9 +192,9 @@ class RosOperator(ABC):
             connection.check()
             if self._fault is not None:
                 raise self._fault
-            self.check_robot()
-            self.publish_action(checked)
-            self._last = checked
+            admitted = self.admit(checked)
+            self.publish_action(admitted)
+            self._last = admitted
 
     def stop(self) -> None:
         """Hold: repeat the last command, or where a joint is if it was kept from following.
@@ -221,12 +221,11 @@ class RosOperator(ABC):
             connection = self._connection
             if connection is None:
                 return
-            try:
-                self.stop()
-                self._flush()
-            finally:
-                self._connection = None
-                connection.close()
+            self.stop()
+            self._flush()
+            self._connection = None
+        # Without the lock: the ROS thread may be waiting for it, and close waits for the thread.
+        connection.close()
 
     # For subclasses.
 
@@ -244,6 +243,11 @@ class RosOperator(ABC):
         except Exception as error:  # rclpy's own classes differ between releases
             raise Faulted(f"a command on {topic} could not be sent: {error}") from error
 
+    @property
+    def last_action(self) -> Array | None:
+        """``(dim,)`` the last command that was sent since connecting, or None."""
+        return None if self._last is None else self._last.copy()
+
     def newest(self, name: str) -> Received | None:
         """The newest message of a stream, None before the first or without a connection."""
         connection = self._connection
@@ -251,7 +255,7 @@ class RosOperator(ABC):
 
     # Parts.
 
-    def _open(self, connection: Connection) -> None:
+    def _subscribe_all(self, connection: Connection) -> None:
         self._specs = tuple(self.streams())
         commands = tuple(self.commands())
         for spec in self._specs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import importlib
 import os
 import re
@@ -44,6 +45,7 @@ def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
     return rclpy
 
 
+@functools.cache
 def message_class(path: str) -> Any:
     """The class that ``sensor_msgs.msg:Image`` (or ``sensor_msgs/msg/Image``) names.
 

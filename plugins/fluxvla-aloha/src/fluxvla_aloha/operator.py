@@ -1,0 +1,286 @@
+"""ALOHA on ROS 2: two puppet arms, up to three cameras, depth and a mobile base if wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
+from fluxvla_aloha.embodiment import CAMERAS, GRIPPERS, RATE_HZ, aloha_spec
+from fluxvla_aloha.presets import PRESETS
+from fluxvla_core.errors import ConfigError, NotReady, Rejected
+from fluxvla_core.ros2 import joints
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.operator import RosOperator
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.streams import (
+    JOINT_STATE,
+    ODOMETRY,
+    SIDE,
+    TWIST,
+    CommandSpec,
+    StreamSpec,
+    camera_stream,
+)
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+SIDES = ("left", "right")
+_ARM = 7
+# The group that Interbotix's drivers know an arm's six joints by.
+_GROUP = "arm"
+
+
+class AlohaOperator(RosOperator):
+    """An ALOHA behind its ROS 2 topics. A topic that is not given is the preset's.
+
+    Args:
+        preset: ``cobot_magic`` (AgileX) or ``interbotix``.
+        img_front_topic, img_left_topic, img_right_topic: colour pictures; a topic that ends in
+            ``/compressed`` bears ``CompressedImage``.
+        img_front_depth_topic, img_left_depth_topic, img_right_depth_topic: depth pictures.
+        puppet_arm_left_topic, puppet_arm_right_topic: joint states of the arms.
+        puppet_arm_left_cmd_topic, puppet_arm_right_cmd_topic: their commands.
+        puppet_gripper_left_cmd_topic, puppet_gripper_right_cmd_topic: commands of the grippers,
+            where the arms' commands do not hold them.
+        robot_base_topic, robot_base_cmd_topic: odometry and velocity of the base.
+        use_depth_image: read depth into ``frame.depths``.
+        use_robot_base: read the base's speed into ``frame.base``, and allow :meth:`drive`.
+        publish_rate: commands a second.
+        camera_names: what front, left and right camera are called, in this order; with fewer names
+            the last cameras are not used.
+        height, width: of every picture, in pixels.
+        joint_names: names of an arm's six joints and gripper in its messages.
+        gripper_closed, gripper_open: a gripper's raw values at its ends.
+        arm_message, gripper_message: types of the commands: ``sensor_msgs.msg:JointState``, one
+            with a field ``cmd`` as Interbotix has, or a std_msgs array or number.
+        base_max_linear, base_max_angular: largest speeds of the base, in m/s and rad/s.
+        camera_rate_hz: pictures a second that should come; None: as many as are sent.
+        embodiment: in place of ViperX 300 arms, the spec of others (as ``EmbodimentSpec.to_dict``
+            gives it), with seven joints an arm, left first, gripper last.
+        domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
+            ``fluxvla_core.ros2.operator.RosOperator``.
+
+    Raises:
+        ConfigError: an unknown preset, or a value out of its range.
+    """
+
+    def __init__(
+        self,
+        preset: str = "cobot_magic",
+        img_front_topic: str | None = None,
+        img_left_topic: str | None = None,
+        img_right_topic: str | None = None,
+        img_front_depth_topic: str | None = None,
+        img_left_depth_topic: str | None = None,
+        img_right_depth_topic: str | None = None,
+        puppet_arm_left_topic: str | None = None,
+        puppet_arm_right_topic: str | None = None,
+        puppet_arm_left_cmd_topic: str | None = None,
+        puppet_arm_right_cmd_topic: str | None = None,
+        puppet_gripper_left_cmd_topic: str | None = None,
+        puppet_gripper_right_cmd_topic: str | None = None,
+        robot_base_topic: str | None = None,
+        robot_base_cmd_topic: str | None = None,
+        use_depth_image: bool = False,
+        use_robot_base: bool = False,
+        publish_rate: float = RATE_HZ,
+        camera_names: Sequence[str] = tuple(camera.name for camera in CAMERAS),
+        height: int = 480,
+        width: int = 640,
+        joint_names: Sequence[str] | None = None,
+        gripper_closed: float | None = None,
+        gripper_open: float | None = None,
+        arm_message: str | None = None,
+        gripper_message: str | None = None,
+        base_max_linear: float = 0.3,
+        base_max_angular: float = 0.5,
+        camera_rate_hz: float | None = None,
+        embodiment: Mapping[str, Any] | None = None,
+        domain_id: int | None = None,
+        connect_timeout_s: float = 10.0,
+        max_age_s: float = 0.5,
+        max_skew_s: float = 0.1,
+        sync_on: str = "stamp",
+        rate_window_s: float = 1.0,
+    ) -> None:
+        super().__init__(
+            domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s
+        )
+        known = PRESETS.get(preset)
+        if known is None:
+            raise ConfigError(f"unknown ALOHA preset {preset!r}; known are {', '.join(PRESETS)}")
+        if len(camera_names) > len(CAMERAS):
+            raise ConfigError(f"an ALOHA has {len(CAMERAS)} cameras, got {list(camera_names)}")
+        cameras = tuple(Camera(name, height, width) for name in camera_names)
+        self.embodiment = _spec(embodiment, cameras, publish_rate)
+        self._images = _given(known.images, img_front_topic, img_left_topic, img_right_topic)
+        self._depths = _given(
+            known.depths, img_front_depth_topic, img_left_depth_topic, img_right_depth_topic
+        )
+        self._states = _given(known.states, puppet_arm_left_topic, puppet_arm_right_topic)
+        self._arms = _given(known.commands, puppet_arm_left_cmd_topic, puppet_arm_right_cmd_topic)
+        self._grippers = _given(
+            known.gripper_commands or ("", ""),
+            puppet_gripper_left_cmd_topic,
+            puppet_gripper_right_cmd_topic,
+        )
+        self._base_topics = _given(
+            (known.odometry, known.velocity), robot_base_topic, robot_base_cmd_topic
+        )
+        self._use_depth = use_depth_image
+        self._use_base = use_robot_base
+        self._names = tuple(joint_names or known.joints)
+        if len(self._names) != _ARM:
+            raise ConfigError(f"joint_names are {_ARM} names of one arm, got {list(self._names)}")
+        self._gripper_closed = known.gripper_closed if gripper_closed is None else gripper_closed
+        self._gripper_open = known.gripper_open if gripper_open is None else gripper_open
+        if not 0 < abs(self._gripper_open - self._gripper_closed) < float("inf"):
+            raise ConfigError("gripper_closed and gripper_open must be different finite numbers")
+        self._arm_message = arm_message or known.arm_message
+        self._gripper_message = gripper_message or known.gripper_message
+        self._camera_hz = camera_rate_hz
+        self._drive = BaseDrive(
+            lambda message: self.publish(self._base_topics[1], message),
+            lambda: message_class(TWIST)(),
+            base_max_linear,
+            base_max_angular,
+        )
+
+    def streams(self) -> Sequence[StreamSpec]:
+        found = [
+            StreamSpec(f"{side} arm", topic, JOINT_STATE)
+            for side, topic in zip(SIDES, self._states, strict=True)
+        ]
+        cameras = self.embodiment.cameras
+        for camera, colour, depth in zip(cameras, self._images, self._depths, strict=False):
+            found.append(camera_stream(camera, colour, self._camera_hz))
+            if self._use_depth:
+                found.append(camera_stream(camera, depth, self._camera_hz, depth=True))
+        if self._use_base:
+            found.append(StreamSpec("base", self._base_topics[0], ODOMETRY, SIDE, depth=1))
+        return found
+
+    def commands(self) -> Sequence[CommandSpec]:
+        found = [CommandSpec(topic, self._arm_message) for topic in self._arms]
+        found += [CommandSpec(topic, self._gripper_message) for topic in self._grippers if topic]
+        if self._use_base:
+            found.append(CommandSpec(self._base_topics[1], TWIST))
+        return found
+
+    def read_state(self, messages: Mapping[str, Any]) -> Array:
+        arms = [
+            joints.positions(messages[f"{side} arm"], self._names, f"{side} arm ({topic})")
+            for side, topic in zip(SIDES, self._states, strict=True)
+        ]
+        state = np.concatenate(arms)
+        for column in GRIPPERS:
+            state[column] = (state[column] - self._gripper_closed) / (
+                self._gripper_open - self._gripper_closed
+            )
+        return state
+
+    def read_base(self, messages: Mapping[str, Any]) -> Array | None:
+        if not self._use_base:
+            return None
+        twist = messages["base"].twist.twist
+        return np.array([twist.linear.x, twist.angular.z])
+
+    def publish_action(self, action: Array) -> None:
+        for index, arm_topic in enumerate(self._arms):
+            arm = action[_ARM * index : _ARM * (index + 1)].copy()
+            arm[-1] = self._gripper_closed + arm[-1] * (self._gripper_open - self._gripper_closed)
+            gripper_topic = self._grippers[index]
+            if not gripper_topic:
+                self._command(arm_topic, self._arm_message, self._names, arm, _GROUP)
+                continue
+            name = self._names[-1]
+            self._command(arm_topic, self._arm_message, self._names[:-1], arm[:-1], _GROUP)
+            self._command(gripper_topic, self._gripper_message, (name,), arm[-1:], name)
+
+    def drive(self, linear: float, angular: float) -> None:
+        """Drive the base at ``linear`` m/s forward and ``angular`` rad/s.
+
+        The speed ends a quarter of a second later unless it is asked for again, and in ``stop``.
+
+        Raises:
+            Rejected: this operator has no base, or a speed is not finite or beyond its limit.
+            NotReady: not connected.
+        """
+        if not self._use_base:
+            raise Rejected("the base is not used", next="set use_robot_base=True")
+        with self._lock:
+            if self._connection is None:
+                raise NotReady("aloha is not connected", next="call connect() first")
+            self._drive.drive(linear, angular)
+
+    def on_connected(self, connection: Connection) -> None:
+        if self._use_base:
+            connection.every(TIMEOUT_S / 5, self._tick)
+
+    def on_stop(self) -> None:
+        if self._use_base:
+            self._drive.halt()
+
+    def _tick(self) -> None:
+        with self._lock:
+            if self._connection is not None:
+                self._drive.tick()
+
+    def _command(
+        self, topic: str, message: str, names: Sequence[str], values: Array, group: str
+    ) -> None:
+        self.publish(topic, fill_command(message_class(message)(), names, values, group))
+
+
+def fill_command(message: Any, names: Sequence[str], values: Array, group: str) -> Any:
+    """Put joint targets into a command message, by the fields that it has; returns it.
+
+    ``position`` (JointState): names and values. ``cmd`` (Interbotix): ``group`` as name, values;
+    one number where there is one joint. ``data`` (std_msgs): values, or one number.
+
+    Raises:
+        ConfigError: it has none of these fields.
+    """
+    if hasattr(message, "position"):
+        return joints.fill(message, names, values)
+    numbers = np.asarray(values, np.float64).tolist()
+    field = next((name for name in ("cmd", "data") if hasattr(message, name)), None)
+    if field is None:
+        raise ConfigError(
+            f"{type(message).__name__} has none of the fields position, cmd and data: "
+            "it cannot bear joint targets"
+        )
+    if field == "cmd":
+        message.name = group
+    single = isinstance(getattr(message, field), float)
+    setattr(message, field, numbers[0] if single else numbers)
+    return message
+
+
+def _given(preset: Sequence[str], *topics: str | None) -> tuple[str, ...]:
+    return tuple(topic or default for topic, default in zip(topics, preset, strict=True))
+
+
+def _spec(
+    given: Mapping[str, Any] | None, cameras: tuple[Camera, ...], rate_hz: float
+) -> EmbodimentSpec:
+    try:
+        usual = aloha_spec(cameras, rate_hz)
+    except ValueError as error:
+        raise ConfigError(f"AlohaOperator: {error}") from error
+    if given is None:
+        return usual
+    spec = EmbodimentSpec.from_dict(given)
+    kinds = [joint.kind == "gripper" for joint in spec.joints]
+    if kinds != [joint.kind == "gripper" for joint in usual.joints]:
+        raise ConfigError(
+            f"embodiment {spec.name}: AlohaOperator commands two arms of six joints and a gripper, "
+            f"left first; got {list(spec.joint_names)}"
+        )
+    return EmbodimentSpec(
+        spec.name, spec.joints, cameras, rate_hz, spec.action_mode, source=spec.source
+    )

@@ -1,0 +1,355 @@
+"""AlohaOperator: what it is told by a config, and what it does on real topics."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
+from fluxvla_aloha.embodiment import START_POSE, aloha_spec
+from fluxvla_aloha.operator import AlohaOperator, fill_command
+from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
+
+from fluxvla_core.build import build_operator_from_cfg
+from fluxvla_core.errors import ConfigError, LoadFailed, NotReady, Rejected
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, ODOMETRY, TWIST
+from fluxvla_core.testing import OperatorConformance
+from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
+
+__all__ = ["drivers", "lasting_drivers", "ros_domain"]
+
+SMALL = {"height": 48, "width": 64}
+QUICK = {**SMALL, "rate_window_s": 0.0, "connect_timeout_s": 8.0}
+SPECIFICATION = {
+    # The operator of the specification's Aloha config, word for word.
+    "type": "AlohaOperator",
+    "img_front_topic": "/camera_f/color/image_raw",
+    "img_left_topic": "/camera_l/color/image_raw",
+    "img_right_topic": "/camera_r/color/image_raw",
+    "img_front_depth_topic": "/camera_f/depth/image_raw",
+    "img_left_depth_topic": "/camera_l/depth/image_raw",
+    "img_right_depth_topic": "/camera_r/depth/image_raw",
+    "puppet_arm_left_cmd_topic": "/master/joint_left",
+    "puppet_arm_right_cmd_topic": "/master/joint_right",
+    "puppet_arm_left_topic": "/puppet/joint_left",
+    "puppet_arm_right_topic": "/puppet/joint_right",
+    "robot_base_topic": "/odom_raw",
+    "robot_base_cmd_topic": "/cmd_vel",
+}
+
+
+def raw(pose, closed, opened):
+    """One arm's seven numbers as its driver has them."""
+    return [*pose[:6], closed + pose[6] * (opened - closed)]
+
+
+def robot(preset=COBOT_MAGIC, depth=False, base=False, **messages):
+    """Streams and sinks of an ALOHA's drivers, for ``Driver``."""
+    streams = [
+        {
+            "topic": state,
+            "message": JOINT_STATE,
+            "hz": 100,
+            "names": list(preset.joints),
+            "positions": raw(START_POSE[:7], preset.gripper_closed, preset.gripper_open),
+            "follows": command,
+        }
+        for state, command in zip(preset.states, preset.commands, strict=True)
+    ]
+    streams += [{"topic": t, "message": IMAGE, "hz": 30, **SMALL} for t in preset.images]
+    sinks = [{"topic": t, "message": messages.get("arm", JOINT_STATE)} for t in preset.commands]
+    for topic in preset.gripper_commands or ():
+        sinks.append({"topic": topic, "message": messages["gripper"]})
+    if depth:
+        kind = {"message": IMAGE, "hz": 30, "encoding": "16UC1", **SMALL}
+        streams += [{"topic": t, **kind} for t in preset.depths]
+    if base:
+        streams.append(
+            {"topic": preset.odometry, "message": ODOMETRY, "hz": 50, "data": [0.2, -0.1]}
+        )
+        sinks.append({"topic": preset.velocity, "message": TWIST})
+    return streams, sinks
+
+
+def wait_for(condition, seconds=8.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "did not happen in time"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def connect(ros_domain):
+    made = []
+
+    def make(**arguments):
+        operator = AlohaOperator(**{**QUICK, **arguments})
+        made.append(operator)
+        operator.connect()
+        return operator
+
+    yield make
+    for operator in made:
+        operator.close()
+
+
+@pytest.fixture(scope="module")
+def lasting_robot(lasting_drivers):
+    return lasting_drivers(*robot())
+
+
+class TestConfig:
+    def test_the_specifications_table_is_the_default(self):
+        built = build_operator_from_cfg(SPECIFICATION)
+        plain = AlohaOperator()
+
+        assert isinstance(built, AlohaOperator)
+        assert built.streams() == plain.streams()
+        assert built.commands() == plain.commands()
+        assert built.embodiment == aloha_spec()
+
+    def test_topics_and_cameras_are_those_of_the_config(self):
+        operator = AlohaOperator(
+            img_front_topic="/top/compressed",
+            puppet_arm_left_topic="/l",
+            camera_names=("top",),
+            camera_rate_hz=15.0,
+            publish_rate=25.0,
+            **SMALL,
+        )
+        left, right, top = operator.streams()
+
+        assert (left.topic, right.topic) == ("/l", "/puppet/joint_right")
+        assert (top.name, top.topic, top.expected_hz) == ("top", "/top/compressed", 15.0)
+        assert top.message.endswith("CompressedImage")
+        assert (top.camera.height, top.camera.width) == (48, 64)
+        assert operator.embodiment.rate_hz == 25.0
+
+    def test_depth_and_base_are_read_only_if_wanted(self):
+        names = [s.name for s in AlohaOperator(use_depth_image=True, use_robot_base=True).streams()]
+
+        assert names == [
+            "left arm",
+            "right arm",
+            "cam_high",
+            "cam_high_depth",
+            "cam_left_wrist",
+            "cam_left_wrist_depth",
+            "cam_right_wrist",
+            "cam_right_wrist_depth",
+            "base",
+        ]
+        assert [c.topic for c in AlohaOperator(use_robot_base=True).commands()][-1] == "/cmd_vel"
+
+    def test_interbotix_has_topics_messages_and_grippers_of_its_own(self):
+        operator = AlohaOperator(preset="interbotix")
+
+        assert [s.topic for s in operator.streams()] == [*INTERBOTIX.states, *INTERBOTIX.images]
+        assert [(c.topic, c.message) for c in operator.commands()] == [
+            ("/follower_left/commands/joint_group", "interbotix_xs_msgs.msg:JointGroupCommand"),
+            ("/follower_right/commands/joint_group", "interbotix_xs_msgs.msg:JointGroupCommand"),
+            ("/follower_left/commands/joint_single", "interbotix_xs_msgs.msg:JointSingleCommand"),
+            ("/follower_right/commands/joint_single", "interbotix_xs_msgs.msg:JointSingleCommand"),
+        ]
+
+    @pytest.mark.parametrize(
+        ("arguments", "what"),
+        [
+            (
+                {"preset": "alhoa"},
+                "unknown ALOHA preset 'alhoa'; known are cobot_magic, interbotix",
+            ),
+            ({"camera_names": tuple("abcd")}, "an ALOHA has 3 cameras, got"),
+            ({"camera_names": ("a", "a")}, "AlohaOperator: camera names must be unique; twice: a"),
+            ({"publish_rate": 0}, "AlohaOperator: rate_hz must be positive, got 0"),
+            ({"joint_names": ("a", "b")}, "joint_names are 7 names of one arm"),
+            ({"gripper_closed": 1.0, "gripper_open": 1.0}, "must be different finite numbers"),
+            ({"base_max_linear": -1}, "base_max_linear must be positive, got -1"),
+        ],
+    )
+    def test_values_out_of_range_are_named(self, arguments, what):
+        with pytest.raises(ConfigError, match=what):
+            AlohaOperator(**arguments)
+
+    def test_other_arms_bring_their_own_limits(self):
+        other = aloha_spec().to_dict()
+        other["name"] = "piper"
+        other["joints"][0]["upper"] = 2.0
+        operator = AlohaOperator(embodiment=other, **SMALL)
+
+        assert operator.embodiment.name == "piper"
+        assert operator.embodiment.joints[0].upper == 2.0
+        assert operator.embodiment.cameras[0].height == 48
+
+    def test_an_embodiment_of_another_shape_is_refused(self):
+        other = aloha_spec().to_dict()
+        other["joints"] = other["joints"][:7]
+
+        with pytest.raises(ConfigError, match="commands two arms of six joints and a gripper"):
+            AlohaOperator(embodiment=other)
+
+
+class TestMessages:
+    def test_joint_states_get_names(self):
+        filled = fill_command(SimpleNamespace(position=[]), ("a", "b"), np.array([1.0, 2.0]), "arm")
+
+        assert (filled.name, filled.position) == (["a", "b"], [1.0, 2.0])
+
+    def test_interbotix_groups_and_singles(self):
+        """Their classes are not on any package index; these have the same fields."""
+        group = fill_command(SimpleNamespace(name="", cmd=[]), ("a", "b"), np.ones(2), "arm")
+        single = fill_command(SimpleNamespace(name="", cmd=0.0), ("g",), np.array([0.7]), "gripper")
+
+        assert (group.name, group.cmd) == ("arm", [1.0, 1.0])
+        assert (single.name, single.cmd) == ("gripper", 0.7)
+
+    def test_arrays_and_numbers(self):
+        assert fill_command(SimpleNamespace(data=[]), "ab", np.ones(2), "").data == [1.0, 1.0]
+        assert fill_command(SimpleNamespace(data=0.0), "a", np.ones(1), "").data == 1.0
+
+    def test_other_messages_are_refused(self):
+        with pytest.raises(ConfigError, match="none of the fields position, cmd and data"):
+            fill_command(SimpleNamespace(text=""), "a", np.ones(1), "")
+
+
+class TestBaseDrive:
+    def drive(self):
+        sent = []
+
+        def twist():
+            return SimpleNamespace(linear=SimpleNamespace(x=0.0), angular=SimpleNamespace(z=0.0))
+
+        def publish(message):
+            sent.append((message.linear.x, message.angular.z))
+
+        return BaseDrive(publish, twist, 0.3, 0.5), sent
+
+    @pytest.mark.parametrize(
+        ("speeds", "what"),
+        [
+            ((0.31, 0.0), "the base's forward speed 0.31 m/s is beyond 0.3 m/s"),
+            ((0.0, -0.6), "the base's turning speed -0.6 rad/s is beyond 0.5 rad/s"),
+            ((float("nan"), 0.0), "forward speed nan m/s"),
+        ],
+    )
+    def test_speeds_beyond_the_limits_are_refused(self, speeds, what):
+        drive, sent = self.drive()
+        with pytest.raises(Rejected, match=what):
+            drive.drive(*speeds)
+
+        assert sent == []
+
+    def test_a_speed_runs_out(self):
+        drive, sent = self.drive()
+        drive.drive(0.1, 0.2)
+        drive.tick()
+        assert sent == [(0.1, 0.2)]
+
+        time.sleep(TIMEOUT_S + 0.01)
+        drive.tick()
+        drive.tick()
+        assert sent == [(0.1, 0.2), (0.0, 0.0)]
+
+
+class TestCobotMagic:
+    def test_state_pictures_depth_and_base(self, connect, drivers):
+        drivers(*robot(depth=True, base=True))
+        operator = connect(use_depth_image=True, use_robot_base=True)
+        frame = operator.get_frame()
+
+        np.testing.assert_allclose(frame.state, START_POSE)
+        assert set(frame.images) == {"cam_high", "cam_left_wrist", "cam_right_wrist"}
+        assert set(frame.depths) == set(frame.images)
+        np.testing.assert_allclose(frame.depths["cam_high"], 1.5)
+        np.testing.assert_allclose(frame.base, [0.2, -0.1])
+
+    def test_both_arms_are_commanded_by_name_with_raw_grippers(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect()
+        action = np.array(START_POSE)
+        action[0], action[6], action[13] = 0.3, 0.0, 0.5
+        operator.send_action(action)
+        wait_for(lambda: all(driver.on(topic) for topic in COBOT_MAGIC.commands))
+
+        for index, topic in enumerate(COBOT_MAGIC.commands):
+            (heard,) = driver.on(topic)
+            assert tuple(heard["name"]) == COBOT_MAGIC.joints
+            ends = COBOT_MAGIC.gripper_closed, COBOT_MAGIC.gripper_open
+            wanted = raw(action[7 * index : 7 * index + 7], *ends)
+            np.testing.assert_allclose(heard["position"], wanted)
+        wait_for(lambda: abs(operator.get_state()[0][0] - 0.3) < 1e-9)
+        np.testing.assert_allclose(operator.get_state()[0], action, atol=1e-9)
+
+    def test_the_base_stops_by_itself_and_with_every_stop(self, connect, drivers):
+        driver = drivers(*robot(base=True))
+        operator = connect(use_robot_base=True)
+
+        def speeds():
+            heard = driver.on("/cmd_vel")
+            return [(h["linear"]["x"], h["angular"]["z"]) for h in heard]
+
+        operator.drive(0.1, 0.0)
+        wait_for(lambda: len(speeds()) == 2)
+        assert speeds() == [(0.1, 0.0), (0.0, 0.0)]
+        first, second = driver.on("/cmd_vel")
+        assert second["at"] - first["at"] >= TIMEOUT_S
+
+        operator.drive(0.2, 0.1)
+        operator.stop()
+        operator.close()
+        wait_for(lambda: len(speeds()) == 5)
+        assert speeds()[2:] == [(0.2, 0.1), (0.0, 0.0), (0.0, 0.0)]
+        with pytest.raises(NotReady, match="aloha is not connected"):
+            operator.drive(0.1, 0.0)
+
+    def test_without_a_base_there_is_no_driving(self):
+        with pytest.raises(Rejected, match="the base is not used") as caught:
+            AlohaOperator().drive(0.1, 0.0)
+
+        assert caught.value.next == "set use_robot_base=True"
+
+
+class TestInterbotix:
+    def test_without_its_messages_the_package_is_named(self, ros_domain):
+        operator = AlohaOperator(preset="interbotix", **QUICK)
+
+        with pytest.raises(LoadFailed, match="interbotix_xs_msgs") as caught:
+            operator.connect()
+        assert "ros-$ROS_DISTRO-interbotix-xs-msgs" in caught.value.next
+
+    def test_arms_and_grippers_have_topics_of_their_own(self, connect, drivers):
+        array, number = "std_msgs.msg:Float64MultiArray", "std_msgs.msg:Float64"
+        driver = drivers(*robot(INTERBOTIX, arm=array, gripper=number))
+        operator = connect(preset="interbotix", arm_message=array, gripper_message=number)
+        np.testing.assert_allclose(operator.get_frame().state, START_POSE)
+
+        action = np.array(START_POSE)
+        action[1], action[13] = -0.5, 0.0
+        operator.send_action(action)
+        topics = [*INTERBOTIX.commands, *INTERBOTIX.gripper_commands]
+        wait_for(lambda: all(driver.on(topic) for topic in topics))
+
+        sent = [driver.on(topic)[0]["data"] for topic in topics]
+        np.testing.assert_allclose(sent[0], action[:6])
+        np.testing.assert_allclose(sent[1], action[7:13])
+        np.testing.assert_allclose(sent[2:], [INTERBOTIX.gripper_open, INTERBOTIX.gripper_closed])
+
+    def test_its_messages_are_imported_by_their_dotted_name(self, monkeypatch):
+        module = SimpleNamespace(JointGroupCommand=SimpleNamespace)
+        monkeypatch.setitem(__import__("sys").modules, "interbotix_xs_msgs", SimpleNamespace())
+        monkeypatch.setitem(__import__("sys").modules, "interbotix_xs_msgs.msg", module)
+
+        assert message_class(INTERBOTIX.arm_message) is SimpleNamespace
+        message_class.cache_clear()
+
+
+class TestConformance(OperatorConformance):
+    entry_point = "AlohaOperator"
+    arguments = QUICK
+
+    @pytest.fixture(autouse=True)
+    def driver(self, lasting_robot):
+        """Who stands in for the arms."""

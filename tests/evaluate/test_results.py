@@ -5,13 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import os
+from pathlib import Path
 
 import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError, RunFailed
 from fluxvla_core.evaluate import results
-from fluxvla_core.evaluate.showing import choose_episodes, video_name
+from fluxvla_core.evaluate.pool import WorkerPool
+from fluxvla_core.evaluate.showing import choose_episodes, record_videos, video_name
 from fluxvla_core.evaluate.subject import chosen_checkpoint
 from fluxvla_core.evaluate.summary import summarise
 
@@ -118,3 +120,50 @@ def test_no_checkpoint_is_said_with_what_to_do(tmp_path):
     with pytest.raises(CheckpointError, match="no whole checkpoint") as caught:
         chosen_checkpoint(None, tmp_path)
     assert "train first" in str(caught.value)
+
+
+class Filmed:
+    """A worker that runs jobs (key, path): leaves a file, unless the seed says otherwise."""
+
+    def __call__(self):
+        return self.work
+
+    def work(self, job):
+        key, path = job
+        if key.seed == 13:
+            raise RuntimeError("the camera fell over")
+        Path(path).write_bytes(b"mp4")
+        return {"state_hash": "other" if key.seed == 7 else "same"}
+
+
+def test_videos_are_of_the_episodes_that_were_counted(tmp_path):
+    folder, said = tmp_path / "videos", []
+    folder.mkdir()
+    (folder / "00-old.mp4").touch()
+
+    class Listener(SilentReporter):
+        def warn(self, text):
+            said.append(text.strip().splitlines()[-1])
+
+    records = [
+        {"group": "policy", "task": "t", "seed": s, "success": s > 9, "state_hash": "same"}
+        for s in (3, 7, 13)
+    ]
+    with WorkerPool(Filmed(), 1) as pool:
+        made = record_videos(pool, records, folder, lambda key, path: (key, path), Listener())
+    assert made == [
+        {
+            "group": "policy",
+            "task": "t",
+            "seed": seed,
+            "success": False,
+            "path": f"videos/0{number}-failure-t-seed-{seed}.mp4",
+        }
+        for number, seed in enumerate((3, 7))
+    ]
+    assert sorted(p.name for p in folder.iterdir()) == [Path(v["path"]).name for v in made]
+    assert said == [
+        "01-failure-t-seed-7.mp4: the episode went another way than when it was counted; "
+        "its outcome does not follow from its seed alone",
+        "RuntimeError: the camera fell over",
+    ]

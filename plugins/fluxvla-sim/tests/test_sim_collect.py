@@ -18,14 +18,13 @@ from fluxvla_sim.aloha.demonstrations import demonstrate, frame_stride, smooth_n
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import HOME, AlohaScene
 from fluxvla_sim.aloha.tasks import TASKS
-from fluxvla_sim.collect import SPARE_STRIDE, Collection, _Demonstrator, _in_order, collect
+from fluxvla_sim.collect import SPARE_STRIDE, Collection, _Demonstrator, collect
 from fluxvla_sim.collect_command import CollectCommand
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
 from fluxvla_core.data.writer import staging_of
 from fluxvla_core.errors import ConfigError, RunFailed, UsageError
-from fluxvla_core.evaluate.pool import Outcome
 from fluxvla_core.spec.embodiment import Camera
 
 SMALL = Collection(episodes=4, height=48, width=64)
@@ -101,7 +100,8 @@ def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path):
     results = [collect(tmp_path / str(n), SMALL, workers=n) for n in (1, 3)]
     assert files(tmp_path / "1") == files(tmp_path / "3")
     for result in results:
-        assert (result["episodes"], result["retried"]) == (4, 0)
+        assert (result["episodes"], result["collected"], result["retried"]) == (4, 4, 0)
+        assert result["steps_per_s"] * result["seconds"] == pytest.approx(4 * 300)
         assert result["frames"] == 40 + 50 + 40 + 50
     info = json.loads((tmp_path / "1" / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0"
@@ -119,25 +119,14 @@ def test_where_the_expert_fails_the_episodes_spare_seed_is_taken(monkeypatch):
     monkeypatch.setattr(demonstrations, "demonstrate", fails_at_first)
     found = _Demonstrator(SMALL, [])(2)
     assert tried == [10_002, 10_002 + SPARE_STRIDE]
-    assert found.seed == 10_002 + SPARE_STRIDE
+    assert found.retried == 1
+    assert found.instruction == TASKS["lift_hold"].instruction
 
 
 def test_an_expert_that_always_fails_ends_the_collection(monkeypatch):
     monkeypatch.setattr(demonstrations, "demonstrate", lambda *arguments: None)
     with pytest.raises(RunFailed, match="failed lift_hold with 4 seeds in a row, from 10000 on"):
         _Demonstrator(replace(SMALL, noise=0.1), [])(0)
-
-
-def test_a_job_that_fails_ends_the_collection():
-    outcomes = [Outcome(1, "early", None, 1), Outcome(0, None, "the renderer is gone", 2)]
-    with pytest.raises(RunFailed, match="episode 7 failed: the renderer is gone"):
-        list(_in_order(iter(outcomes), range(7, 9)))
-
-
-def test_episodes_are_written_in_order_however_they_come():
-    outcomes = [Outcome(i, f"demo {i}", None, 1) for i in (2, 0, 3, 1)]
-    found = list(_in_order(iter(outcomes), range(5, 9)))
-    assert found == [(5, "demo 0"), (6, "demo 1"), (7, "demo 2"), (8, "demo 3")]
 
 
 def interrupted(out):

@@ -13,7 +13,7 @@ from fluxvla_sim.aloha.policies import ExpertPolicy
 from fluxvla_sim.aloha.rollout import rollout
 from fluxvla_sim.aloha.scene import HOME, AlohaScene
 from fluxvla_sim.aloha.tasks import TASKS
-from fluxvla_sim.eval_runner import AlohaSimEvalRunner, choose_videos, count_behaviours
+from fluxvla_sim.eval_runner import AlohaSimEvalRunner, count_behaviours
 from fluxvla_sim.eval_worker import policy_cameras
 from fluxvla_sim.operators import AlohaSimOperator
 
@@ -259,20 +259,6 @@ def record(task, seed, success, group="policy", **more):
         "success": success,
         **more,
     }
-
-
-def test_videos_show_failures_first_and_both_tasks():
-    records = [record(t, s, s > 2) for s in range(6) for t in ("a", "b")]
-    chosen = [(r["task"], r["seed"]) for r in choose_videos(records, 4)]
-    assert chosen == [("a", 0), ("b", 0), ("a", 3), ("b", 3)]
-    assert len(choose_videos(records, 100)) == 12
-    assert choose_videos(records, 0) == []
-    only = [record("a", s, True) for s in range(5)]
-    assert [r["seed"] for r in choose_videos(only, 3)] == [0, 1, 2]
-    one = [record("a", 0, False), *only[1:]]
-    assert [r["seed"] for r in choose_videos(one, 4)] == [0, 1, 2, 3]
-    others = [record("a", 0, False, group="untrained"), {**only[0], "status": "error"}]
-    assert choose_videos(others, 3) == []
 
 
 def test_behaviours_are_counted_by_what_was_said():

@@ -67,8 +67,8 @@ def collect_episodes(
         resume: go on with a collection into ``out`` that was interrupted.
 
     Returns:
-        JSON values: ``episodes``, ``frames`` and ``retried`` (of this call), ``seconds``,
-        ``frames_per_s``, ``workers``.
+        JSON values: ``episodes``; ``collected``, ``frames`` and ``retried`` of this call;
+        ``seconds``, ``frames_per_s``, ``workers``.
 
     Raises:
         DataError: there is a dataset already.
@@ -105,6 +105,7 @@ def collect_episodes(
     seconds = time.monotonic() - began
     result = {
         "episodes": episodes,
+        "collected": episodes - kept,
         "frames": frames,
         "retried": retried,
         "seconds": seconds,

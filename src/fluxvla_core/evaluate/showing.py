@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
-from fluxvla_core.evaluate.ledger import DONE
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.evaluate.ledger import DONE, EpisodeKey
+from fluxvla_core.evaluate.pool import WorkerPool
 
 
 def choose_episodes(
@@ -26,6 +30,53 @@ def video_name(number: int, record: Mapping[str, Any]) -> str:
     """``00-failure-TASK-seed-SEED.mp4``."""
     word = "success" if record["success"] else "failure"
     return f"{number:02d}-{word}-{record['task']}-seed-{record['seed']}.mp4"
+
+
+def record_videos(
+    pool: WorkerPool,
+    records: Sequence[Mapping[str, Any]],
+    folder: Path,
+    make_job: Callable[[EpisodeKey, str], Any],
+    reporter: Reporter,
+) -> list[dict[str, Any]]:
+    """Run the episodes of ``records`` once more, watched: they go as they went before.
+
+    Args:
+        pool: its workers return a result with ``state_hash``, as the records have it.
+        folder: where the videos go; those of an evaluation before are removed.
+        make_job: from a key and a path to the job that runs it and leaves its video there.
+
+    Returns:
+        JSON values, one for each video that was made, in the order of ``records``: ``group``,
+        ``task``, ``seed``, ``success`` and ``path``, relative to ``folder``'s parent.
+    """
+    for old in folder.glob("*.mp4"):
+        old.unlink()
+    names = [video_name(number, record) for number, record in enumerate(records)]
+    jobs = [
+        make_job(EpisodeKey(r["group"], r["task"], r["seed"]), str(folder / name))
+        for r, name in zip(records, names, strict=True)
+    ]
+    made = [False] * len(jobs)
+    with closing(pool.run(jobs)) as outcomes:
+        for done, outcome in enumerate(outcomes, 1):
+            reporter.progress("videos", done, len(jobs))
+            made[outcome.index] = outcome.error is None
+            if outcome.error is not None:
+                reporter.warn(f"no video {names[outcome.index]}: {outcome.error}")
+            elif outcome.result["state_hash"] != records[outcome.index]["state_hash"]:
+                reporter.warn(
+                    f"{names[outcome.index]}: the episode went another way than when it was "
+                    "counted; its outcome does not follow from its seed alone"
+                )
+    return [
+        {
+            **{key: record[key] for key in ("group", "task", "seed", "success")},
+            "path": f"{folder.name}/{name}",
+        }
+        for record, name, there in zip(records, names, made, strict=True)
+        if there
+    ]
 
 
 def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

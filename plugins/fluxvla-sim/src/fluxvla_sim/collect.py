@@ -7,23 +7,18 @@ same for any number of workers, and a collection that was interrupted can go on.
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.errors import ConfigError, RunFailed, UsageError
-from fluxvla_core.evaluate.pool import run_jobs
+from fluxvla_core.errors import ConfigError, RunFailed
 
 if TYPE_CHECKING:
-    from fluxvla_sim.aloha.demonstrations import Demonstration
+    from fluxvla_core.evaluate.collecting import Recorded
 
-SETTINGS = "collection.json"
 SPARE_SEEDS = 4
 SPARE_STRIDE = 1_000_000_000
 """Spare seeds lie this far apart: no other episode uses them, and all are below 2**32."""
@@ -93,8 +88,8 @@ def collect(
         resume: go on with a collection into ``out`` that was interrupted.
 
     Returns:
-        JSON values: ``episodes``, ``frames``, ``retried``, ``seconds``, ``steps_per_s`` (control
-        steps simulated a second), ``workers``.
+        JSON values: those of ``collect_episodes``, and ``steps_per_s``, the control steps that
+        were simulated a second.
 
     Raises:
         DataError: there is a dataset already.
@@ -103,53 +98,27 @@ def collect(
     """
     from fluxvla_aloha.embodiment import aloha_spec
 
-    from fluxvla_core.data.writer import LeRobotWriter, staging_of
+    from fluxvla_core.evaluate.collecting import collect_episodes
     from fluxvla_core.spec.embodiment import Camera
     from fluxvla_sim.aloha.scene import CONTROL_HZ
-    from fluxvla_sim.aloha.tasks import MAX_STEPS, get_task
+    from fluxvla_sim.aloha.tasks import MAX_STEPS
 
-    reporter = reporter or SilentReporter()
     size = collection.height, collection.width
     cameras = tuple(Camera(name, *size) for name in collection.camera_names)
-    note = staging_of(Path(out)) / SETTINGS
-    if resume:
-        _check_same(note, collection)
-    elif note.parent.exists():
-        raise UsageError(
-            f"a collection into {out} was interrupted, or is under way",
-            next=f"add --resume to go on with it, or delete {note.parent}",
-        )
-    began, retried, frames, kept = time.monotonic(), 0, 0, 0
-    with LeRobotWriter(
-        out, collection.fps, aloha_spec(cameras, CONTROL_HZ), recover=resume
-    ) as writer:
-        note.write_text(json.dumps(asdict(collection)))
-        kept = writer.episodes
-        jobs = range(kept, collection.episodes)
-        work = partial(_Demonstrator, collection, cameras)
-        with closing(run_jobs(work, jobs, workers)) as outcomes:
-            for episode, found in _in_order(outcomes, jobs):
-                task = get_task(task_name(collection, episode))
-                _save(writer, found, task.instruction, episode)
-                retried += found.seed != collection.seed + episode
-                frames += len(found.states)
-                pace = (episode + 1 - kept) / (time.monotonic() - began)
-                reporter.progress(
-                    "demonstrations", episode + 1, collection.episodes, per_s=round(pace, 2)
-                )
-    seconds = time.monotonic() - began
-    simulated = (collection.episodes - kept + retried) * MAX_STEPS
-    result = {
-        "episodes": collection.episodes,
-        "frames": frames,
-        "retried": retried,
-        "seconds": seconds,
-        "steps_per_s": simulated / max(seconds, 1e-9),
-        "workers": workers,
-    }
-    reporter.event("collected", **result)
-    reporter.artifact("dataset", Path(out))
-    return result
+    found = collect_episodes(
+        Path(out),
+        collection.fps,
+        aloha_spec(cameras, CONTROL_HZ),
+        partial(_Demonstrator, collection, cameras),
+        collection.episodes,
+        asdict(collection),
+        workers,
+        resume,
+        reporter or SilentReporter(),
+    )
+    # Each demonstration, also one that failed, is simulated to its end.
+    simulated = (found["collected"] + found["retried"]) * MAX_STEPS
+    return {**found, "steps_per_s": simulated / max(found["seconds"], 1e-9)}
 
 
 def task_name(collection: Collection, episode: int) -> str:
@@ -170,58 +139,29 @@ class _Demonstrator:
         self._scene = AlohaScene(collection.quality, *size)
         self._expert = Expert(self._scene.model)
 
-    def __call__(self, episode: int) -> Demonstration:
+    def __call__(self, episode: int) -> Recorded:
+        from fluxvla_core.evaluate.collecting import Recorded
         from fluxvla_sim.aloha.demonstrations import demonstrate
         from fluxvla_sim.aloha.tasks import get_task
 
-        name = task_name(self._collection, episode)
+        task = get_task(task_name(self._collection, episode))
         first = self._collection.seed + episode
-        for seed in (first + spare * SPARE_STRIDE for spare in range(SPARE_SEEDS)):
+        for spare in range(SPARE_SEEDS):
             found = demonstrate(
                 self._scene,
                 self._expert,
-                get_task(name),
-                seed,
+                task,
+                first + spare * SPARE_STRIDE,
                 self._cameras,
                 self._collection.fps,
                 self._collection.noise,
             )
             if found is not None:
-                return found
+                return Recorded(
+                    found.images, found.states, found.actions, task.instruction, retried=spare
+                )
         raise RunFailed(
-            f"the expert failed {name} with {SPARE_SEEDS} seeds in a row, from {first} on",
+            f"the expert failed {task.name} with {SPARE_SEEDS} seeds in a row, from {first} on",
             cause=f"noise = {self._collection.noise:g} rad is too much for it",
             next="collect with less noise",
-        )
-
-
-def _in_order(outcomes: Any, jobs: Sequence[int]) -> Any:
-    """``(episode, demonstration)`` in the order of the episodes; early ones wait."""
-    early: dict[int, Any] = {}
-    following = 0
-    for outcome in outcomes:
-        if outcome.error is not None:
-            raise RunFailed(f"episode {jobs[outcome.index]} failed: {outcome.error}")
-        early[outcome.index] = outcome.result
-        while following in early:
-            yield jobs[following], early.pop(following)
-            following += 1
-
-
-def _save(writer: Any, found: Demonstration, instruction: str, episode: int) -> None:
-    for frame in range(len(found.states)):
-        images = {name: pictures[frame] for name, pictures in found.images.items()}
-        writer.add_frame(images, found.states[frame], found.actions[frame], instruction)
-    writer.save_episode(key=episode)
-
-
-def _check_same(note: Path, collection: Collection) -> None:
-    if not note.exists():
-        return
-    before, now = json.loads(note.read_text()), json.loads(json.dumps(asdict(collection)))
-    other = [f"{k}: {before.get(k)} / {now[k]}" for k in now if before.get(k) != now[k]]
-    if other:
-        raise UsageError(
-            f"the interrupted collection had other settings: {'; '.join(other)}",
-            next=f"use the same settings, or delete {note.parent} and begin anew",
         )

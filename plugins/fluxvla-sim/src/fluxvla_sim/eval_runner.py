@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import DONE, EpisodeKey
 from fluxvla_core.evaluate.pool import WorkerPool
-from fluxvla_core.evaluate.summary import describe, summarise
-from fluxvla_sim.eval_worker import (
-    POLICY,
-    SWAPPED,
-    UNTRAINED,
-    AlohaEvalWorker,
-    Job,
-    Settings,
-)
+from fluxvla_core.evaluate.results import FORMAT, check_any_done, tell, timing, write_results
+from fluxvla_core.evaluate.showing import choose_episodes, record_videos
+from fluxvla_core.evaluate.subject import chosen_checkpoint
+from fluxvla_core.evaluate.summary import summarise
+from fluxvla_sim.eval_worker import POLICY, SWAPPED, UNTRAINED, AlohaEvalWorker, Job, Settings
 
-FORMAT = "fluxvla-eval-1"
 FOLDER = "eval"
 
 
@@ -137,19 +130,8 @@ class AlohaSimEvalRunner:
 
         if self.policy not in NEEDS_CHECKPOINT and not self.baseline:
             return
-        from fluxvla_core.infer.local_policy import find_checkpoint
-        from fluxvla_core.train.checkpoint import Checkpoint
-        from fluxvla_core.train.manifest import NAME, hash_file
-
-        path = find_checkpoint(self.ckpt_path, Path(self.context.work_dir))
-        checkpoint = Checkpoint.open(path)
-        checkpoint.verify()
-        self._checkpoint = {
-            "path": str(path),
-            "step": checkpoint.step,
-            "sha256": hash_file(path / NAME),
-        }
-        self.context.reporter.info(f"evaluating {path}")
+        self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
+        self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
 
     def run(self) -> dict[str, Any]:
         """Run the episodes, write ``results.json``, and return what is in it.
@@ -167,23 +149,21 @@ class AlohaSimEvalRunner:
             records = run_in_pool(pool, keys, ledger, reporter)
             # Loading libraries and models is not what is measured.
             seconds = time.monotonic() - began - (pool.ready_s or 0.0)
-            if not any(record["status"] == DONE for record in records):
-                raise RunFailed(
-                    f"none of the {len(records)} episodes gave a result; the last one:\n"
-                    f"{records[-1]['error']}",
-                    where=str(ledger.path),
-                )
-            videos = self._videos(pool, records)
+            check_any_done(records, ledger.path)
+            shown = choose_episodes(records, self.record_videos)
+            videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
         results = {
             "groups": summarise(records),
             "behaviours": count_behaviours(records),
             "checkpoint": self._checkpoint,
             "settings": self._what()["settings"],
             "videos": videos,
-            "timing": _timing(records, new, seconds, self.workers),
+            "timing": timing(records, new, seconds, self.workers),
         }
-        self._write({"format": FORMAT, "policy": self.policy, **results})
-        self._tell(results)
+        path = self.folder / "results.json"
+        write_results(path, {"format": FORMAT, "policy": self.policy, **results})
+        reporter.artifact("evaluation", path)
+        tell(reporter, results, self.folder)
         return results
 
     def _check(self) -> None:
@@ -223,8 +203,6 @@ class AlohaSimEvalRunner:
         )
 
     def _worker_settings(self) -> Settings:
-        from dataclasses import replace
-
         path = None if self._checkpoint is None else self._checkpoint["path"]
         return replace(self._settings, ckpt_path=path)
 
@@ -261,86 +239,6 @@ class AlohaSimEvalRunner:
             },
         }
 
-    def _videos(
-        self, pool: WorkerPool, records: Sequence[Mapping[str, Any]]
-    ) -> list[dict[str, Any]]:
-        """Run the chosen episodes once more, watched: they go as they went before."""
-        chosen = choose_videos(records, self.record_videos)
-        folder = self.folder / "videos"
-        for old in folder.glob("*.mp4"):
-            old.unlink()
-        jobs, videos = [], []
-        for number, record in enumerate(chosen):
-            word = "success" if record["success"] else "failure"
-            path = folder / f"{number:02d}-{word}-{record['task']}-seed-{record['seed']}.mp4"
-            jobs.append(Job(EpisodeKey(record["group"], record["task"], record["seed"]), str(path)))
-            kept = {name: record[name] for name in ("group", "task", "seed", "success")}
-            videos.append({**kept, "path": f"videos/{path.name}"})
-        reporter, made = self.context.reporter, [False] * len(jobs)
-        with closing(pool.run(jobs)) as outcomes:
-            for done, outcome in enumerate(outcomes, 1):
-                reporter.progress("videos", done, len(jobs))
-                made[outcome.index] = outcome.error is None
-                if outcome.error is not None:
-                    reporter.warn(f"no video of {videos[outcome.index]}: {outcome.error}")
-                elif outcome.result["state_hash"] != chosen[outcome.index]["state_hash"]:
-                    reporter.warn(
-                        f"{videos[outcome.index]['path']}: the episode went another way than when "
-                        "it was counted; its outcome does not follow from its seed alone"
-                    )
-        return [video for video, there in zip(videos, made, strict=True) if there]
-
-    def _write(self, results: Mapping[str, Any]) -> None:
-        path = self.folder / "results.json"
-        part = path.with_suffix(".json.part")
-        try:
-            part.write_text(json.dumps(results, indent=1) + "\n")
-            os.replace(part, path)
-        except OSError as error:
-            full = error.errno == errno.ENOSPC
-            raise RunFailed(
-                f"results cannot be written: {error}",
-                where=str(path),
-                next="make room and run the same command again" if full else None,
-            ) from error
-        self.context.reporter.artifact("evaluation", path)
-
-    def _tell(self, results: Mapping[str, Any]) -> None:
-        reporter = self.context.reporter
-        for group, found in results["groups"].items():
-            for task, counted in found["tasks"].items():
-                reporter.info(describe(f"{group} {task}", counted))
-        timing = results["timing"]
-        if timing["episodes"]:
-            reporter.info(
-                f"{timing['steps']} steps in {timing['seconds']:.0f} s: "
-                f"{timing['steps_per_s']:.0f} steps/s in {timing['workers']} processes"
-            )
-        for video in results["videos"]:
-            reporter.artifact("video", self.folder / video["path"])
-
-
-def choose_videos(records: Sequence[Mapping[str, Any]], count: int) -> list[Mapping[str, Any]]:
-    """Up to ``count`` of the policy's episodes: half failures, half successes, tasks in turn.
-
-    Where there are not enough of one kind the other fills up. Failures come first.
-    """
-    mine = [r for r in records if r["group"] == POLICY and r["status"] == DONE]
-    failures = _in_turn([r for r in mine if not r["success"]])
-    successes = _in_turn([r for r in mine if r["success"]])
-    shown = min(len(failures), max((count + 1) // 2, count - len(successes)))
-    return failures[:shown] + successes[: count - shown]
-
-
-def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    seen: dict[str, int] = {}
-    ranked = []
-    for record in records:
-        rank = seen.get(record["task"], 0)
-        seen[record["task"]] = rank + 1
-        ranked.append((rank, record))
-    return [record for _, record in sorted(ranked, key=lambda pair: pair[0])]
-
 
 def count_behaviours(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Which task was done after which instruction.
@@ -361,26 +259,6 @@ def count_behaviours(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for task, did in record["behaviours"].items():
             row[task] += bool(did)
     return table
-
-
-def _timing(
-    records: Sequence[Mapping[str, Any]], new: int, seconds: float, workers: int
-) -> dict[str, Any]:
-    """How fast the new episodes were; nothing where all were there already."""
-    done = [r for r in records if r["status"] == DONE]
-    calls = sum(r["calls"] for r in done)
-    policy = sum(r["timing"]["policy_seconds"] for r in done)
-    if new < len(records):  # a mixture of two runs has no one speed
-        return {"episodes": 0, "workers": workers, "policy_ms": 1e3 * policy / max(calls, 1)}
-    steps = sum(r["steps"] for r in done)
-    return {
-        "episodes": new,
-        "steps": steps,
-        "seconds": seconds,
-        "steps_per_s": steps / max(seconds, 1e-9),
-        "workers": workers,
-        "policy_ms": 1e3 * policy / max(calls, 1),
-    }
 
 
 def _plain(table: Any) -> Any:

@@ -91,16 +91,7 @@ def make_policy(
     assert ckpt_path is not None
     policy = load_policy(ckpt_path, device, dataset, denormalize_action, mixed_precision_dtype)
     if name == "untrained":
-        policy.model = _fresh_model(ckpt_path, device)
+        from fluxvla_core.evaluate.subject import untrained_model
+
+        policy.model = untrained_model(ckpt_path, device)
     return policy
-
-
-def _fresh_model(ckpt_path: str, device: str) -> Any:
-    import torch
-
-    from fluxvla_core.build import build_vla_from_cfg
-    from fluxvla_core.train.checkpoint import Checkpoint
-
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return build_vla_from_cfg(Checkpoint.open(ckpt_path).config()["model"]).to(device).eval()

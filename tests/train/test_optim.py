@@ -10,7 +10,13 @@ import torch
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.train.optim import decay_groups, make_adamw, named_state, torch_state
+from fluxvla_core.train.optim import (
+    clip_,
+    decay_groups,
+    make_adamw,
+    named_state,
+    torch_state,
+)
 
 
 def model():
@@ -118,3 +124,15 @@ def test_another_optimizer_or_other_groups_are_refused():
     net[2].requires_grad_(False)
     with pytest.raises(CheckpointError, match=r"\(AdamW, \[1, 3\]\)"):
         torch_state(net, make_adamw(net, 0.1, 0.1), tensors, described, "here")
+
+
+@pytest.mark.parametrize("max_norm", [0.1, 1e9])
+def test_clipping_is_torchs(max_norm):
+    grads = []
+    for clip in (clip_, nn.utils.clip_grad_norm_):
+        net = model()
+        net(torch.ones(2, 3)).square().sum().backward()
+        net[0].bias.grad = None
+        norm = clip(list(net.parameters()), max_norm)
+        grads.append([norm, *(p.grad for p in net.parameters() if p.grad is not None)])
+    assert all(map(torch.equal, *grads))

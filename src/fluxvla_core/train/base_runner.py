@@ -250,14 +250,12 @@ class BaseTrainRunner:
 
     def clip_grad_norm(self) -> Tensor | None:
         """Scale the gradients down to ``max_grad_norm``; their norm before, on the device."""
-        import torch
-
-        from fluxvla_core.train.tensors import whole
+        from fluxvla_core.train.optim import clip_
 
         if self.max_grad_norm is None:
             return None
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        return whole(torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm))
+        return clip_(parameters, self.max_grad_norm)
 
     def save_checkpoint(
         self,

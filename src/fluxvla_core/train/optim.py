@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.train.schedule import Schedule
-from fluxvla_core.train.tensors import like
+from fluxvla_core.train.tensors import like, whole
 
 NamedState = dict[str, Tensor]
 
@@ -43,6 +43,19 @@ def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
 def make_adamw(model: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
     """AdamW over :func:`decay_groups`, in one fused kernel (CPU and CUDA have one)."""
     return torch.optim.AdamW(decay_groups(model, weight_decay), lr=learning_rate, fused=True)
+
+
+def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:
+    """Scale gradients in place so that their norm over all ranks is at most ``max_norm``.
+
+    Returns:
+        The norm before, a scalar on the device.
+    """
+    grads = [p.grad for p in parameters if p.grad is not None]
+    # Gathered once, here: torch.nn.utils.clip_grad_norm_ would do it again for the caller.
+    norm = whole(torch.nn.utils.get_total_norm(grads))
+    torch.nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
+    return norm
 
 
 def named_state(

@@ -89,7 +89,7 @@ class FSDPTrainRunner(BaseTrainRunner):
         # Inputs keep their dtype: casting them would round targets and states as well.
         return MixedPrecisionPolicy(
             param_dtype=self.compute_dtype,
-            reduce_dtype=torch.float32,
+            reduce_dtype=torch.float32 if self.compute_dtype else None,
             cast_forward_inputs=False,
         )
 

@@ -45,10 +45,11 @@ class Startup:
         until = self._since + timeout_s
         while True:
             self._connection.check()
-            problem = self._problem(hurry=time.monotonic() < until)
+            late = time.monotonic() >= until
+            problem = self._problem(hurry=not late)
             if problem is None:
                 return
-            if time.monotonic() >= until:
+            if late:
                 raise problem
             time.sleep(_POLL_S)
 

@@ -39,7 +39,8 @@ class Driver:
         streams: what it publishes. Each has ``topic``, ``message`` (type), ``hz``, and, by type:
             ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
             (Image), ``format`` (CompressedImage, a JPEG or PNG of the same), ``data`` (std_msgs),
-            ``follows`` (a sink's topic: the last command there is where its joints are);
+            ``follows`` (a sink's topic: the last command there is where its joints are, in the
+            order of ``command_names`` if it has none);
             ``best_effort`` and ``latched`` say how; ``stamped: false`` leaves stamps at zero.
         sinks: what it listens to: ``topic`` and ``message``. What arrives is in ``heard``.
         name: of its node.
@@ -131,11 +132,11 @@ class _Publisher:
 
     def make(self, connection: Connection, commands: Mapping[str, Any]) -> Any:
         spec, message, kind = self.spec, self.cls(), self.cls.__name__
+        known = commands.get(spec.get("follows", ""))
         if kind == "JointState":
-            known = commands.get(spec.get("follows", ""))
             here = dict(zip(spec["names"], spec["positions"], strict=False))
             if known is not None:
-                here.update(_targets(known, spec["names"]))
+                here.update(_targets(known, spec.get("command_names", spec["names"])))
             spec["positions"] = [here.get(name, 0.0) for name in spec["names"]]
             joints.fill(message, spec["names"], spec["positions"])
         elif kind in ("Image", "CompressedImage"):
@@ -143,7 +144,7 @@ class _Publisher:
         elif kind == "Odometry":
             message.twist.twist.linear.x, message.twist.twist.angular.z = spec["data"]
         else:
-            message.data = spec["data"]
+            message.data = spec["data"] if known is None else known.data
         if hasattr(message, "header") and spec.get("stamped", True):
             message.header.stamp = connection.node.get_clock().now().to_msg()
         return message

@@ -1,0 +1,273 @@
+"""UROperator: what it is told by a config, and what it does on real topics."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from fluxvla_ur.embodiment import JOINTS, ur_spec
+from fluxvla_ur.operator import CONTROLLERS, TRAJECTORY, UROperator, scaled_step
+
+from fluxvla_core.errors import ConfigError, Faulted, NotReady
+from fluxvla_core.ros2.streams import FLOAT64, FLOAT64_ARRAY, IMAGE, JOINT_STATE
+from fluxvla_core.testing import OperatorConformance
+from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
+
+__all__ = ["drivers", "lasting_drivers", "ros_domain"]
+
+SMALL = {"height": 48, "width": 64}
+QUICK = {**SMALL, "rate_window_s": 0.0, "connect_timeout_s": 8.0}
+POSE = (0.1, -1.5, 1.4, -1.3, -1.2, 0.2)
+FORWARD, SCALED, _ = CONTROLLERS
+COMMANDS = CONTROLLERS[FORWARD][0]
+SCALING = "/speed_scaling_state_broadcaster/speed_scaling"
+RUNNING = "/io_and_status_controller/robot_program_running"
+
+
+def robot(controller=FORWARD, scaling=None, running=None):
+    """Streams and sinks of a UR's drivers; older ones order joints by the alphabet."""
+    topic, message = CONTROLLERS[controller]
+    where = dict(zip(JOINTS, POSE, strict=True)) | {"finger_joint": 0.4}
+    names = sorted(where)
+    streams = [
+        {
+            "topic": "/joint_states",
+            "message": JOINT_STATE,
+            "hz": 125,
+            "names": names,
+            "positions": [where[name] for name in names],
+            "follows": topic,
+            "command_names": list(JOINTS),
+        },
+        {
+            "topic": "/gripper/position",
+            "message": FLOAT64,
+            "hz": 50,
+            "data": 0.5,
+            "follows": "/gripper/command",
+        },
+    ]
+    cameras = ("/front_camera/color/image_raw", "/wrist_camera/color/image_raw")
+    streams += [{"topic": t, "message": IMAGE, "hz": 30, **SMALL} for t in cameras]
+    if scaling is not None:
+        streams.append({"topic": SCALING, "message": FLOAT64, "hz": 50, "data": scaling})
+    if running is not None:
+        bool_ = {"message": "std_msgs.msg:Bool", "hz": 0, "latched": True, "data": running}
+        streams.append({"topic": RUNNING, **bool_})
+    sinks = [
+        {"topic": topic, "message": message},
+        {"topic": "/gripper/command", "message": FLOAT64},
+    ]
+    return streams, sinks
+
+
+def wait_for(condition, seconds=8.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "did not happen in time"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def connect(ros_domain):
+    made = []
+
+    def make(**arguments):
+        operator = UROperator(**{**QUICK, **arguments})
+        made.append(operator)
+        operator.connect()
+        return operator
+
+    yield make
+    for operator in made:
+        operator.close()
+
+
+@pytest.fixture(scope="module")
+def lasting_robot(lasting_drivers):
+    return lasting_drivers(*robot())
+
+
+class TestConfig:
+    def test_the_defaults_are_the_drivers(self):
+        operator = UROperator()
+
+        assert [(s.name, s.topic, s.required) for s in operator.streams()] == [
+            ("arm", "/joint_states", True),
+            ("cam_high", "/front_camera/color/image_raw", True),
+            ("cam_left_wrist", "/wrist_camera/color/image_raw", True),
+            ("gripper", "/gripper/position", True),
+            ("speed scaling", SCALING, False),
+            ("program running", RUNNING, False),
+        ]
+        assert [(c.topic, c.message) for c in operator.commands()] == [
+            ("/forward_position_controller/commands", FLOAT64_ARRAY),
+            ("/gripper/command", FLOAT64),
+        ]
+        assert operator.embodiment == ur_spec()
+
+    def test_topics_models_and_cameras_are_those_of_the_config(self):
+        operator = UROperator(
+            model="ur3e",
+            controller=SCALED,
+            puppet_arm_left_cmd_topic="/left/commands",
+            img_front_topic="/top/compressed",
+            use_depth_image=True,
+            camera_names=("top",),
+            gripper_joint="finger_joint",
+            publish_rate=50.0,
+        )
+
+        assert [s.name for s in operator.streams()][:3] == ["arm", "top", "top_depth"]
+        assert "gripper" not in [s.name for s in operator.streams()]
+        command, _ = operator.commands()
+        assert (command.topic, command.message) == ("/left/commands", TRAJECTORY)
+        assert (operator.embodiment.name, operator.embodiment.rate_hz) == ("ur3e", 50.0)
+
+    @pytest.mark.parametrize(
+        ("arguments", "what"),
+        [
+            ({"controller": "velocity"}, "unknown controller 'velocity'; known are forward_pos"),
+            ({"model": "ur99"}, "unknown UR model 'ur99'"),
+            ({"camera_names": tuple("abc")}, "there are 2 cameras, got"),
+            ({"gripper_open": 0.0}, "must be different finite numbers"),
+            ({"trajectory_time_s": 0}, "trajectory_time_s must be positive, got 0"),
+            ({"publish_rate": -1}, "UROperator: rate_hz must be positive, got -1"),
+        ],
+    )
+    def test_values_out_of_range_are_named(self, arguments, what):
+        with pytest.raises(ConfigError, match=what):
+            UROperator(**arguments)
+
+
+class TestScaledStep:
+    speeds = np.array([1.0, 2.0])
+
+    def test_a_step_that_is_slow_enough_is_taken_whole(self):
+        wanted = np.array([0.05, -0.1])
+
+        np.testing.assert_array_equal(scaled_step(np.zeros(2), wanted, self.speeds, 0.05), wanted)
+
+    def test_a_fast_step_is_cut_on_the_straight_line(self):
+        moved = scaled_step(np.zeros(2), np.array([0.2, 0.1]), self.speeds, 0.05)
+
+        np.testing.assert_allclose(moved, [0.05, 0.025])
+
+
+class TestRobot:
+    def test_joints_by_name_and_a_gripper_of_its_own(self, connect, drivers):
+        drivers(*robot())
+        operator = connect(gripper_closed=0.0, gripper_open=2.0)
+
+        np.testing.assert_allclose(operator.get_frame().state, [*POSE, 0.25])
+        assert operator.speed_scaling == 1.0
+
+    def test_commands_are_in_the_controllers_order(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect(gripper_closed=0.8, gripper_open=0.0)
+        operator.send_action([*np.add(POSE, 0.01), 0.25])
+        wait_for(lambda: driver.on(COMMANDS) and driver.on("/gripper/command"))
+
+        np.testing.assert_allclose(driver.on(COMMANDS)[0]["data"], np.add(POSE, 0.01))
+        np.testing.assert_allclose(driver.on("/gripper/command")[0]["data"], 0.6)
+        wait_for(lambda: np.allclose(operator.get_state()[0], [*np.add(POSE, 0.01), 0.25]))
+
+    def test_a_gripper_among_the_joints(self, connect, drivers):
+        drivers(*robot())
+        operator = connect(gripper_joint="finger_joint", gripper_closed=0.8, gripper_open=0.0)
+
+        np.testing.assert_allclose(operator.get_frame().state[6], 0.5)
+
+    def test_a_gripper_that_is_no_number_is_a_fault(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect()
+        driver.tell(fault="/gripper/position=nan")
+        wait_for(lambda: np.isnan(operator.newest("gripper").message.data))
+
+        with pytest.raises(Faulted, match=r"the gripper \(/gripper/position\) reports nan"):
+            operator.get_frame()
+
+    def test_a_silent_gripper_is_named(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect()
+        driver.tell(fault="/gripper/position=drop")
+        time.sleep(0.7)
+
+        with pytest.raises(NotReady, match=r"gripper \(/gripper/position\) is silent"):
+            operator.get_frame()
+
+    def test_trajectories_name_their_joints_and_say_when(self, connect, drivers):
+        driver = drivers(*robot(SCALED))
+        operator = connect(controller=SCALED, trajectory_time_s=1.25)
+        operator.send_action([*POSE, 1.0])
+        operator.stop()
+        topic = CONTROLLERS[SCALED][0]
+        wait_for(lambda: len(driver.on(topic)) == 2)
+
+        heard, held = driver.on(topic)
+        (point,) = heard["points"]
+        assert heard["joint_names"] == list(JOINTS)
+        np.testing.assert_allclose(point["positions"], POSE)
+        assert point["time_from_start"] == {"sec": 1, "nanosec": 250_000_000}
+        assert held["points"] == heard["points"]
+
+
+class TestWhatTheRobotSays:
+    def test_a_slowed_robot_is_given_slower_commands(self, connect, drivers):
+        driver = drivers(*robot(scaling=20.0))
+        operator = connect()
+        wait_for(lambda: operator.newest("speed scaling"))
+        assert operator.speed_scaling == pytest.approx(0.2)
+        wanted = np.array([*POSE, 0.5])
+        wanted[0] += 1.0
+        for _ in range(3):
+            operator.send_action(wanted)
+            time.sleep(0.05)
+        wait_for(lambda: len(driver.on(COMMANDS)) == 3)
+
+        sent = [POSE[0], *(heard["data"][0] for heard in driver.on(COMMANDS))]
+        limit = operator.embodiment.joints[0].velocity * 0.2 / operator.embodiment.rate_hz
+        np.testing.assert_allclose(np.diff(sent), limit)
+
+    def test_the_scaled_controller_needs_no_help(self, connect, drivers):
+        driver = drivers(*robot(SCALED, scaling=20.0))
+        operator = connect(controller=SCALED)
+        wait_for(lambda: operator.newest("speed scaling"))
+        operator.send_action([1.1, *POSE[1:], 0.5])
+        wait_for(lambda: driver.on(CONTROLLERS[SCALED][0]))
+
+        (point,) = driver.on(CONTROLLERS[SCALED][0])[0]["points"]
+        assert point["positions"][0] == 1.1
+
+    def test_a_paused_robot_refuses(self, connect, drivers):
+        drivers(*robot(scaling=0.0))
+        operator = connect()
+        wait_for(lambda: operator.newest("speed scaling"))
+
+        with pytest.raises(Faulted, match="the robot is paused: its speed scaling is 0"):
+            operator.send_action([*POSE, 0.5])
+
+    @pytest.mark.parametrize("running", [True, False])
+    def test_a_robot_whose_program_stopped_refuses(self, connect, drivers, running):
+        """The driver says so once, before anybody listens."""
+        driver = drivers(*robot(running=running))
+        operator = connect()
+        wait_for(lambda: operator.newest("program running"))
+        if running:
+            operator.send_action([*POSE, 0.5])
+            wait_for(lambda: driver.on(COMMANDS))
+        else:
+            with pytest.raises(Faulted, match="the robot's program is not running") as caught:
+                operator.send_action([*POSE, 0.5])
+            assert "protective or emergency stop" in caught.value.cause
+            assert driver.on(COMMANDS) == []
+
+
+class TestConformance(OperatorConformance):
+    entry_point = "UROperator"
+    arguments = QUICK
+
+    @pytest.fixture(autouse=True)
+    def driver(self, lasting_robot):
+        """Who stands in for the arm."""

@@ -10,7 +10,14 @@ import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha import scene as scene_module
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import ARM_JOINTS, ARMS, AlohaScene, to_metres, to_normalized
+from fluxvla_sim.aloha.scene import (
+    ARM_JOINTS,
+    ARMS,
+    AlohaScene,
+    load_model,
+    to_metres,
+    to_normalized,
+)
 from fluxvla_sim.aloha.tasks import TASKS, Facts, get_task, task_of
 from fluxvla_sim.render import import_mujoco
 
@@ -116,6 +123,29 @@ def test_pictures_have_any_size_up_to_the_buffer(scene):
 def test_an_unknown_camera_is_named_with_those_that_exist(scene):
     with pytest.raises(ValueError, match=r"no camera 'head'; it has .*top.*left_wrist"):
         scene.render("head", 48, 64)
+
+
+def test_cheap_pictures_leave_out_shadows_and_multisampling():
+    cheap, reference = load_model("cheap"), load_model("reference", 600, 900)
+    quality = cheap.vis.quality
+    assert (quality.shadowsize, quality.offsamples) == (0, 0)
+    quality = reference.vis.quality
+    assert (quality.shadowsize, quality.offsamples) == (4096, 4), "as the model file asks"
+    buffer = reference.vis.global_
+    assert (buffer.offheight, buffer.offwidth) == (600, 900)
+    with pytest.raises(ValueError, match="quality 'best' is none of"):
+        load_model("best")
+
+
+def test_cheap_pictures_show_the_same_scene():
+    pictures = []
+    for quality in ("cheap", "reference"):
+        drawn = AlohaScene(quality)
+        drawn.reset(4)
+        pictures.append(drawn.render("top", 96, 128).astype(int))
+        drawn.close()
+    assert np.abs(pictures[0] - pictures[1]).mean() < 12
+    assert (pictures[0] != pictures[1]).any()
 
 
 def test_a_missing_gym_aloha_is_named_with_its_install_command(monkeypatch):

@@ -89,8 +89,8 @@ def rollout(
     if watch is not None:
         watch()
     while not task.done(facts) and facts.steps < max_steps:
-        asked = time.perf_counter()
         observation = _observe(scene, cameras, instruction)
+        asked = time.perf_counter()
         chunk = _checked(policy.predict_action(observation), limiter.last.shape[0])
         policy_seconds += time.perf_counter() - asked
         calls += 1

@@ -2,11 +2,13 @@
 
 python lerobot_side.py write TAKES.npz ROOT CODEC
 python lerobot_side.py read ROOT OUT.npz
+python lerobot_side.py convert ROOT
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 
 import numpy as np
@@ -18,6 +20,7 @@ _operators.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tenso
 _operators.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
+from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset  # noqa: E402
 
 CAMERAS = ("top", "wrist")
 WINDOW = 4
@@ -76,8 +79,14 @@ def read(root: str, out: str) -> None:
     np.savez(out, described=json.dumps(described), **arrays)
 
 
+def convert(root: str) -> None:
+    """Version 2.1 to 3.0, in place."""
+    parent, name = os.path.split(root)
+    convert_dataset(name, root=parent, push_to_hub=False)
+
+
 def main(jobs_file: str) -> None:
-    commands = {"write": write, "read": read}
+    commands = {"write": write, "read": read, "convert": convert}
     with open(jobs_file, encoding="utf-8") as file:
         for name, *words in json.load(file):
             commands[name](*words)

@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fluxvla_core.cli.main import main
 from fluxvla_core.data.metadata import read_metadata
 from fluxvla_core.data.parquet_dataset import ParquetDataset
-from fluxvla_core.data.validate import main
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError, SpecMismatch
 
@@ -116,7 +116,7 @@ def test_truncated_video(dataset):
     text = refused(dataset)
     assert f"{dataset / VIDEO}: 28 frames expected, " in text
     assert "the file is truncated: its index points beyond its end" in text
-    assert "python -m fluxvla_core.data.validate DATASET" in text
+    assert "fluxvla data validate DATASET" in text
 
 
 def test_a_missing_video_matters_only_to_who_needs_it(dataset):
@@ -238,35 +238,11 @@ def test_datasets_that_do_not_go_together(shared, tmp_path, recorder, take, spec
         ParquetDataset([str(shared), str(tmp_path / "fast")], [], ["top"])
 
 
-@pytest.mark.parametrize("camera", ["top", "wrist"])
-def test_every_frame_is_decoded_by_validate(camera, dataset, capsys):
-    assert main([str(dataset)]) == 0
-    out = capsys.readouterr().out
-    assert f"{dataset}: 3 episodes, 28 frames at 10 Hz" in out
-    assert f"{TOP}: 28 frames in 1 files" in out
-    # Damage that no index shows: zeros where frame data was.
-    path = dataset / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
-    data = bytearray(path.read_bytes())
-    start = data.index(b"mdat") + 4
-    data[start:] = bytes(len(data) - start)
-    path.write_bytes(data)
-    assert len(ParquetDataset(str(dataset), [], [camera])) == 28
-    assert main([str(dataset)]) == 2
-    assert f"{path}: no frame at 0.000 s" in capsys.readouterr().err
-
-
-def test_validate_says_how_it_is_used_and_what_is_wrong(tmp_path, capsys):
-    assert main([]) == 2
-    assert "usage: python -m fluxvla_core.data.validate DATASET" in capsys.readouterr().err
-    assert main([str(tmp_path / "none")]) == 2
-    assert "there is no dataset here" in capsys.readouterr().err
-
-
 def test_pictures_of_another_size_than_stated(dataset, capsys):
     info = json.loads((dataset / "meta/info.json").read_text())
     info["features"][TOP]["shape"] = [64, 48, 3]
     edit_info(dataset, features=info["features"])
-    assert main([str(dataset)]) == 2
+    assert main(["data", "validate", str(dataset)]) == 2
     assert "is 32 x 48, info.json says 64 x 48" in capsys.readouterr().err
     with pytest.raises(DataError, match=r"frames of 32 x 48, info\.json says 64 x 48"):
         load(dataset, cache_frames=True).prepare()

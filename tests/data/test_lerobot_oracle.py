@@ -20,6 +20,7 @@ import pytest
 import torch
 
 from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.convert import convert
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.merge import merge_datasets
 from fluxvla_core.data.parquet_dataset import ParquetDataset
@@ -28,9 +29,13 @@ from fluxvla_core.data.validate import validate
 from fluxvla_core.infer.local_policy import load_policy
 from tools import lerobot_env, shell
 
+from .version2 import write_v2
+
 SIDE = Path(__file__).with_name("lerobot_side.py")
 CAMERAS = ("top", "wrist")
 OURS = {"h264": "h264", "av1": "libsvtav1"}
+# From our datasets, by LeRobot, from a version 2.1 by us, from the same by LeRobot.
+MADE = ("merged", "theirs", "converted", "theirs converted")
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ def seen(tmp_path_factory, recorder, takes, many):
     except (shell.StepFailed, OSError) as error:
         pytest.skip(f"LeRobot cannot be installed here: {str(error).strip().splitlines()[-1]}")
     folder = tmp_path_factory.mktemp("oracle")
-    roots = {name: folder / name for name in (*OURS, "merged", "theirs")}
+    roots = {name: folder / name for name in (*OURS, *MADE)}
     for name, codec in OURS.items():
         # Small files, so that there are several of each kind.
         limits = {"data_file_mb": 0.001, "video_file_mb": 0.006}
@@ -67,8 +72,12 @@ def seen(tmp_path_factory, recorder, takes, many):
     merge_datasets(shards, roots["merged"])
     for shard in shards:
         shutil.rmtree(shard)
+    write_v2(folder / "old", many)
+    convert(folder / "old", roots["converted"])
+    shutil.copytree(folder / "old", roots["theirs converted"])
     save_takes(folder / "takes.npz", takes)
     jobs = [["write", folder / "takes.npz", roots["theirs"], "libsvtav1"]]
+    jobs += [["convert", roots["theirs converted"]]]
     jobs += [["read", root, folder / f"{name}.npz"] for name, root in roots.items()]
     run(env, folder / "jobs.json", jobs)
     return {name: load(root, folder / f"{name}.npz") for name, root in roots.items()}
@@ -105,7 +114,7 @@ def load(root, path):
     return Seen(root, arrays, json.loads(str(arrays.pop("described"))))
 
 
-@pytest.mark.parametrize("name", [*OURS, "merged", "theirs"])
+@pytest.mark.parametrize("name", [*OURS, *MADE])
 def test_lerobot_and_we_see_the_same(name, seen):
     theirs = seen[name]
     dataset = ParquetDataset(str(theirs.root), [], CAMERAS, action_window_size=4)
@@ -123,10 +132,10 @@ def test_lerobot_and_we_see_the_same(name, seen):
         assert theirs.described["tasks"][i] == sample["task_description"]
 
 
-@pytest.mark.parametrize("name", [*OURS, "merged"])
+@pytest.mark.parametrize("name", [*OURS, "merged", "converted"])
 def test_lerobot_reads_what_we_recorded(name, seen, many):
     found = seen[name]
-    if name != "merged":
+    if name in OURS:
         assert len(list(found.root.rglob("*.mp4"))) > 2
     states = np.concatenate([t.state for t in many])
     np.testing.assert_array_equal(found.arrays["observation.state"], states)
@@ -142,6 +151,19 @@ def test_lerobot_reads_what_we_recorded(name, seen, many):
     assert np.shape(stats["observation.images.top"]["mean"]) == (3, 1, 1)
 
 
+def test_lerobot_converts_version_2_to_the_same(seen):
+    """Rows and pictures are equal; statistics of rows agree but for LeRobot's float32."""
+    ours, theirs = seen["converted"], seen["theirs converted"]
+    assert set(ours.arrays) == set(theirs.arrays)
+    for key, array in ours.arrays.items():
+        np.testing.assert_array_equal(array, theirs.arrays[key])
+    assert ours.described["tasks"] == theirs.described["tasks"]
+    for key in ("action", "observation.state"):
+        for name in ("mean", "std", "min", "max"):
+            one, two = (s.described["stats"][key][name] for s in (ours, theirs))
+            np.testing.assert_allclose(one, two, rtol=1e-5)
+
+
 def test_we_read_what_lerobot_recorded(seen, takes):
     root = seen["theirs"].root
     dataset = ParquetDataset(str(root), [], CAMERAS)
@@ -150,7 +172,7 @@ def test_we_read_what_lerobot_recorded(seen, takes):
     np.testing.assert_array_equal(dataset[7]["states"], takes[1].state[0])
     top = dataset[12]["images"][0].transpose(1, 2, 0)
     assert np.abs(top.astype(int) - enlarge(takes[1].top)[5]).mean() < 8
-    validate(root, print)
+    validate(root)
 
 
 def test_batches_of_a_dataset_that_lerobot_recorded(seen):

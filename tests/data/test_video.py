@@ -77,7 +77,7 @@ def test_a_time_a_little_off_is_the_nearest_frame_and_between_two_is_none(movie)
         video.read(2.0)
     text = str(caught.value)
     assert "movie.mp4: no frame at 2.000 s (there is none); 40 frames found" in text
-    assert "python -m fluxvla_core.data.validate DATASET" in text
+    assert "fluxvla data validate DATASET" in text
     assert number(video.read(3 / FPS)) == 3
 
 
@@ -163,7 +163,7 @@ def test_a_truncated_file_is_found_by_its_index(front, keep, tmp_path):
     assert "40 frames expected, " in text
     assert "found" in text
     assert "truncated" in text or "the file is empty or missing" in text
-    assert "python -m fluxvla_core.data.validate DATASET" in text
+    assert "fluxvla data validate DATASET" in text
     if front and keep in (0.5, -1):
         assert "its index points beyond its end" in text
 

@@ -32,6 +32,16 @@ COMMANDS: Mapping[str, Entry] = {
     "plugins doctor": Entry(
         "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"
     ),
+    "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
+    "data validate": Entry(
+        "fluxvla_core.cli.data_commands:Validate", "read every row, decode every frame"
+    ),
+    "data stats": Entry(
+        "fluxvla_core.cli.data_commands:Stats", "print exact statistics of a dataset"
+    ),
+    "data convert": Entry(
+        "fluxvla_core.cli.data_commands:Convert", "write a dataset of LeRobot v2 as v3.0"
+    ),
     "report": Entry("fluxvla_core.report.command:Report", "write the HTML report of a work dir"),
     "version": Entry("fluxvla_core.cli.version:Version", "print the versions"),
 }

@@ -85,16 +85,18 @@ def assemble(episodes: Sequence[Episode], out: Path, recording: Recording) -> No
     ]
     _write_data(columns, rows, out, features, recording)
     for key in (k for k, f in features.items() if f["dtype"] == "video"):
-        _write_videos(key, [e.clips[key] for e in episodes], rows, out, recording)
+        clips = [e.clips[key] for e in episodes]
+        groups = split_by_size([clip.size for clip in clips], recording.video_file_mb * MEGABYTE)
+        write_videos(key, clips, groups, rows, out, recording.fps)
     for row, episode, column in zip(rows, episodes, columns, strict=True):
-        row.update(_flat_statistics(_episode_statistics(episode, column)))
-    _write_meta(rows, out, tasks)
+        row.update(flat_statistics(statistics_of(episode.histograms, column)))
+    write_tables(rows, out, tasks)
     _write_extras(episodes, out)
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     totals = {
         k: np.sum([e.histograms[k] for e in episodes], axis=0) for k in episodes[0].histograms
     }
-    write_json(out / v3.STATS, {k: as_lists(s) for k, s in _statistics(totals, whole).items()})
+    write_json(out / v3.STATS, {k: as_lists(s) for k, s in statistics_of(totals, whole).items()})
     write_json(out / v3.EMBODIMENT, recording.embodiment.to_dict())
     write_json(
         out / v3.INFO,
@@ -158,19 +160,20 @@ def _write_data(
                 rows[i].update({"data/chunk_index": chunk, "data/file_index": file})
 
 
-def _write_videos(
+def write_videos(
     key: str,
     clips: Sequence[Clip],
+    groups: Sequence[Sequence[int]],
     rows: Sequence[dict[str, Any]],
     out: Path,
-    recording: Recording,
+    fps: float,
 ) -> None:
-    groups = split_by_size([clip.size for clip in clips], recording.video_file_mb * MEGABYTE)
+    """Join each group of clips into a file, and note in ``rows`` where each of them is."""
     for number, group in enumerate(groups):
         chunk, file = v3.file_of(number)
         path = out / v3.VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        join_clips([clips[i] for i in group], path, recording.fps)
+        join_clips([clips[i] for i in group], path, fps)
         done = 0
         for i in group:
             end = done + clips[i].frames
@@ -178,8 +181,8 @@ def _write_videos(
                 {
                     f"videos/{key}/chunk_index": chunk,
                     f"videos/{key}/file_index": file,
-                    f"videos/{key}/from_timestamp": done / recording.fps,
-                    f"videos/{key}/to_timestamp": end / recording.fps,
+                    f"videos/{key}/from_timestamp": done / fps,
+                    f"videos/{key}/to_timestamp": end / fps,
                 }
             )
             done = end
@@ -198,13 +201,10 @@ def split_by_size(sizes: Sequence[float], limit: float) -> list[list[int]]:
     return groups
 
 
-def _episode_statistics(episode: Episode, columns: Mapping[str, Array]) -> dict[str, Stats]:
-    return _statistics(episode.histograms, columns)
-
-
-def _statistics(
+def statistics_of(
     histograms: Mapping[str, npt.NDArray[np.int64]], columns: Mapping[str, Array]
 ) -> dict[str, Stats]:
+    """Statistics of each feature: cameras by their pixel counts, columns ``(n, …)`` by rows."""
     frames = len(columns["index"])
     stats = {key: histogram_statistics(h, frames) for key, h in histograms.items()}
     for key, values in columns.items():
@@ -215,7 +215,8 @@ def _statistics(
     return stats
 
 
-def _flat_statistics(stats: Mapping[str, Stats]) -> dict[str, Any]:
+def flat_statistics(stats: Mapping[str, Stats]) -> dict[str, Any]:
+    """One episode's statistics as its row of the episode table has them."""
     return {
         f"stats/{key}/{name}": value
         for key, entry in stats.items()
@@ -223,7 +224,8 @@ def _flat_statistics(stats: Mapping[str, Stats]) -> dict[str, Any]:
     }
 
 
-def _write_meta(rows: Sequence[dict[str, Any]], out: Path, tasks: Mapping[str, int]) -> None:
+def write_tables(rows: Sequence[dict[str, Any]], out: Path, tasks: Mapping[str, int]) -> None:
+    """The tables of episodes and of instructions (text -> ``task_index``)."""
     pa = arrow()
     pq = parquet()
 

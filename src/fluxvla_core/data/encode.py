@@ -121,23 +121,31 @@ class EpisodeEncoder:
 
 @dataclass(frozen=True)
 class Clip:
-    """``frames`` pictures of ``path`` from ``start`` seconds on, and how many bytes they take."""
+    """``frames`` pictures of ``path`` from ``start`` seconds on, and how many bytes they take.
+
+    ``delay`` is how many frames later than they are decoded some of them are shown; above 0 only
+    for whole files.
+    """
 
     path: Path
     frames: int
     size: int
     start: float = 0.0
+    delay: int = 0
 
 
 def join_clips(clips: Sequence[Clip], out: Path, fps: float) -> None:
     """Write the clips one after the other into ``out``, copying packets.
 
+    Frame ``i`` of all is shown at ``i / fps``.
+
     Raises:
-        DataError: a clip has fewer frames than it should.
+        DataError: a clip has other frames than it should, or they refer across its ends.
     """
     av = libav()
 
     step = Fraction(1) / Fraction(fps).limit_denominator(1001)
+    delay = max(clip.delay for clip in clips)
     with (
         av.open(str(clips[0].path)) as first,
         av.open(str(out), "w", options=_CONTAINER) as target,
@@ -146,15 +154,40 @@ def join_clips(clips: Sequence[Clip], out: Path, fps: float) -> None:
         stream = target.add_stream_from_template(first.streams.video[0], opaque=True)
         done = 0
         for clip in clips:
-            for count, packet in enumerate(_packets(clip, step)):
-                ticks = round((done + count) * step / packet.time_base)
-                packet.pts, packet.dts = ticks, ticks
+            for count, (packet, shown) in enumerate(_packets(clip, step)):
+                packet.pts = round((done + shown) * step / packet.time_base)
+                packet.dts = round((done + count - delay) * step / packet.time_base)
                 packet.stream = stream
                 target.mux(packet)
             done += clip.frames
 
 
-def _packets(clip: Clip, step: Fraction) -> Iterator[Any]:
+def whole_clip(path: Path, frames: int, fps: float) -> tuple[Clip, bytes]:
+    """All of a file as a clip, and its stream's parameters: only equal ones can be joined.
+
+    Raises:
+        DataError: it has other frames than ``frames`` at ``0, 1 / fps, 2 / fps, …``.
+    """
+    av = libav()
+
+    step = Fraction(1) / Fraction(fps).limit_denominator(1001)
+    clip = Clip(path, frames, path.stat().st_size, delay=frames)
+    seen = [shown for _, shown in _packets(clip, step)]
+    if sorted(seen) != list(range(frames)):
+        raise DataError(
+            f"{path}: its {frames} frames are not shown at {float(1 / step):g} Hz from 0 s on",
+            cause="it was recorded at another rate than info.json says, or cut",
+        )
+    with av.open(str(path)) as source:
+        context = source.streams.video[0].codec_context
+        size = f"{context.name} {context.width} {context.height} {context.pix_fmt} "
+        parameters = size.encode() + bytes(context.extradata or b"")
+    delay = max(count - shown for count, shown in enumerate(seen))
+    return Clip(path, frames, clip.size, delay=delay), parameters
+
+
+def _packets(clip: Clip, step: Fraction) -> Iterator[tuple[Any, int]]:
+    """A clip's packets as they are decoded, each with its place in the order that is shown."""
     av = libav()
 
     found = 0
@@ -169,13 +202,14 @@ def _packets(clip: Clip, step: Fraction) -> Iterator[Any]:
                     continue
                 if found == clip.frames:
                     break
-                if packet.pts != packet.dts or (found == 0 and not packet.is_keyframe):
+                shown = round((packet.pts - first) * stream.time_base / step)
+                if found - shown > clip.delay or (found == 0 and not packet.is_keyframe):
                     raise DataError(
                         f"{clip.path}: the episode at {clip.start:.3f} s cannot be copied",
                         cause="its frames refer across its ends; another program wrote it",
                     )
                 found += 1
-                yield packet
+                yield packet, shown
     except av.error.FFmpegError as error:
         raise DataError(f"{clip.path}: cannot be read as video ({error.strerror})") from error
     if found != clip.frames:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,13 +13,7 @@ from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.encode import CODECS, Clip
 from fluxvla_core.data.files import read_table
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.writer import (
-    check_absent,
-    explain_disk,
-    make_staging,
-    publish,
-    staging_of,
-)
+from fluxvla_core.data.writer import built_aside, check_absent
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import check_match
 
@@ -47,22 +40,9 @@ def merge_datasets(roots: Sequence[str | Path], out: str | Path) -> Path:
     for meta in metas[1:]:
         _check_alike(recording, metas[0], meta)
     episodes = _sorted([episode for meta in metas for episode in _episodes(meta)])
-    staging = staging_of(target)
-    if staging.exists():
-        raise DataError(
-            f"{target}: {staging} is in the way",
-            cause="another merge or recording is under way, or was interrupted",
-            next="delete that folder if nothing is writing there",
-        )
-    make_staging(staging)
-    try:
+    safe = "the datasets that were to be merged are as they were"
+    with built_aside(target, safe, "make room and merge again") as staging:
         assemble(episodes, staging, recording)
-        publish(staging, target)
-    except OSError as error:
-        safe = "the datasets that were to be merged are as they were"
-        raise explain_disk(error, target, safe, "make room and merge again") from error
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
     return target
 
 

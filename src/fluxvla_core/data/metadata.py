@@ -51,6 +51,17 @@ class Metadata:
         """Features that are pictures."""
         return [k for k, f in self.features.items() if f["dtype"] in ("video", "image")]
 
+    @property
+    def vectors(self) -> list[str]:
+        """Features that are a vector of float32 or float64 a frame."""
+        return [
+            k
+            for k, f in self.features.items()
+            if f["dtype"].startswith("float")
+            and len(f["shape"]) == 1
+            and k not in v3.INDEX_FEATURES
+        ]
+
     def data_file(self, file: FileId) -> Path:
         return self.root / _path(self.info["data_path"], file)
 

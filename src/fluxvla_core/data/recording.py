@@ -90,7 +90,7 @@ def load_recorded(
             else "episodes=[] chooses none",
         )
     _check_tasks(meta, columns["task_index"])
-    tracks = tuple(_track(meta, key, columns["timestamp"], chosen) for key in keys)
+    tracks = tuple(make_track(meta, key, columns["timestamp"], chosen) for key in keys)
     return Recorded(
         meta=meta,
         states=columns[state_key],
@@ -127,7 +127,12 @@ def _check_tasks(meta: Metadata, index: npt.NDArray[Any]) -> None:
         )
 
 
-def _track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[np.bool_]) -> Track:
+def make_track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[np.bool_]) -> Track:
+    """Where the frames of camera ``key`` are; ``chosen`` are the episodes to find, ``(E,)``.
+
+    Raises:
+        DataError: a file of a chosen episode is missing or too short.
+    """
     places = meta.episodes.videos[key]
     lengths = meta.episodes.lengths
     # Only the files of the chosen episodes: a part of a dataset can be copied and trained on.

@@ -120,7 +120,7 @@ class VideoFile:
         return DataError(
             f"{self.path}: no frame at {time:.3f} s ({why}); {self.whole_frames()} frames found",
             cause="the file is damaged, or belongs to another recording",
-            next=f"{COPY_AGAIN}python -m fluxvla_core.data.validate DATASET",
+            next=f"{COPY_AGAIN}fluxvla data validate DATASET",
         )
 
 
@@ -168,7 +168,7 @@ def check_video(path: Path, expected: int) -> None:
         raise DataError(
             f"{error.what}: {expected} frames expected, 0 found",
             cause=error.cause,
-            next=f"{COPY_AGAIN}python -m fluxvla_core.data.validate DATASET",
+            next=f"{COPY_AGAIN}fluxvla data validate DATASET",
         ) from error
     found = video.whole_frames()
     video.close()
@@ -178,7 +178,7 @@ def check_video(path: Path, expected: int) -> None:
             cause="the file is truncated: its index points beyond its end"
             if len_of_index(path) >= expected
             else "the recording was edited, or the file belongs to another dataset",
-            next=f"{COPY_AGAIN}python -m fluxvla_core.data.validate DATASET",
+            next=f"{COPY_AGAIN}fluxvla data validate DATASET",
         )
 
 

@@ -10,7 +10,8 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -235,6 +236,35 @@ def make_staging(staging: Path) -> None:
             f"{staging.parent}: no dataset can be written here ({error.strerror})",
             cause="there is no permission to write, or a file is where a folder should be",
         ) from error
+
+
+@contextmanager
+def built_aside(target: Path, safe: str, next: str) -> Iterator[Path]:
+    """A folder to write the dataset ``target`` into; it appears there if nothing is raised.
+
+    Args:
+        safe, next: what to say when the disk is full.
+
+    Raises:
+        DataError: ``target`` exists, is under way, or cannot be written.
+        RunFailed: the disk is full.
+    """
+    check_absent(target)
+    staging = staging_of(target)
+    if staging.exists():
+        raise DataError(
+            f"{target}: {staging} is in the way",
+            cause="another process writes the same dataset, or was interrupted",
+            next="delete that folder if nothing is writing there",
+        )
+    make_staging(staging)
+    try:
+        yield staging
+        publish(staging, target)
+    except OSError as error:
+        raise explain_disk(error, target, safe, next) from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
 
 
 def explain_disk(error: OSError, root: Path, safe: str, next: str) -> Exception:

@@ -1,0 +1,120 @@
+"""``fluxvla data inspect``, ``validate``, ``stats`` and ``convert``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from fluxvla_core.cli.parser import Parser
+
+DIR = "a LeRobot dataset: the folder that holds meta/"
+
+
+class Inspect:
+    api = "1.0"
+    help = (
+        "Print what a dataset holds: version, robot, episodes, cameras, vectors, instructions. "
+        "Reads its tables and decodes nothing."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("dataset", metavar="DIR", help=DIR)
+        parser.add_argument("--json", action="store_true", help="print JSON")
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.data.describe import describe, lines
+
+        facts = describe(Path(args.dataset))
+        print(json.dumps(facts, indent=1) if args.json else "\n".join(lines(facts)))
+        return 0
+
+
+class Validate:
+    api = "1.0"
+    help = (
+        "Read every row and decode every frame of a dataset; exit code 2 and what is wrong, file "
+        "by file, or 0."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("dataset", metavar="DIR", help=DIR)
+        _log_format(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.data.validate import validate
+
+        with _reporter(args.log_format, sys.stdout) as reporter:
+            doubts = validate(Path(args.dataset), reporter)
+            warned = f", {len(doubts)} warnings" if doubts else ""
+            reporter.info(f"nothing is wrong with {args.dataset}{warned}")
+        return 0
+
+
+class Stats:
+    api = "1.0"
+    help = (
+        "Print exact statistics of a dataset: every vector, and with --pixels every camera. "
+        "Quantiles are of the data itself."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("dataset", metavar="DIR", help=DIR)
+        parser.add_argument("--pixels", action="store_true", help="decode and count all frames")
+        parser.add_argument("--json", action="store_true", help="print JSON")
+        parser.add_argument("--write", action="store_true", help="put them into meta/stats.json")
+        _log_format(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.data.describe import dataset_statistics, table, write_statistics
+        from fluxvla_core.data.statistics import as_lists
+
+        # The statistics are what comes out; how far they are is said beside them.
+        with _reporter(args.log_format, sys.stderr) as reporter:
+            meta, stats = dataset_statistics(Path(args.dataset), args.pixels, reporter)
+            if args.write:
+                reporter.artifact("statistics", write_statistics(meta, stats))
+        if args.json:
+            print(json.dumps({key: as_lists(entry) for key, entry in stats.items()}, indent=1))
+        else:
+            print("\n".join(table(meta, stats)))
+        return 0
+
+
+class Convert:
+    api = "1.0"
+    help = (
+        "Write a dataset of LeRobot v2.0 or v2.1 as v3.0. Video is copied, not encoded again; "
+        "statistics are computed anew."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("dataset", metavar="DIR", help=f"{DIR}; stays as it is")
+        parser.add_argument("out", metavar="OUT", help="the new dataset's folder")
+        _log_format(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.data.convert import convert
+
+        with _reporter(args.log_format, sys.stdout) as reporter:
+            reporter.artifact("dataset", convert(args.dataset, args.out, reporter))
+        return 0
+
+
+def _log_format(parser: Parser) -> None:
+    parser.once("--log-format", choices=("text", "json"), default="text", help="of the progress")
+
+
+@contextmanager
+def _reporter(log_format: str, stream: TextIO) -> Iterator[Any]:
+    from fluxvla_core.cli.reporters import make_reporter
+
+    reporter = make_reporter(log_format, stream)
+    try:
+        yield reporter
+    finally:
+        reporter.close()

@@ -1,0 +1,207 @@
+"""Datasets of LeRobot v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
+
+Rows and video packets are copied as they are. Statistics are computed anew, exactly: version 2 has
+no quantiles, and estimates its pictures from samples. That decodes every frame, so what comes out
+is known to be whole.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.data import lerobot_v3 as v3
+from fluxvla_core.data.assemble import (
+    MEGABYTE,
+    flat_statistics,
+    split_by_size,
+    statistics_of,
+    write_json,
+    write_tables,
+    write_videos,
+)
+from fluxvla_core.data.columns import read_columns
+from fluxvla_core.data.encode import Clip, whole_clip
+from fluxvla_core.data.files import read_table
+from fluxvla_core.data.metadata import Metadata, read_metadata
+from fluxvla_core.data.optional import arrow, parquet
+from fluxvla_core.data.statistics import LEVELS, as_lists, image_histogram
+from fluxvla_core.data.video import VideoFile
+from fluxvla_core.data.writer import built_aside
+from fluxvla_core.errors import DataError
+
+Counts = npt.NDArray[np.int64]
+Columns = dict[str, npt.NDArray[Any]]
+
+
+def convert(root: str | Path, out: str | Path, reporter: Reporter | None = None) -> Path:
+    """Write the dataset below ``root`` as version 3.0 to ``out``; returns ``out``.
+
+    ``root`` stays as it is. ``out`` appears in one step when it is whole.
+
+    Raises:
+        DataError: ``root`` is damaged, of version 3.0 already, or holds pictures in its tables;
+            ``out`` exists.
+        RunFailed: the disk is full.
+    """
+    say = reporter or SilentReporter()
+    source, target = Path(root), Path(out)
+    meta = read_metadata(source)
+    if meta.version == v3.VERSION:
+        raise DataError(f"{source}: is of version {v3.VERSION} already")
+    images = [key for key, f in meta.features.items() if f["dtype"] == "image"]
+    if images:
+        raise DataError(
+            f"{source}: {', '.join(images)} stored as 'image'; only video is converted",
+            next="make videos of them with the LeRobot that recorded them",
+        )
+    checked = read_columns(meta, meta.vectors)
+    with built_aside(target, f"{source} is as it was", "make room and convert again") as staging:
+        _write(meta, checked["task_index"], staging, say)
+        made = read_metadata(staging)
+        read_columns(made, made.vectors)
+    return target
+
+
+def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) -> None:
+    episodes = meta.episodes
+    rows: list[dict[str, Any]] = []
+    for i, (start, end) in enumerate(zip(episodes.first_row, episodes.end_row, strict=True)):
+        said = dict.fromkeys(meta.tasks[t] for t in tasks[start:end])
+        rows.append(
+            {
+                "episode_index": i,
+                "tasks": list(said),
+                "length": int(end - start),
+                "dataset_from_index": int(start),
+                "dataset_to_index": int(end),
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+    columns = _copy_rows(meta, rows, out)
+    videos = list(episodes.videos)
+    histograms: list[dict[str, Counts]] = [{} for _ in rows]
+    total = len(videos) * int(episodes.lengths.sum())
+    for part, key in enumerate(videos):
+        clips, parameters = [], []
+        for i, length in enumerate(map(int, episodes.lengths)):
+            path = meta.video_file(key, episodes.videos[key].files[i])
+            clip, kind = whole_clip(path, length, meta.fps)
+            clips.append(clip)
+            parameters.append(kind)
+            histograms[i][key] = _count_pixels(path, length, meta.fps)
+            done = part * total // len(videos) + int(episodes.end_row[i])
+            say.progress("convert frames", done, total, camera=v3.camera_name(key))
+        groups = _groups(clips, parameters)
+        write_videos(key, clips, groups, rows, out, meta.fps)
+    for row, counts, values in zip(rows, histograms, columns, strict=True):
+        row.update(flat_statistics(statistics_of(counts, values)))
+    write_tables(rows, out, {task: i for i, task in enumerate(meta.tasks)})
+    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in videos}
+    stats = statistics_of(totals, whole)
+    write_json(out / v3.STATS, {key: as_lists(entry) for key, entry in stats.items()})
+    if (meta.root / v3.EMBODIMENT).is_file():
+        shutil.copyfile(meta.root / v3.EMBODIMENT, out / v3.EMBODIMENT)
+    gone = ("total_chunks", "total_videos")
+    info = {
+        **{key: value for key, value in meta.info.items() if key not in gone},
+        "codebase_version": v3.VERSION,
+        "total_tasks": len(meta.tasks),
+        "chunks_size": v3.CHUNK_FILES,
+        "data_files_size_in_mb": v3.DATA_FILE_MB,
+        "video_files_size_in_mb": v3.VIDEO_FILE_MB,
+        "data_path": v3.DATA,
+        "video_path": v3.VIDEO if videos else None,
+    }
+    write_json(out / v3.INFO, info)
+
+
+def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> list[Columns]:
+    """Write the data files; returns each episode's numbers, ``(n,)`` or ``(n, D)`` a column."""
+    pa = arrow()
+    pq = parquet()
+
+    paths = [meta.data_file(file) for file in meta.episodes.files]
+    sizes = [path.stat().st_size for path in paths]
+    metadata = {"huggingface": v3.datasets_schema(meta.features)}
+    names = [key for key, f in meta.features.items() if f["dtype"] != "video"]
+    columns: list[Columns] = []
+    schema: Any = None
+    for number, group in enumerate(split_by_size(sizes, v3.DATA_FILE_MB * MEGABYTE)):
+        chunk, file = v3.file_of(number)
+        path = out / v3.DATA.format(chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer: Any = None
+        for i in group:
+            table = _rows(paths[i], names, rows[i]["dataset_from_index"])
+            schema = schema or table.schema.with_metadata(metadata)
+            try:
+                table = table.cast(schema)
+            except pa.ArrowException as error:
+                raise DataError(
+                    f"{paths[i]}: its columns are not of the types of {paths[0]} ({error})"
+                ) from error
+            writer = writer or pq.ParquetWriter(path, schema)
+            writer.write_table(table)
+            rows[i].update({"data/chunk_index": chunk, "data/file_index": file})
+            columns.append(_numbers(table))
+        writer.close()
+    return columns
+
+
+def _rows(path: Path, names: Sequence[str], start: int) -> Any:
+    """An episode's table, its ``index`` counting the dataset's rows from ``start`` on."""
+    pa = arrow()
+
+    table = read_table(path, names).select(names)
+    index = pa.array(np.arange(start, start + table.num_rows))
+    return table.set_column(table.schema.get_field_index("index"), "index", index)
+
+
+def _numbers(table: Any) -> Columns:
+    """Columns of numbers, or of equally long lists of numbers; the others have no statistics."""
+    pa = arrow()
+
+    found: Columns = {}
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        lists = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+        flat = column.flatten() if lists else column
+        kind = flat.type
+        number = (
+            pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+        )
+        if number and not flat.null_count and len(flat) % len(column) == 0:
+            values = flat.to_numpy(zero_copy_only=False)
+            found[name] = values.reshape(len(column), -1) if lists else values
+    return found
+
+
+def _count_pixels(path: Path, frames: int, fps: float) -> Counts:
+    video = VideoFile(path)
+    try:
+        counts = np.zeros((3, LEVELS), np.int64)
+        for i in range(frames):
+            counts += image_histogram(video.read(i / fps))
+        return counts
+    finally:
+        video.close()
+
+
+def _groups(clips: Sequence[Clip], parameters: Sequence[bytes]) -> list[list[int]]:
+    """Consecutive clips that make a file: not too large, and all of one encoder's parameters."""
+    groups: list[list[int]] = []
+    for group in split_by_size([clip.size for clip in clips], v3.VIDEO_FILE_MB * MEGABYTE):
+        for place, i in enumerate(group):
+            if place == 0 or parameters[i] != parameters[i - 1]:
+                groups.append([])
+            groups[-1].append(i)
+    return groups

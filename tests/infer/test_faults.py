@@ -129,7 +129,7 @@ def test_a_policy_that_hangs_on_a_robot(bench, make_arm, asynchronous):
     fails(
         bench,
         SafetyStop,
-        r"waits for a chunk for 0\.\d+ s, safety.starvation_s is 0.3",
+        r"waits for a chunk for \d+\.\d+ s, safety.starvation_s is 0.3",
         async_execution=asynchronous,
         max_publish_step=500,
         safety={"starvation_s": 0.3},

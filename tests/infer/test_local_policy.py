@@ -28,7 +28,7 @@ ARM = EmbodimentSpec(
 MEAN, STD = [0.1, -0.2], [0.5, 2.0]
 
 
-class TinyVLA(torch.nn.Module):
+class LittleVLA(torch.nn.Module):
     """Actions = gain * noise + the normalised state; remembers what it was given."""
 
     def __init__(self, action_dim: int = 2) -> None:
@@ -62,10 +62,10 @@ class Plain(torch.nn.Module):
 
 @pytest.fixture(autouse=True)
 def models():
-    for cls in (TinyVLA, Plain):
+    for cls in (LittleVLA, Plain):
         VLAS.register_module()(cls)
     yield
-    for cls in (TinyVLA, Plain):
+    for cls in (LittleVLA, Plain):
         VLAS.unregister(cls.__name__)
 
 
@@ -90,7 +90,7 @@ def save(
         **changes.pop("dataset", {}),
     }
     config = {
-        "model": {"type": "TinyVLA"},
+        "model": {"type": "LittleVLA"},
         "train_dataloader": {"dataset": dataset},
         **changes.pop("config", {}),
     }

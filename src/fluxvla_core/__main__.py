@@ -2,7 +2,11 @@
 
 import sys
 
+from fluxvla_core.cli import ranks
 from fluxvla_core.cli.main import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    if ranks.world_size() is not None:
+        ranks.leave(code)
+    sys.exit(code)

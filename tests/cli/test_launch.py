@@ -227,3 +227,22 @@ def test_a_rank_that_was_killed_after_the_grace_is_no_cause(
     found = launch._all({0: Process(), 1: Process()}, {1: first})
     assert root_cause(found).rank == 0
     assert launch._ending(3) == "exit code 3"
+
+
+@pytest.mark.parametrize("rank", [True, False])
+def test_a_rank_leaves_before_its_interpreter_can_be_aborted(rank: bool) -> None:
+    code = (
+        "import atexit, runpy, sys\n"
+        "atexit.register(print, 'shut down')\n"
+        "sys.argv = ['fluxvla', 'no-such-command']\n"
+        "runpy.run_module('fluxvla_core', run_name='__main__')\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "WORLD_SIZE"}
+    if rank:
+        environment["WORLD_SIZE"] = "1"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "no command 'no-such-command'" in done.stderr
+    assert done.stdout == ("" if rank else "shut down\n")

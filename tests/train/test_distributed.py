@@ -116,12 +116,3 @@ def test_a_lost_rank_is_explained_and_other_errors_are_not():
     )
     assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), TWO, 12) is None
     assert explain(error, ONE, 12) is None
-
-
-def leave():
-    print("last words", flush=False)
-    distributed.exit_now(3)
-
-
-def test_exit_now_keeps_the_code():
-    assert run_ranks(1, leave) == [3]

@@ -104,13 +104,13 @@ def test_one_process_in_bf16_with_recomputing(tmp_path):
 WORKER = """
 import json, os, pathlib, sys
 from fluxvla_core.testing.training import train
-from fluxvla_core.train.distributed import exit_now
+from fluxvla_core.cli.ranks import leave
 settings = json.loads(pathlib.Path(sys.argv[1]).read_text())
 folder = pathlib.Path(settings["work_dir"])
 folder.mkdir(parents=True, exist_ok=True)
 (folder / f"pid-{os.environ['RANK']}").write_text(str(os.getpid()))
 train(settings)
-exit_now(0)
+leave(0)
 """
 
 

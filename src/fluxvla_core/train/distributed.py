@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -107,17 +106,6 @@ def stop(world: World, failed: bool = False) -> None:
     if not failed:
         dist.barrier(group=world.control)
     dist.destroy_process_group()
-
-
-def exit_now(code: int) -> NoReturn:
-    """End a worker process at once, with everything it said written out.
-
-    gloo's threads can outlive the interpreter and then abort it ("terminate called without an
-    active exception") after all work is done; leaving this way gives them no chance to.
-    """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
 
 
 def agree(world: World, value: int) -> int:

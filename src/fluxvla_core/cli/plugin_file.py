@@ -35,9 +35,11 @@ def _load(path: Path) -> None:
     sys.modules[module] = loaded
     try:
         spec.loader.exec_module(loaded)
-    except FluxError:
-        raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        # Worker processes load every such module again; one that failed must not be among them.
+        del sys.modules[module]
+        if isinstance(error, FluxError) or not isinstance(error, (Exception, SystemExit)):
+            raise
         steps = traceback.extract_tb(error.__traceback__)
         lines = [s.lineno for s in steps if Path(s.filename).resolve() == path.resolve()]
         line = lines[-1] if lines else getattr(error, "lineno", None)

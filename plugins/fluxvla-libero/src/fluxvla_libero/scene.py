@@ -169,6 +169,8 @@ class LiberoScene:
         # The controller is made from where the arm's base is, which a reset alone does not say.
         self._sim.reset()
         self._sim.forward()
+        # LIBERO's picture context does so once more, and the solver starts from what it found.
+        self._sim.forward()
         for robot in env.robots:
             # The fingers' target, which is summed up from one command to the next.
             robot.gripper.current_action = np.zeros_like(robot.gripper.current_action)

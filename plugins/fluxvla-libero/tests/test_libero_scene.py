@@ -1,0 +1,181 @@
+"""A scene against LIBERO's own environment: resets, states and pictures are the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fluxvla_libero.drawing import Drawing
+from fluxvla_libero.embodiment import NO_OP, axis_angle
+from fluxvla_libero.require import quiet
+from fluxvla_libero.scene import ENV_SEED, LiberoScene
+from fluxvla_libero.suites import can_be_done_in, choose_tasks, goal, init_states, suite_tasks
+
+from fluxvla_core.errors import ConfigError, RunFailed
+
+
+def shake(scene, seed, steps=12):
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        scene.step(np.clip(rng.normal(size=7), -1, 1))
+    return scene.state_hash()
+
+
+def stock(libero, task, size=0):
+    """LIBERO's own environment, as its evaluation makes it."""
+    with quiet():
+        made = libero.envs.OffScreenRenderEnv(
+            bddl_file_name=str(task.bddl), camera_heights=size or 64, camera_widths=size or 64
+        )
+    if not size:
+        for name, observable in made.env._observables.items():
+            observable.set_enabled("image" not in name)
+    made.seed(ENV_SEED)
+    made.reset()
+    return made
+
+
+def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
+    """After other episodes in the scene, and from a model that LIBERO built anew."""
+    init = init_states("libero_object", 2)
+    scene.reset(init[1])
+    shake(scene, 1)
+    scene.reset(init[0])
+    env = stock(libero, scene.task, size=64)
+    seen = env.set_init_state(init[0])
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        action = np.clip(rng.normal(size=7), -1, 1)
+        seen, _, done, _ = env.step(action)
+        scene.step(action)
+    data = env.sim.data
+    np.testing.assert_array_equal(scene.data.qpos, data.qpos)
+    np.testing.assert_array_equal(scene.data.qvel, data.qvel)
+    assert not scene.done() and not done
+    expected = [
+        seen["robot0_eef_pos"],
+        axis_angle(seen["robot0_eef_quat"]),
+        seen["robot0_gripper_qpos"],
+    ]
+    np.testing.assert_array_equal(scene.state, np.concatenate(expected))
+    from robosuite.utils.transform_utils import quat2axisangle
+
+    robosuites = quat2axisangle(seen["robot0_eef_quat"].copy())
+    np.testing.assert_allclose(scene.state[3:6], robosuites, atol=1e-12)
+    # What robosuite shows, turned by 180 degrees as everybody does it.
+    drawing = Drawing(scene.model, "reference")
+    scene.model.vis.quality.shadowsize = env.sim.model.vis.quality.shadowsize
+    scene.model.vis.quality.offsamples = env.sim.model.vis.quality.offsamples
+    for camera in ("agentview", "robot0_eye_in_hand"):
+        picture = drawing.picture(scene.data, camera, 64, 64)
+        turned = seen[f"{camera}_image"][::-1, ::-1]
+        assert picture.std() > 10, "something is seen"
+        np.testing.assert_array_equal(picture, turned)
+    drawing.close()
+    env.close()
+
+
+def test_what_cannot_move_stands_where_libero_puts_it(libero):
+    """libero_goal has a cabinet and a stove, which the fixed states say nothing about."""
+    task = suite_tasks("libero_goal")[0]
+    state = init_states("libero_goal", 0)[3]
+    scene = LiberoScene(task)
+    scene.reset(seed=5)
+    shake(scene, 2, 3)
+    scene.reset(state)
+    env = stock(libero, task)
+    env.set_init_state(state)
+    np.testing.assert_array_equal(scene.model.body_pos, env.sim.model.body_pos)
+    for _ in range(5):
+        scene.step(NO_OP)
+        env.step(NO_OP)
+    np.testing.assert_array_equal(scene.data.qpos, env.sim.data.qpos)
+    judged = [t.index for t in suite_tasks("libero_goal") if scene.can_judge(t)]
+    assert judged == list(range(10)), "all tasks share the scene"
+    env.close()
+    scene.close()
+    scene.close()
+
+
+def test_a_reset_leaves_nothing_of_the_episode_before(scene):
+    init = init_states("libero_object", 2)
+    scene.reset(init[4])
+    first = shake(scene, 4)
+    scene.reset(seed=9)
+    placed = scene.state_hash()
+    shake(scene, 5)
+    scene.reset(init[4])
+    assert shake(scene, 4) == first
+    scene.reset(seed=9)
+    assert scene.state_hash() == placed
+    scene.reset(seed=10)
+    assert scene.state_hash() != placed
+    assert scene.steps == 0
+
+
+def test_waiting_steps_do_not_count(scene):
+    scene.reset(init_states("libero_object", 2)[0])
+    scene.settle(4)
+    assert scene.steps == 0
+    scene.step(NO_OP)
+    assert scene.steps == 1
+
+
+def test_cheap_pictures_show_the_same_without_shadows(scene):
+    scene.reset(init_states("libero_object", 2)[0])
+    picture = scene.render("agentview", 48, 80)
+    assert picture.shape == (48, 80, 3)
+    assert picture.dtype == np.uint8
+    assert picture.std() > 10
+    np.testing.assert_array_equal(picture, scene.render("agentview", 48, 80))
+    assert scene.model.vis.quality.shadowsize == 0
+
+
+def test_the_basket_is_on_the_left_as_in_the_public_datasets(scene):
+    """It stands at positive y; upright and not mirrored it would be on the right."""
+    scene.reset(init_states("libero_object", 2)[0])
+    picture = scene.render("agentview", 64, 64).astype(int)
+    column = picture[30:42].std(axis=(0, 2))
+    assert column[5:20].mean() > 1.5 * column[48:62].mean(), "the basket's wicker"
+
+
+@pytest.mark.parametrize(
+    "action", [np.zeros(6), np.full(7, np.nan), np.full(7, np.inf), np.zeros((1, 7))]
+)
+def test_impossible_actions_are_refused(scene, action):
+    with pytest.raises(RunFailed, match="LIBERO takes 7 finite numbers"):
+        scene.step(action)
+
+
+def test_a_state_of_another_model_is_refused(scene):
+    with pytest.raises(RunFailed, match="an initial state has 110 numbers"):
+        scene.reset(np.zeros(92))
+
+
+def test_suites_have_their_tasks_goals_and_states(libero):
+    tasks = suite_tasks("libero_object")
+    assert [t.index for t in tasks] == list(range(10))
+    assert tasks[4].language == "pick up the ketchup and place it in the basket"
+    assert goal(tasks[4]) == (("in", "ketchup_1", "basket_1_contain_region"),)
+    assert init_states("libero_object", 4).shape[0] == 50
+    assert len(suite_tasks("libero_90")) == 90
+    reworded = suite_tasks("libero_object_lan")[0].language
+    assert reworded != tasks[0].language
+
+
+def test_tasks_are_chosen_by_index_and_name(libero):
+    tasks = suite_tasks("libero_object")
+    assert choose_tasks("libero_object", None) == tasks
+    assert choose_tasks("libero_object", [3, tasks[1].name]) == (tasks[3], tasks[1])
+    with pytest.raises(ConfigError, match=r"libero_object has no task 10; it has 0 \(pick_up_the"):
+        choose_tasks("libero_object", [10])
+    with pytest.raises(ConfigError, match="must name each task once"):
+        choose_tasks("libero_object", [1, 1])
+    with pytest.raises(ConfigError, match="must name each task once"):
+        choose_tasks("libero_object", [])
+
+
+def test_what_can_be_done_where_is_read_from_the_files(libero, scene):
+    tasks = suite_tasks("libero_object")
+    from_files = [t.index for t in tasks if can_be_done_in(t, tasks[2])]
+    assert from_files == [t.index for t in tasks if scene.can_judge(t)]
+    assert from_files == [0, 1, 2, 4, 5, 7]

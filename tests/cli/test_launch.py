@@ -185,6 +185,17 @@ def test_a_launched_rank_leaves_its_error_to_the_launcher(
     assert "a.mp4: bad data" in ended.err
 
 
+def test_a_rank_that_lost_another_is_no_cause(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    assert ranks.record("rank 0 of 2 lost another rank during step 14\n  …", 1, expected=True)
+    (lost,) = ranks.failures(tmp_path).values()
+    assert lost.asked
+    killed = Failure(1, lost.time + 1, "ended without a word", 1, wordless=True)
+    assert root_cause([lost, killed]) is killed
+
+
 def test_the_root_cause() -> None:
     asked = Failure(0, 1.0, "training was stopped by SIGTERM", 1, expected=True, asked=True)
     broken = Failure(1, 2.0, "RuntimeError: connection closed", 1)

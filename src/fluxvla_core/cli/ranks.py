@@ -54,7 +54,7 @@ class Failure:
     Args:
         time: monotonic seconds, which all processes of a machine share.
         expected: a FluxError, whose text says everything.
-        asked: it was stopped from outside, because another rank had failed.
+        asked: it ended because another rank had: stopped from outside, or cut off from it.
         wordless: it left no record: killed, or crashed below Python.
     """
 
@@ -71,8 +71,9 @@ def record(text: str, code: int, *, expected: bool) -> bool:
     """Leave an error for the launcher; False if there is none to read it."""
     if not launched():
         return False
-    # What training, robot loops and this command line say of a SIGTERM.
-    asked = "stopped by SIGTERM" in text
+    # What training, robot loops and this command line say of a SIGTERM, and training of a rank
+    # that is gone.
+    asked = "stopped by SIGTERM" in text or "lost another rank" in text
     failure = Failure(rank(), time.monotonic(), text, code, expected, asked)
     path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.json"
     try:

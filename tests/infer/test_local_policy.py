@@ -160,6 +160,21 @@ def test_the_noise_follows_from_the_seed_and_the_call(tmp_path):
     assert not np.allclose(runs[0], runs[2])
 
 
+def test_a_policy_of_a_mixture_is_for_its_first_dataset(tmp_path):
+    alone = load(save(tmp_path / "alone"))
+    table = json.loads(
+        (tmp_path / "alone/checkpoints/step-000000100/config.resolved.json").read_text()
+    )
+    first = table["config"]["train_dataloader"]["dataset"]
+    mixed = {"type": "DistributedRepeatingDataset", "datasets": [first, {"type": "ParquetDataset"}]}
+    policy = load(save(tmp_path / "mixed", config={"train_dataloader": {"dataset": mixed}}))
+    for each in (alone, policy):
+        each.reset(3)
+    np.testing.assert_array_equal(
+        alone.predict_action(observation()), policy.predict_action(observation())
+    )
+
+
 def test_averaged_weights_are_preferred(tmp_path):
     assert float(load(save(tmp_path, ema=5.0)).model.gain.detach()) == 5.0
 

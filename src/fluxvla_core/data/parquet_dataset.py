@@ -145,16 +145,11 @@ class ParquetDataset:
 
         Each has mean, std, min, max, q01, q10, q50, q90, q99 and count, as lists.
         """
-        states = np.concatenate([r.states[r.chosen] for r in self.recordings])
-        action = action_statistics(
-            self.recordings,
-            self.action_window_size,
-            self.window_start_idx,
-            self.relative,
-            self.per_step_statistics,
-        )
-        proprio = as_lists(column_statistics(states))
-        return {self.statistic_name: {"proprio": proprio, "action": action}}
+        return {self.statistic_name: pooled_statistics([self])}
+
+    def use_statistics(self, entry: Mapping[str, Any]) -> None:
+        """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""
+        self.statistics = {self.statistic_name: dict(entry)}
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""
@@ -219,6 +214,24 @@ class ParquetDataset:
         if isinstance(images, list) and len({image.shape for image in images}) == 1:
             sample["images"] = np.concatenate(split(images))
         return sample
+
+
+def pooled_statistics(datasets: Sequence[ParquetDataset]) -> dict[str, Any]:
+    """``{"proprio", "action"}`` of all frames in use of ``datasets``, as if they were one.
+
+    The datasets take actions alike; every frame counts once.
+    """
+    first = datasets[0]
+    recordings = [recorded for dataset in datasets for recorded in dataset.recordings]
+    states = np.concatenate([r.states[r.chosen] for r in recordings])
+    action = action_statistics(
+        recordings,
+        first.action_window_size,
+        first.window_start_idx,
+        first.relative,
+        first.per_step_statistics,
+    )
+    return {"proprio": as_lists(column_statistics(states)), "action": action}
 
 
 def _roots(given: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_SAMPLE, _ORDER = 1, 2
+_SAMPLE, _ORDER, _MIXTURE = 1, 2, 3
 
 
 def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:
@@ -22,6 +22,11 @@ def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:
 def order_rng(seed: int, epoch: int) -> np.random.Generator:
     """The generator that shuffles ``epoch``."""
     return _generator(seed, _ORDER, epoch, 0)
+
+
+def mixture_rng(seed: int, dataset: int, turn: int) -> np.random.Generator:
+    """The generator that orders the ``turn``-th round through a mixture's ``dataset``."""
+    return _generator(seed, _MIXTURE, turn, dataset)
 
 
 def _generator(seed: int, purpose: int, epoch: int, index: int) -> np.random.Generator:

@@ -20,6 +20,7 @@ from fluxvla_core.build import (
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot_v3 import camera_name
+from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -185,7 +186,7 @@ def load_policy(
             cause="the dataset that it was trained on did not say",
             next="train on a dataset with an embodiment; fluxvla writes it on recording",
         )
-    trained_on = dict(config.get("train_dataloader", {}).get("dataset", {}))
+    trained_on = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
     if trained_on.get("use_delta"):
         raise SpecMismatch(
             "the policy was trained with use_delta=True: differences from frame to frame, "

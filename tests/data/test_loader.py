@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.rng import sample_rng
@@ -31,7 +32,8 @@ class Grouped(Noisy):
     prepared = False
     asked = 0
 
-    def prepare(self):
+    def prepare(self, reporter):
+        reporter.progress("decode frames", 3, 3)
         self.prepared = True
 
     def get_samples(self, keys):
@@ -76,6 +78,17 @@ def test_a_dataset_may_prepare_and_read_a_batch_at_once():
     dataset = Grouped()
     assert equal(batches(3, dataset=dataset), batches(3))
     assert dataset.asked == 3
+
+
+def test_preparing_is_reported():
+    told = []
+
+    class Told(SilentReporter):
+        def progress(self, name, done, total, **fields):
+            told.append((name, done, total))
+
+    make_loader(Grouped(), collate, EpochSampler(10, 2), reporter=Told())
+    assert told == [("decode frames", 3, 3)]
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, FluxError
 
@@ -35,15 +36,17 @@ def make_loader(
     pin_memory: bool = False,
     prefetch_factor: int = 2,
     multiprocessing_context: str | None = None,
+    reporter: Reporter | None = None,
 ) -> Loader:
     """Load batches of ``dataset`` in the order of ``sampler``.
 
     Args:
         dataset: has ``get_sample(index, epoch)``, or ``get_samples(keys)`` for grouped reads;
-            ``prepare()`` is called first where there is one.
+            ``prepare(reporter)`` is called first where there is one.
         num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
+        reporter: is told how far ``prepare`` is.
 
     Raises:
         ConfigError: ``num_workers`` is negative.
@@ -55,7 +58,7 @@ def make_loader(
         raise ConfigError(f"per_device_num_workers must be at least 0, got {num_workers}")
     prepare = getattr(dataset, "prepare", None)
     if prepare is not None:
-        prepare()
+        prepare(reporter or SilentReporter())
     keyed: Any = _Keyed(dataset)
     inner: DataLoader[Any] = DataLoader(
         keyed,

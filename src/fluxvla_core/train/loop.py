@@ -43,6 +43,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
         sampler,
         run.loader_options.per_device_num_workers,
         pin_memory=world.device.type == "cuda",
+        reporter=context.reporter if world.first else None,
     )
     loop = StepLoop(run, iter(loader), stop)
     run.vla.train()

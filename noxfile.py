@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
 from tools import envs, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
+from tools.steps import Steps  # noqa: E402
 
 nox.needs_version = ">=2024.4.15"
 nox.options.sessions = ["tests"]
@@ -32,7 +33,7 @@ PYTEST = ["-n", os.environ.get("FLUXVLA_TEST_PROCESSES", "2"), "--dist", "loadfi
 @nox.session
 def tests(session: nox.Session) -> None:
     """Lint, types, layers, all tests with the packaging ones, and the demo's short form."""
-    with steps(session) as step:
+    with Steps(session) as step:
         dev = dev_env(session)
         if session.posargs:
             make_renderable(session, dev)
@@ -50,14 +51,14 @@ def tests(session: nox.Session) -> None:
 @nox.session
 def demo(session: nox.Session) -> None:
     """Collect, train, evaluate and run a policy for the simulated ALOHA; one HTML report."""
-    with steps(session) as step:
+    with Steps(session) as step:
         step("demo", lambda: run_demo(session, session.posargs))
 
 
 @nox.session
 def lint(session: nox.Session) -> None:
     """ruff check and ruff format --check."""
-    with steps(session) as step:
+    with Steps(session) as step:
         dev = dev_env(session)
         step("lint", lambda: check_lint(dev))
 
@@ -65,7 +66,7 @@ def lint(session: nox.Session) -> None:
 @nox.session
 def types(session: nox.Session) -> None:
     """mypy, strict, on the core."""
-    with steps(session) as step:
+    with Steps(session) as step:
         dev = dev_env(session)
         step("types", lambda: dev.run("mypy", *session.posargs, cwd=ROOT))
 
@@ -73,7 +74,7 @@ def types(session: nox.Session) -> None:
 @nox.session
 def layers(session: nox.Session) -> None:
     """import-linter: which room of the core may import which."""
-    with steps(session) as step:
+    with Steps(session) as step:
         dev = dev_env(session)
         step("layers", lambda: dev.run("lint-imports", *session.posargs, cwd=ROOT))
 
@@ -81,7 +82,7 @@ def layers(session: nox.Session) -> None:
 @nox.session
 def bench(session: nox.Session) -> None:
     """Every benchmark of benchmarks/, or those named; results go to benchmarks/results/."""
-    with steps(session) as step:
+    with Steps(session) as step:
         dev = dev_env(session)
         make_renderable(session, dev)
         named = session.posargs or sorted(p.stem for p in (ROOT / "benchmarks").glob("[!_]*.py"))
@@ -196,36 +197,3 @@ def check_stranger(session: nox.Session) -> None:
     env, _ = demo_env(session)
     builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
     unseen.check(env, builder, ROOT / ".nox" / "stranger")
-
-
-class steps:
-    """Run the parts of a session one after the other; name all that failed at the end.
-
-    A failing part does not keep the next one from running: CI reports everything in one go.
-    """
-
-    def __init__(self, session: nox.Session) -> None:
-        self.session = session
-        self.failed: list[str] = []
-        self.took: list[str] = []
-
-    def __enter__(self) -> steps:
-        return self
-
-    def __call__(self, name: str, action: object) -> None:
-        self.session.log(f"== {name}")
-        began = time.monotonic()
-        try:
-            action()  # type: ignore[operator]
-        except shell.StepFailed as error:
-            self.session.warn(f"{name}: {error}")
-            self.failed.append(name)
-        self.took.append(f"{name} {time.monotonic() - began:.0f} s")
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, shell.StepFailed):
-            self.session.error(str(error))
-        if kind is None:
-            self.session.log("took: " + ", ".join(self.took))
-            if self.failed:
-                self.session.error("failed: " + ", ".join(self.failed))

@@ -37,10 +37,15 @@ def test_parts_run_in_order_and_are_timed() -> None:
 
 def test_a_failing_part_is_named_after_the_others_ran() -> None:
     session, ran = Session(), []
-    with pytest.raises(RuntimeError, match=r"^failed: types, layers$"), Steps(session) as step:
-        step("types", fail)
-        step("layers", fail)
-        step("pytest", lambda: ran.append(1))
+
+    def run() -> None:
+        with Steps(session) as step:
+            step("types", fail)
+            step("layers", fail)
+            step("pytest", lambda: ran.append(1))
+
+    with pytest.raises(RuntimeError, match=r"^failed: types, layers$"):
+        run()
     assert ran == [1]
     assert "warning: types: exit status 1 from: mypy" in session.said
 

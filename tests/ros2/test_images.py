@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluxvla_core.errors import Faulted, LoadFailed
+from fluxvla_core.errors import LoadFailed
 from fluxvla_core.ros2 import images
+from fluxvla_core.ros2.trouble import BadMessage
 
 
 def message(pixels, encoding, pad=0, bigendian=0):
@@ -102,7 +103,7 @@ def test_a_view_copies_nothing_and_a_picture_is_copied_once():
     ],
 )
 def test_what_does_not_fit_is_named(call, sent, what):
-    with pytest.raises(Faulted, match=what) as caught:
+    with pytest.raises(BadMessage, match=what) as caught:
         getattr(images, call)(sent, 4, 6, "cam_high (/camera)")
 
     assert caught.value.what.startswith("cam_high (/camera) sends")
@@ -113,7 +114,7 @@ def test_damaged_pictures_are_refused(change):
     sent = message(colours(), "rgb8")
     vars(sent).update(change)
 
-    with pytest.raises(Faulted, match=r"damaged pictures: 6x\d rgb8 with rows of"):
+    with pytest.raises(BadMessage, match=r"damaged pictures: 6x\d rgb8 with rows of"):
         images.to_rgb(sent, 4, 6)
 
 
@@ -173,7 +174,7 @@ class TestCompressed:
         np.testing.assert_allclose(images.to_depth(sent, 1, 2), [[np.nan, 1.5]], rtol=1e-6)
 
     def test_a_compressed_picture_has_a_size_too(self):
-        with pytest.raises(Faulted, match="sends 6x4 pictures, the embodiment says 6x8"):
+        with pytest.raises(BadMessage, match="sends 6x4 pictures, the embodiment says 6x8"):
             images.to_rgb(self.packed(colours(), ".png", "png"), 8, 6)
 
     @pytest.mark.parametrize("data", [b"", b"no picture"])
@@ -181,14 +182,16 @@ class TestCompressed:
         pytest.importorskip("cv2", reason="pip install opencv-python-headless")
         sent = SimpleNamespace(format="jpeg", data=array.array("B", data))
 
-        with pytest.raises(Faulted, match=rf"\('jpeg', {len(data)} bytes\) that cannot be decoded"):
+        with pytest.raises(
+            BadMessage, match=rf"\('jpeg', {len(data)} bytes\) that cannot be decoded"
+        ):
             images.to_rgb(sent, 4, 6)
 
     def test_other_depth_formats_are_refused(self):
         pytest.importorskip("cv2", reason="pip install opencv-python-headless")
         sent = SimpleNamespace(format="32FC1; compressedDepth png", data=array.array("B", b"x"))
 
-        with pytest.raises(Faulted, match="only 16UC1 is understood"):
+        with pytest.raises(BadMessage, match="only 16UC1 is understood"):
             images.to_depth(sent, 4, 6)
 
     def test_without_opencv_the_message_says_what_to_install(self, monkeypatch):

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluxvla_core.errors import Faulted
 from fluxvla_core.ros2 import joints
+from fluxvla_core.ros2.trouble import BadMessage
 
 
 def message(names, values):
@@ -39,7 +39,7 @@ def test_joints_that_nobody_asked_for_are_passed_over():
     ],
 )
 def test_what_cannot_be_a_state_is_named(sent, what):
-    with pytest.raises(Faulted) as caught:
+    with pytest.raises(BadMessage) as caught:
         joints.positions(sent, ("a", "b", "c"), "arm")
 
     assert caught.value.what.startswith(what)

@@ -57,7 +57,7 @@ def test_commands_that_nobody_hears_are_an_error(operators, drivers):
 
 
 def test_the_shared_memory_trap_is_named_at_start_up(drivers, operators):
-    large = {**PICTURES, "height": 960, "width": 1280, "best_effort": True}
+    large = {**PICTURES, "height": 1536, "width": 2048, "best_effort": True}
     drivers([STATE, large], [COMMANDS])
     operator = operators(rate_window_s=0.5)
 
@@ -138,7 +138,7 @@ def test_a_driver_that_left_and_comes_back(operators, drivers, ending):
     assert ("the driver is gone: nobody publishes" in error.cause) == (ending == "close")
 
     drivers([STATE, PICTURES], [COMMANDS])
-    wait_for(lambda: time.monotonic() - arm.newest("cam").receipt < 0.2)
+    wait_for(lambda: all(time.monotonic() - arm.newest(n).receipt < 0.2 for n in ("arm", "cam")))
     assert frames_for(arm, 0.3)
 
 

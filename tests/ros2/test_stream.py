@@ -48,7 +48,7 @@ def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(pictures, dri
 
 def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
     """If this fails because all arrive, Fast DDS was mended and ``rates`` can go."""
-    drivers([{**CAMERA, "height": 960, "width": 1280, "best_effort": True}])
+    drivers([{**CAMERA, "height": 1536, "width": 2048, "best_effort": True}])
     wait_for(lambda: pictures.lost > 0)
     received, lost = count(pictures, 1.0)
     reception = rates.Reception("cam", pictures.reliability, 1.0, received, lost, 0)

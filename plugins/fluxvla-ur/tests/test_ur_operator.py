@@ -171,7 +171,7 @@ class TestRobot:
 
         np.testing.assert_allclose(driver.on(COMMANDS)[0]["data"], np.add(POSE, 0.01))
         np.testing.assert_allclose(driver.on("/gripper/command")[0]["data"], 0.6)
-        wait_for(lambda: np.allclose(operator.get_state()[0], [*np.add(POSE, 0.01), 0.25]))
+        wait_for(lambda: np.allclose(operator.get_state(), [*np.add(POSE, 0.01), 0.25]))
 
     def test_a_gripper_among_the_joints(self, connect, drivers):
         drivers(*robot())

@@ -39,7 +39,7 @@ def pictures(
         chosen: stream name -> the message to convert.
 
     Raises:
-        Faulted: a picture has another size or encoding than its camera; names stream and topic.
+        BadMessage: a picture has another size or encoding than its camera; names stream and topic.
     """
     colours: dict[str, npt.NDArray[np.uint8]] = {}
     depths: dict[str, npt.NDArray[np.float32]] = {}

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import Faulted, LoadFailed
+from fluxvla_core.errors import LoadFailed
+from fluxvla_core.ros2.trouble import BadMessage
 
 # encoding -> (element type, number of channels, columns that are red, green and blue)
 _COLOUR: Mapping[str, tuple[int, tuple[int, int, int]]] = {
@@ -43,7 +44,7 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
     Rows may be padded (``step``). Numbers of the other byte order are swapped, which copies.
 
     Raises:
-        Faulted: an unknown encoding, or fewer bytes than the header promises; names ``source``.
+        BadMessage: an unknown encoding, or fewer bytes than the header promises; names ``source``.
     """
     encoding = message.encoding
     if encoding in _COLOUR:
@@ -52,7 +53,7 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
         channels = 1
     else:
         known = ", ".join([*_COLOUR, *_DEPTH])
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends pictures with encoding {encoding!r}; understood are {known}",
             next="set the camera driver to one of them (rgb8 costs the least)",
         )
@@ -60,7 +61,7 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
     row = message.width * channels * dtype.itemsize
     size = message.step * (message.height - 1) + row if message.height else 0
     if message.step < row or len(message.data) < size:
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends damaged pictures: {message.width}x{message.height} {encoding} with "
             f"rows of {message.step} bytes needs {max(size, row)} bytes, got {len(message.data)}"
         )
@@ -79,7 +80,7 @@ def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.
     """A fresh ``(height, width, 3)`` uint8 RGB array from an ``Image`` or ``CompressedImage``.
 
     Raises:
-        Faulted: another size, no colour picture, or damaged; names ``source``.
+        BadMessage: another size, no colour picture, or damaged; names ``source``.
         LoadFailed: a compressed picture, and no decoder is installed.
     """
     if is_compressed(message):
@@ -88,7 +89,7 @@ def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.
         return picture
     pixels = view(message, source)
     if message.encoding not in _COLOUR:
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends {message.encoding} pictures, which have no colours",
             cause="a depth topic is given where a colour topic belongs",
         )
@@ -112,7 +113,7 @@ def to_depth(
     ``16UC1`` holds millimetres with 0 for nothing, ``32FC1`` metres with NaN (REP 118).
 
     Raises:
-        Faulted: another size, no depth picture, or damaged; names ``source``.
+        BadMessage: another size, no depth picture, or damaged; names ``source``.
         LoadFailed: a compressed picture, and no decoder is installed.
     """
     if is_compressed(message):
@@ -121,7 +122,7 @@ def to_depth(
         pixels = view(message, source)[..., 0]
     else:
         view(message, source)
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends {message.encoding} pictures, which hold no distances",
             cause="a colour topic is given where a depth topic belongs",
         )
@@ -167,7 +168,7 @@ def is_compressed(message: Any) -> bool:
 
 def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) -> None:
     if pixels.shape[:2] != (height, width):
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends {pixels.shape[1]}x{pixels.shape[0]} pictures, "
             f"the embodiment says {width}x{height}",
             next="set the camera driver's resolution, or the operator's height and width",
@@ -193,11 +194,11 @@ def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
         if picture is not None and picture.dtype == np.uint16 and picture.ndim == 2:
             return np.asarray(picture)
     else:
-        raise Faulted(
+        raise BadMessage(
             f"{source} sends compressed depth as {message.format!r}; only 16UC1 is understood",
             next="name the uncompressed depth topic",
         )
-    raise Faulted(
+    raise BadMessage(
         f"{source} sends a compressed picture ({message.format!r}, {data.size} bytes) "
         "that cannot be decoded"
     )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import Faulted
+from fluxvla_core.ros2.trouble import BadMessage
 
 Array = npt.NDArray[np.float64]
 
@@ -24,25 +24,27 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
     Joints that nobody asked for (fingers, other arms) are passed over.
 
     Raises:
-        Faulted: a joint is missing, named twice, without position, or not finite; or the message
+        BadMessage: a joint is missing, named twice, without position, or not finite; or the message
             has no names at all. Names ``source`` and what the message does have.
     """
     given = list(message.name)
     if not given:
-        raise Faulted(
+        raise BadMessage(
             f"{source}: {len(message.position)} positions without joint names; "
             "joints are only ever told apart by name",
             next="let the driver fill JointState.name",
         )
     if len(message.position) != len(given):
-        raise Faulted(f"{source}: {len(given)} joint names, but {len(message.position)} positions")
+        raise BadMessage(
+            f"{source}: {len(given)} joint names, but {len(message.position)} positions"
+        )
     at = {name: index for index, name in enumerate(given)}
     if len(at) != len(given):
         twice = sorted({name for name in given if given.count(name) > 1})
-        raise Faulted(f"{source}: joint names come twice: {', '.join(twice)}")
+        raise BadMessage(f"{source}: joint names come twice: {', '.join(twice)}")
     missing = [name for name in names if name not in at]
     if missing:
-        raise Faulted(
+        raise BadMessage(
             f"{source}: no joint called {', '.join(missing)}; there are {', '.join(given)}",
             cause="another robot, or a driver that names its joints in another way",
             next="give the operator the names that its driver uses (joint_names)",
@@ -50,7 +52,7 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
     values = np.array([message.position[at[name]] for name in names], np.float64)
     bad = [name for name, value in zip(names, values, strict=True) if not math.isfinite(value)]
     if bad:
-        raise Faulted(f"{source}: the position of {', '.join(bad)} is not a finite number")
+        raise BadMessage(f"{source}: the position of {', '.join(bad)} is not a finite number")
     return values
 
 

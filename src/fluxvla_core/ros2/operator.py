@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
-from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady, OperatorError
+from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames, sync
 from fluxvla_core.ros2.actions import checked_action, hold_target
 from fluxvla_core.ros2.connection import Connection
@@ -28,6 +28,7 @@ from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.ring import Received
 from fluxvla_core.ros2.startup import Startup
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, CommandSpec, StreamSpec
+from fluxvla_core.ros2.trouble import Stale
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -153,30 +154,36 @@ class RosOperator(ABC):
     def get_frame(self) -> RobotFrame:
         """State and pictures that belong together, in fresh arrays, with their receipt stamps.
 
+        Waits up to ``max_age_s`` for messages that belong together; as a rule they are there.
+
         Raises:
-            NotReady: not connected; a stream is silent, or they are too far apart in time.
-            Faulted: the connection broke, or a message is not what the embodiment describes.
+            NotReady: not connected.
+            Stale: a stream is silent or late, or they are too far apart in time.
+            BadMessage: a message is not what the embodiment describes.
+            Faulted: the connection broke.
         """
-        rings, matched = self._matched()
+        matched = self._matched()
         stamps = {name: received.receipt for name, received in matched.items()}
-        side = {spec.name: rings[spec.name][-1] for spec in self._specs if spec.name in rings}
         states = {spec.name: matched[spec.name].message for spec in self._specs_of(STATE)}
         stamps[STATE_STREAM] = min(stamps.pop(name) for name in states)
         colours, depths = frames.pictures(self._specs, matched)
-        base = self.read_base({name: received.message for name, received in side.items()})
-        return RobotFrame(self.read_state(states), colours, stamps, depths, base)
+        newest = {name: received.message for name, received in self._fresh().items()}
+        return RobotFrame(self.read_state(states), colours, stamps, depths, self.read_base(newest))
 
-    def get_state(self) -> tuple[Array, float]:
-        """The newest ``(state_dim,)`` state and its receipt stamp, without looking at pictures.
+    def get_state(self) -> Array:
+        """The newest ``(state_dim,)`` state, without waiting, and without converting pictures.
+
+        Called after every command, it is also what notices a silent camera between two frames.
 
         Raises:
-            NotReady: not connected, or a state stream is silent.
-            Faulted: the connection broke, or a message is not what the embodiment describes.
+            NotReady: not connected.
+            Stale: a stream is silent.
+            BadMessage: the joint states are not what the embodiment describes.
+            Faulted: the connection broke.
         """
-        rings = self._fresh(STATE)
-        newest = {name: items[-1] for name, items in rings.items()}
-        state = self.read_state({name: received.message for name, received in newest.items()})
-        return state, min(received.receipt for received in newest.values())
+        newest = self._fresh()
+        states = {spec.name: newest[spec.name].message for spec in self._specs_of(STATE)}
+        return self.read_state(states)
 
     def send_action(self, action: npt.ArrayLike) -> None:
         """Publish one ``(dim,)`` command.
@@ -284,41 +291,42 @@ class RosOperator(ABC):
             raise NotReady(f"{self.embodiment.name} is not connected", next="call connect() first")
         return self._connection
 
-    def _matched(self) -> tuple[dict[str, tuple[Received, ...]], Mapping[str, Received]]:
-        """Messages of all streams, and those that belong together, waiting a little for them."""
+    def _matched(self) -> Mapping[str, Received]:
+        """Messages of state, cameras and depth that belong together, waiting a little for them."""
+        connection = self._connected()
+        names = [spec.name for spec in self._specs_of(STATE, CAMERA, DEPTH)]
         # A burst puts a stream apart from the others for a moment; one that fell silent is named
         # as such in this time; only a driver that is late stays apart.
         until = time.monotonic() + self.max_age_s
-        specs = self._specs_of(STATE, CAMERA, DEPTH)
         while True:
-            rings = self._fresh()
+            self._fresh()
             by = "receipt" if self._clock_stepped() else self.sync_on
+            rings = {name: connection.streams[name].ring.items() for name in names}
             try:
-                match = sync.match({s.name: rings[s.name] for s in specs}, self.max_skew_s, by)
+                match = sync.match(rings, self.max_skew_s, by)
                 sync.check_age(match, time.monotonic(), self.max_age_s)
-            except NotReady:
+            except Stale:
                 if time.monotonic() >= until:
                     raise
                 time.sleep(_LOOK_S)
             else:
-                return rings, match.messages
+                return match.messages
 
     def _specs_of(self, *kinds: str) -> list[StreamSpec]:
         return [spec for spec in self._specs if spec.kind in kinds]
 
-    def _fresh(self, *kinds: str) -> dict[str, tuple[Received, ...]]:
-        """Messages of every required stream (of ``kinds``), none silent."""
+    def _fresh(self) -> dict[str, Received]:
+        """The newest message of every stream that has one; no required stream is silent."""
         connection = self._connected()
         connection.check()
-        specs = self._specs_of(*kinds) if kinds else self._specs
-        rings = {spec.name: connection.streams[spec.name].ring.items() for spec in specs}
-        required = {spec.name: rings[spec.name] for spec in specs if spec.required}
+        newest = {spec.name: connection.streams[spec.name].newest() for spec in self._specs}
+        required = {spec.name: newest[spec.name] for spec in self._specs if spec.required}
         silent = sync.silent(required, time.monotonic(), self.max_age_s)
         if silent:
             raise self._silence(connection, silent)
-        return {name: items for name, items in rings.items() if items}
+        return {name: received for name, received in newest.items() if received is not None}
 
-    def _silence(self, connection: Connection, silent: Mapping[str, float | None]) -> OperatorError:
+    def _silence(self, connection: Connection, silent: Mapping[str, float | None]) -> Stale:
         lines, gone = [], []
         for name, age in silent.items():
             stream = connection.streams[name]
@@ -329,7 +337,7 @@ class RosOperator(ABC):
         cause = "the device froze, or its driver was killed or hangs"
         if gone:
             cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
-        return NotReady(
+        return Stale(
             f"{'; '.join(lines)}; {self.max_age_s:g} s is allowed",
             cause=cause,
             next="look at the driver; max_age_s of the operator says how long it may be silent",
@@ -344,7 +352,7 @@ class RosOperator(ABC):
 
     def _hold_target(self, last: Array) -> Array:
         try:
-            state, _ = self.get_state()
+            state = self.get_state()
         except FluxError:
             # Where the arm is, nobody knows; its last command is where it goes or stays.
             return last

@@ -12,8 +12,8 @@ import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fluxvla_core.errors import NotReady
 from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2.trouble import Stale
 
 Streams = Mapping[str, Sequence[Received]]
 
@@ -31,12 +31,14 @@ class Matched:
     slowest: str
 
 
-def silent(streams: Streams, now: float, max_age: float) -> dict[str, float | None]:
+def silent(
+    newest: Mapping[str, Received | None], now: float, max_age: float
+) -> dict[str, float | None]:
     """Streams whose newest message arrived more than ``max_age`` s ago, with its age in seconds.
 
     None as age: nothing ever arrived.
     """
-    ages = {name: now - items[-1].receipt if items else None for name, items in streams.items()}
+    ages = {name: None if item is None else now - item.receipt for name, item in newest.items()}
     return {name: age for name, age in ages.items() if age is None or age > max_age}
 
 
@@ -50,7 +52,7 @@ def match(streams: Streams, max_skew: float, by: str = "stamp") -> Matched:
             whose clocks differ). Where any stream bears no stamps, ``receipt`` is used.
 
     Raises:
-        NotReady: they are further apart; names the first and the last stream, and whether the
+        Stale: they are further apart; names the first and the last stream, and whether the
             senders' clocks differ or a stream is late.
     """
     if any(items[-1].stamp is None for items in streams.values()):
@@ -70,12 +72,12 @@ def check_age(matched: Matched, now: float, max_age: float) -> None:
     """Refuse what belongs together but happened too long ago.
 
     Raises:
-        NotReady: the oldest of the messages arrived more than ``max_age`` s ago, because the
+        Stale: the oldest of the messages arrived more than ``max_age`` s ago, because the
             slowest stream is that late; names it.
     """
     age = now - min(message.receipt for message in matched.messages.values())
     if age > max_age:
-        raise NotReady(
+        raise Stale(
             f"{matched.slowest} is late: what belongs to its newest message arrived {age:.2f} s "
             f"ago; {max_age:g} s is allowed",
             cause="its driver or the network delays it",
@@ -103,7 +105,7 @@ def _apart(
     skew: float,
     max_skew: float,
     by: str,
-) -> NotReady:
+) -> Stale:
     first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
     receipts = [m.receipt for m in chosen.values()]
     cause = f"{first} is late, or comes in bursts"
@@ -111,7 +113,7 @@ def _apart(
     if by == "stamp" and skew > 10 * max(max(receipts) - min(receipts), max_skew):
         cause = "they arrive together, so the clocks that stamp them differ"
         step = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
-    return NotReady(
+    return Stale(
         f"{first} is {skew:.3f} s behind {last}; at most {max_skew:g} s is allowed",
         cause=cause,
         next=step,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import ConfigError, Faulted, NotReady
+from fluxvla_core.errors import ConfigError, Faulted
 from fluxvla_core.ros2 import joints
 from fluxvla_core.ros2.operator import RosOperator
 from fluxvla_core.ros2.require import message_class
@@ -22,6 +22,7 @@ from fluxvla_core.ros2.streams import (
     StreamSpec,
     camera_stream,
 )
+from fluxvla_core.ros2.trouble import BadMessage, Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
 
@@ -216,7 +217,7 @@ class UROperator(RosOperator):
             return action
         before = self.last_action
         if before is None:
-            before, _ = self.get_state()
+            before = self.get_state()
         return scaled_step(before, action, self._speeds(), scaling / self.embodiment.rate_hz)
 
     def publish_action(self, action: Array) -> None:
@@ -242,10 +243,10 @@ class UROperator(RosOperator):
     def _gripper_position(self) -> float:
         received = self.newest("gripper")
         if received is None:
-            raise NotReady(f"the gripper ({self._gripper_state}) has not said where it is")
+            raise Stale(f"the gripper ({self._gripper_state}) has not said where it is")
         value = float(received.message.data)
         if not math.isfinite(value):
-            raise Faulted(f"the gripper ({self._gripper_state}) reports {value}")
+            raise BadMessage(f"the gripper ({self._gripper_state}) reports {value}")
         return value
 
     def _speeds(self) -> Array:

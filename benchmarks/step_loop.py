@@ -225,10 +225,9 @@ def main() -> int:
         "rounds": args.rounds,
         "steps_a_round": args.steps,
         "load_average": os.getloadavg()[0],
-        "cpus": os.cpu_count(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "platform": platform.platform(),
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=1) + "\n")

@@ -2,12 +2,11 @@
 
 Blocks of one page run in order in one folder, which has the repository's ``configs`` in it. A
 comment before a block says what becomes of it: ``<!-- file: NAME -->`` writes it to a file,
-``<!-- not run: WHY -->`` leaves it out; Python must be well-formed all the same.
+``<!-- not run: WHY -->`` leaves it out.
 """
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
@@ -94,13 +93,6 @@ def test_every_block_says_what_it_is() -> None:
         assert fences == 2 * len(found), f"{page.name}: a fence is not closed"
         unnamed = [b.body[:40] for b in found if not b.language]
         assert unnamed == [], f"{page.name}: blocks without a language"
-
-
-def test_python_that_is_not_run_is_well_formed() -> None:
-    for page in PAGES:
-        for block in blocks(page.read_text(encoding="utf-8")):
-            if block.language == "python":
-                ast.parse(block.body, filename=str(page))
 
 
 def test_links_to_files_of_the_repository_lead_somewhere() -> None:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.ros2.faults import Fault, Faults
+from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 
 
 def message(number, sec=10, nanosec=500_000_000):
@@ -74,6 +74,38 @@ def test_a_clock_step_moves_stamps_only():
 
 def test_other_streams_are_well():
     assert [m.number for _, m in ill("x=drop").apply("s", message(1))] == [1]
+
+
+class Publisher:
+    def __init__(self):
+        self.sent = []
+
+    def publish(self, message):
+        self.sent.append(message.number)
+
+
+def test_an_outbox_sends_what_is_due_in_the_order_of_time():
+    faults, publisher = Faults(), Publisher()
+    outbox = Outbox(faults)
+    faults.set("late", Fault("delay", 1.0))
+    outbox.put("late", publisher, message(1), now=10.0)
+    outbox.put("s", publisher, message(2), now=10.5)
+    assert outbox.next_due == 10.5
+
+    outbox.flush(10.5)
+    assert publisher.sent == [2]
+    outbox.flush(11.0)
+    assert publisher.sent == [2, 1]
+    assert outbox.next_due == math.inf
+
+
+def test_an_outbox_can_be_emptied():
+    outbox, publisher = Outbox(Faults()), Publisher()
+    outbox.put("s", publisher, message(1), now=0.0)
+    outbox.clear()
+    outbox.flush(1.0)
+
+    assert publisher.sent == []
 
 
 @pytest.mark.parametrize("text", ["s", "s=broken", "=drop", "s=drop:x", "s=delay:nan"])

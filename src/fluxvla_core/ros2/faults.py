@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import heapq
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -96,6 +98,38 @@ class Faults:
                 return []
             return [(0.0, message), (0.0, before)]
         return [(0.0, _changed(message, fault))]
+
+
+class Outbox:
+    """Publishes messages when they are due, after what ``faults`` does to them.
+
+    One thread uses one outbox; several may share the faults.
+    """
+
+    def __init__(self, faults: Faults) -> None:
+        self._faults = faults
+        self._waiting: list[tuple[float, int, Any, Any]] = []
+        self._ticket = itertools.count()
+
+    @property
+    def next_due(self) -> float:
+        """When ``flush`` has something to do again, in seconds; infinity if nothing waits."""
+        return self._waiting[0][0] if self._waiting else math.inf
+
+    def put(self, stream: str, publisher: Any, message: Any, now: float) -> None:
+        """Let ``publisher`` send what the stream's fault leaves of the message."""
+        for delay, changed in self._faults.apply(stream, message):
+            heapq.heappush(self._waiting, (now + delay, next(self._ticket), publisher, changed))
+
+    def flush(self, now: float) -> None:
+        """Publish what is due."""
+        while self._waiting and self._waiting[0][0] <= now:
+            _, _, publisher, message = heapq.heappop(self._waiting)
+            publisher.publish(message)
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
 
 
 def _changed(message: Any, fault: Fault) -> Any:

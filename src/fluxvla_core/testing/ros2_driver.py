@@ -11,8 +11,6 @@ Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before sta
 from __future__ import annotations
 
 import argparse
-import heapq
-import itertools
 import json
 import queue
 import subprocess
@@ -26,7 +24,7 @@ import numpy as np
 
 from fluxvla_core.ros2 import images, joints, qos
 from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.faults import Fault, Faults
+from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 from fluxvla_core.ros2.require import message_class
 
 _START_S = 20.0
@@ -280,8 +278,7 @@ def _publish(
     orders: queue.Queue[dict[str, Any] | None],
     faults: Faults,
 ) -> None:
-    late: list[tuple[float, int, Any, Any]] = []
-    ticket = itertools.count()
+    outbox = Outbox(faults)
     while True:
         now = time.monotonic()
         for publisher in publishers:
@@ -291,13 +288,10 @@ def _publish(
             # hz 0: once, as a latched topic does.
             publisher.next = max(publisher.next + 1.0 / hz, now - 0.5) if hz else float("inf")
             message = publisher.make(connection, commands)
-            for delay, copy in faults.apply(publisher.topic, message):
-                heapq.heappush(late, (now + delay, next(ticket), publisher.publisher, copy))
-        while late and late[0][0] <= time.monotonic():
-            _, _, sender, message = heapq.heappop(late)
-            sender.publish(message)
-        upcoming = [p.next for p in publishers] + [item[0] for item in late[:1]]
-        pause = min([*upcoming, now + 0.1]) - time.monotonic()
+            outbox.put(publisher.topic, publisher.publisher, message, now)
+        outbox.flush(time.monotonic())
+        upcoming = [publisher.next for publisher in publishers]
+        pause = min([*upcoming, outbox.next_due, now + 0.1]) - time.monotonic()
         try:
             order = orders.get(timeout=max(pause, 0.0))
         except queue.Empty:
@@ -305,7 +299,7 @@ def _publish(
         if order is None:
             return
         if order.get("reset"):
-            late.clear()
+            outbox.clear()
         _order(order, faults, publishers)
 
 

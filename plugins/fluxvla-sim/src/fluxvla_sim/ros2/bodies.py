@@ -1,0 +1,203 @@
+"""A robot's side of its topics: what it says of its state, and what it makes of commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from fluxvla_aloha.presets import Preset
+from fluxvla_ur.embodiment import JOINTS
+from fluxvla_ur.operator import BOOL, CONTROLLERS, TRAJECTORY
+
+from fluxvla_core.ros2 import joints
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.streams import FLOAT64, JOINT_STATE
+from fluxvla_core.ros2.trouble import BadMessage
+
+Array = npt.NDArray[np.float64]
+
+
+class Body(Protocol):
+    """Between a scene's numbers and a robot's messages; knows no publisher and no time of its own.
+
+    ``states`` and ``latched`` are stream -> (topic, message type), ``cameras`` is the scene's
+    camera -> topic, ``commands`` is topic -> message type.
+    """
+
+    states: Mapping[str, tuple[str, str]]
+    latched: Mapping[str, tuple[str, str]]
+    cameras: Mapping[str, str]
+    commands: Mapping[str, str]
+
+    def say(self, state: Array) -> dict[str, Any]:
+        """Stream -> message, of the scene's ``(D,)`` state; ``latched`` ones too."""
+
+    def hear(self, topic: str, message: Any, now: float) -> None:
+        """Take a command.
+
+        Raises:
+            BadMessage: it is none: names are missing, or numbers are not finite.
+        """
+
+    def target(self, now: float) -> Array:
+        """``(D,)`` what the arm drives to at ``now``."""
+
+    def reset(self, state: Array) -> None:
+        """Forget all commands; the arm stays at ``state``."""
+
+
+class AlohaBody:
+    """Two arms with grippers, as their drivers present them.
+
+    Args:
+        preset: topics, names and raw gripper values.
+        arm_message, gripper_message: in place of the preset's types (see ``AlohaOperator``).
+    """
+
+    _ARM = 7
+    _SIDES = ("left", "right")
+
+    def __init__(
+        self, preset: Preset, arm_message: str | None = None, gripper_message: str | None = None
+    ) -> None:
+        self._preset = preset
+        names = [f"{side} arm" for side in self._SIDES]
+        self.states = {n: (t, JOINT_STATE) for n, t in zip(names, preset.states, strict=True)}
+        self.latched: Mapping[str, tuple[str, str]] = {}
+        scene = ("top", "left_wrist", "right_wrist")
+        self.cameras = dict(zip(scene, preset.images, strict=True))
+        # Topic -> the columns of the action that it commands.
+        self._columns: dict[str, range] = {}
+        self.commands: dict[str, str] = {}
+        for index, topic in enumerate(preset.commands):
+            first = self._ARM * index
+            length = self._ARM - 1 if preset.gripper_commands else self._ARM
+            self._columns[topic] = range(first, first + length)
+            self.commands[topic] = arm_message or preset.arm_message
+            if preset.gripper_commands:
+                gripper = preset.gripper_commands[index]
+                self._columns[gripper] = range(first + length, first + length + 1)
+                self.commands[gripper] = gripper_message or preset.gripper_message
+        self._target: Array = np.zeros(2 * self._ARM)
+
+    def say(self, state: Array) -> dict[str, Any]:
+        said = {}
+        for index, name in enumerate(self.states):
+            arm = state[self._ARM * index : self._ARM * (index + 1)].copy()
+            arm[-1] = self._raw(arm[-1])
+            said[name] = joints.fill(message_class(JOINT_STATE)(), self._preset.joints, arm)
+        return said
+
+    def hear(self, topic: str, message: Any, now: float) -> None:
+        columns = self._columns[topic]
+        names = [self._preset.joints[column % self._ARM] for column in columns]
+        values = command_values(message, names, topic)
+        for column, value in zip(columns, values, strict=True):
+            gripper = column % self._ARM == self._ARM - 1
+            self._target[column] = self._opening(value) if gripper else value
+
+    def target(self, now: float) -> Array:
+        return self._target
+
+    def reset(self, state: Array) -> None:
+        self._target = np.array(state)
+
+    def _raw(self, opening: float) -> float:
+        closed, opened = self._preset.gripper_closed, self._preset.gripper_open
+        return closed + opening * (opened - closed)
+
+    def _opening(self, raw: float) -> float:
+        closed, opened = self._preset.gripper_closed, self._preset.gripper_open
+        return (raw - closed) / (opened - closed)
+
+
+class URBody:
+    """A UR arm as ur_robot_driver presents it, and a gripper that takes and gives a number.
+
+    Args:
+        controller: the one that is active.
+    """
+
+    _ARM = len(JOINTS)
+    _GRIPPER = "/gripper/command"
+    # Older drivers sort joints by name; whoever reads them by index is found out here.
+    _NAMES = tuple(sorted(JOINTS))
+
+    def __init__(self, controller: str = "forward_position_controller") -> None:
+        self._topic, message = CONTROLLERS[controller]
+        self.states = {
+            "arm": ("/joint_states", JOINT_STATE),
+            "gripper": ("/gripper/position", FLOAT64),
+            "speed scaling": ("/speed_scaling_state_broadcaster/speed_scaling", FLOAT64),
+        }
+        self.latched = {
+            "program running": ("/io_and_status_controller/robot_program_running", BOOL)
+        }
+        self.cameras = {
+            "front": "/front_camera/color/image_raw",
+            "wrist": "/wrist_camera/color/image_raw",
+        }
+        self.commands = {self._topic: message, self._GRIPPER: FLOAT64}
+        self.reset(np.zeros(self._ARM + 1))
+
+    def say(self, state: Array) -> dict[str, Any]:
+        where = dict(zip(JOINTS, state, strict=False))
+        arm = message_class(JOINT_STATE)()
+        number = message_class(FLOAT64)
+        return {
+            "arm": joints.fill(arm, self._NAMES, [where[name] for name in self._NAMES]),
+            "gripper": number(data=float(state[self._ARM])),
+            "speed scaling": number(data=100.0),
+            "program running": message_class(BOOL)(data=True),
+        }
+
+    def hear(self, topic: str, message: Any, now: float) -> None:
+        if topic == self._GRIPPER:
+            self._gripper = command_values(message, ("gripper",), topic)[0]
+            return
+        arm = command_values(message, JOINTS, topic)
+        seconds = 0.0
+        if self.commands[topic] == TRAJECTORY:
+            after = message.points[-1].time_from_start
+            seconds = after.sec + after.nanosec * 1e-9
+        self._from, self._to = self.target(now)[: self._ARM], arm
+        self._since, self._seconds = now, seconds
+
+    def target(self, now: float) -> Array:
+        share = 1.0 if self._seconds <= 0 else min((now - self._since) / self._seconds, 1.0)
+        return np.append(self._from + share * (self._to - self._from), self._gripper)
+
+    def reset(self, state: Array) -> None:
+        self._from = self._to = np.array(state[: self._ARM])
+        self._gripper = float(state[self._ARM])
+        self._since = self._seconds = 0.0
+
+
+def command_values(message: Any, names: Sequence[str], topic: str) -> Array:
+    """``(len(names),)`` joint targets of a command, by the fields that it has.
+
+    Raises:
+        BadMessage: names are missing, it is too short, or a number is not finite.
+    """
+    if hasattr(message, "points"):
+        if not message.points:
+            raise BadMessage(f"{topic}: a trajectory without points")
+        given: Any = _Named(message.joint_names, message.points[-1].positions)
+        return joints.positions(given, names, topic)
+    if hasattr(message, "position"):
+        return joints.positions(message, names, topic)
+    values = message.cmd if hasattr(message, "cmd") else message.data
+    array = np.atleast_1d(np.array(values, np.float64))
+    if array.shape != (len(names),):
+        raise BadMessage(f"{topic}: {len(names)} values are needed, got {array.shape}")
+    if not all(map(math.isfinite, array)):
+        raise BadMessage(f"{topic}: a value is not finite")
+    return array
+
+
+class _Named:
+    def __init__(self, name: Sequence[str], position: Sequence[float]) -> None:
+        self.name, self.position = name, position

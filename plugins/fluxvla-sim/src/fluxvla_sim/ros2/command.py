@@ -1,0 +1,196 @@
+"""``fluxvla sim``: a simulated robot that other programs drive over ROS 2."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+from fluxvla_core.errors import UsageError
+
+
+class SimCommand:
+    """The command's arguments; the work is in ``fluxvla_sim.ros2.node``."""
+
+    api: ClassVar[str] = "1.0"
+    help: ClassVar[str] = "Simulate a robot in real time behind the ROS 2 topics of the real one."
+
+    def add_arguments(self, parser: Any) -> None:
+        parser.add_argument("robot", choices=("aloha", "ur5e"), help="which robot")
+        parser.add_argument(
+            "--ros2", action="store_true", help="over ROS 2 (there is no other way)"
+        )
+        parser.add_argument("--seed", type=int, default=0, help="places the objects, default 0")
+        parser.add_argument(
+            "--camera-hz", type=float, default=30.0, metavar="HZ", help="of each camera, default 30"
+        )
+        parser.add_argument("--height", type=int, default=480, help="of the pictures")
+        parser.add_argument("--width", type=int, default=640, help="of the pictures")
+        parser.add_argument(
+            "--quality", choices=("cheap", "reference"), default="cheap", help="of the pictures"
+        )
+        parser.add_argument(
+            "--cameras", nargs="+", metavar="NAME", help="the scene's cameras; all by default"
+        )
+        parser.add_argument(
+            "--preset",
+            default="cobot_magic",
+            help="ALOHA: cobot_magic (default) or interbotix topics",
+        )
+        parser.add_argument(
+            "--controller",
+            default="forward_position_controller",
+            help="UR: the controller that is active",
+        )
+        parser.add_argument(
+            "--best-effort", action="store_true", help="offer pictures as camera drivers do"
+        )
+        parser.add_argument(
+            "--fault",
+            action="append",
+            default=[],
+            metavar="STREAM=MODE[:AMOUNT][@S]",
+            help="make a stream ill, S seconds after the start; modes: freeze, drop, delay, nan, "
+            "duplicate, out_of_order, clock",
+        )
+        parser.add_argument("--domain-id", type=int, metavar="N", help="ROS domain")
+        parser.add_argument("--seconds", type=float, metavar="S", help="end by itself")
+        parser.add_argument(
+            "--log-format",
+            choices=("text", "json"),
+            default="text",
+            help="for people (default) or one JSON object a line",
+        )
+
+    def run(self, args: Any) -> int:
+        from fluxvla_core.cli.reporters import make_reporter
+        from fluxvla_core.ros2.require import require_rclpy
+
+        if not args.ros2:
+            raise UsageError(
+                "a simulated robot is reached over ROS 2 here",
+                next=f"fluxvla sim {args.robot} --ros2; in one process with the policy, use "
+                "operator=dict(type='AlohaSimOperator') in the config",
+            )
+        faults = [timed_fault(text) for text in args.fault]
+        require_rclpy()
+        reporter = make_reporter(args.log_format)
+        try:
+            return self._simulate(args, faults, reporter)
+        finally:
+            reporter.close()
+
+    def _simulate(self, args: Any, faults: list[Any], reporter: Any) -> int:
+        from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_stream
+
+        body, scene, facts = _aloha(args) if args.robot == "aloha" else _ur(args)
+        for _, stream, _ in faults:
+            check_stream(stream, {*body.states, *body.latched, *body.cameras})
+        settings = NodeSettings(
+            name=f"sim_{args.robot}",
+            seed=args.seed,
+            camera_hz=args.camera_hz,
+            height=args.height,
+            width=args.width,
+            best_effort=args.best_effort,
+            faults=faults,
+            domain_id=args.domain_id,
+        )
+        node = RobotNode(body, scene, settings, reporter, facts)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: node.stop())
+        try:
+            topics = [topic for topic, _ in body.states.values()]
+            reporter.info(
+                f"simulating {args.robot}: {', '.join([*topics, *body.cameras.values()])}; "
+                f"commands on {', '.join(body.commands)}; Ctrl-C ends"
+            )
+            node.run(args.seconds)
+        finally:
+            node.close()
+            scene.close()
+            counts = node.counts
+            reporter.info(
+                f"{counts.periods} periods ({counts.late} late), {counts.pictures} pictures, "
+                f"{counts.commands} commands"
+            )
+        return 0
+
+
+def timed_fault(text: str) -> tuple[float, str, Any]:
+    """``STREAM=MODE[:AMOUNT][@SECONDS]`` as (seconds, stream, fault).
+
+    Raises:
+        UsageError: another form.
+    """
+    from fluxvla_core.ros2.faults import Fault
+
+    fault, _, after = text.partition("@")
+    try:
+        seconds = float(after or 0.0)
+    except ValueError as error:
+        raise UsageError(f"{text!r}: {after!r} is no number of seconds") from error
+    return (seconds, *Fault.parse(fault))
+
+
+Facts = Callable[[bool | None], Mapping[str, Any]]
+
+
+def _some_cameras(body: Any, names: list[str] | None) -> None:
+    unknown = [name for name in names or () if name not in body.cameras]
+    if unknown:
+        raise UsageError(
+            f"no camera {', '.join(map(repr, unknown))}; there are {', '.join(body.cameras)}"
+        )
+    if names:
+        body.cameras = {name: body.cameras[name] for name in names}
+
+
+def _aloha(args: Any) -> tuple[Any, Any, Facts]:
+    from fluxvla_aloha.presets import PRESETS
+
+    from fluxvla_sim.aloha.scene import AlohaScene
+    from fluxvla_sim.aloha.tasks import TASKS
+    from fluxvla_sim.aloha.tasks import Facts as AlohaFacts
+    from fluxvla_sim.ros2.bodies import AlohaBody
+
+    if args.preset not in PRESETS:
+        raise UsageError(f"unknown preset {args.preset!r}; known are {', '.join(PRESETS)}")
+    body = AlohaBody(PRESETS[args.preset])
+    _some_cameras(body, args.cameras)
+    scene = AlohaScene(args.quality, args.height, args.width)
+    known = AlohaFacts()
+
+    def facts(commanded: bool | None) -> Mapping[str, Any]:
+        nonlocal known
+        if commanded is None:
+            known = AlohaFacts()
+        elif commanded:
+            known = known.after(scene)
+        done = {name: task.success(known) for name, task in TASKS.items()}
+        return {"steps": known.steps, **done}
+
+    return body, scene, facts
+
+
+def _ur(args: Any) -> tuple[Any, Any, Facts]:
+    from fluxvla_ur.operator import CONTROLLERS
+
+    from fluxvla_sim.ros2.bodies import URBody
+    from fluxvla_sim.ur.scene import URScene
+
+    if args.controller not in CONTROLLERS:
+        raise UsageError(
+            f"unknown controller {args.controller!r}; known are {', '.join(CONTROLLERS)}"
+        )
+    body = URBody(args.controller)
+    _some_cameras(body, args.cameras)
+    scene = URScene(args.quality, args.height, args.width)
+    steps = 0
+
+    def facts(commanded: bool | None) -> Mapping[str, Any]:
+        nonlocal steps
+        steps = 0 if commanded is None else steps + int(commanded)
+        return {"steps": steps, "lifted": bool(scene.lifted())}
+
+    return body, scene, facts

@@ -1,0 +1,293 @@
+"""A scene in real time behind a robot's topics.
+
+The calling thread steps the physics on absolute deadlines and publishes the robot's state; a second
+one draws the cameras, each at its own time, from a copy of the positions, so that a slow
+renderer makes pictures rarer and nothing else late. Three topics are the simulation's own:
+``/sim/reset`` (``std_msgs/Int64``: a seed), ``/sim/fault`` (``std_msgs/String``: as ``--fault``
+takes it, or ``STREAM=well``) and ``/sim/facts`` (``std_msgs/String``: JSON, ten times a second).
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import FluxError, UsageError
+from fluxvla_core.ros2 import images, qos
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.faults import Fault, Faults, Outbox
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.streams import IMAGE
+from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.ros2.bodies import Body
+
+CONTROL_HZ = 50.0
+_FACTS_EVERY = 5
+# A process that was stopped for longer than this goes on from now, instead of catching up.
+_FAR_BEHIND_S = 0.5
+_WELL = "well"
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """How a simulated robot presents itself.
+
+    Args:
+        name: of the node.
+        seed: of the first scene.
+        camera_hz: pictures a second of each camera, if the machine can.
+        height, width: of every picture, in pixels.
+        best_effort: offer pictures as camera drivers do by default, not reliably.
+        faults: (seconds after the start, stream, fault), what falls ill by itself.
+        domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
+    """
+
+    name: str
+    seed: int = 0
+    camera_hz: float = 30.0
+    height: int = 480
+    width: int = 640
+    best_effort: bool = False
+    faults: Sequence[tuple[float, str, Fault]] = ()
+    domain_id: int | None = None
+
+
+@dataclass
+class Counts:
+    """What was done, for the line at the end."""
+
+    periods: int = 0
+    late: int = 0
+    pictures: int = 0
+    commands: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+
+
+class RobotNode:
+    """Opens the connection at once; ``run`` simulates; ``close`` ends both.
+
+    Args:
+        body: the robot's side of its topics.
+        scene: the physics: ``model``, ``data``, ``state``, ``reset(seed)``, ``step(action)``.
+        facts: what ``/sim/facts`` tells; called after each period with whether the robot was
+            commanded since the reset, and with None at a reset.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        scene: Any,
+        settings: NodeSettings,
+        reporter: Reporter,
+        facts: Callable[[bool | None], Mapping[str, Any]],
+    ) -> None:
+        self.counts = Counts()
+        self._body, self._scene, self._settings = body, scene, settings
+        self._reporter, self._facts = reporter, facts
+        self._faults = Faults()
+        self._streams = {*body.states, *body.latched, *body.cameras}
+        # The scene's data, the body's target and what is set by topics.
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._commanded = False
+        self._reset(settings.seed)
+        self._connection = Connection(settings.name, settings.domain_id)
+        try:
+            self._open()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def run(self, seconds: float | None = None) -> None:
+        """Simulate until ``stop``, or for ``seconds``.
+
+        Raises:
+            Faulted: the ROS thread ended.
+            RunFailed: nothing can be drawn.
+        """
+        drawing = _Drawing(self._draw)
+        drawing.start()
+        try:
+            self._live(seconds, drawing)
+        finally:
+            self._stopping.set()
+            drawing.join()
+
+    def stop(self) -> None:
+        """Let ``run`` return; from any thread or signal handler."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """Leave the graph; any number of times."""
+        self.stop()
+        self._connection.close()
+
+    def _live(self, seconds: float | None, drawing: _Drawing) -> None:
+        outbox, period = Outbox(self._faults), 1.0 / CONTROL_HZ
+        pending = sorted(self._settings.faults, key=lambda item: item[0])
+        start = deadline = time.monotonic()
+        while not self._stopping.is_set():
+            now = time.monotonic()
+            if seconds is not None and now - start >= seconds:
+                return
+            self._connection.check()
+            drawing.check()
+            while pending and now - start >= pending[0][0]:
+                _, stream, fault = pending.pop(0)
+                self._faults.set(stream, fault)
+            self._period(outbox, now)
+            outbox.flush(time.monotonic())
+            deadline += period
+            behind = time.monotonic() - deadline
+            if behind > 0:
+                self.counts.late += 1
+                deadline += behind if behind > _FAR_BEHIND_S else 0.0
+            else:
+                self._stopping.wait(-behind)
+
+    def _period(self, outbox: Outbox, now: float) -> None:
+        with self._lock:
+            self._scene.step(self._body.target(now))
+            state = self._scene.state
+            facts = self._facts(self._commanded)
+        stamp = self._connection.node.get_clock().now().to_msg()
+        for stream, message in self._body.say(state).items():
+            if stream in self._publishers:
+                if hasattr(message, "header"):
+                    message.header.stamp = stamp
+                outbox.put(stream, self._publishers[stream], message, now)
+        self.counts.periods += 1
+        if self.counts.periods % _FACTS_EVERY == 0:
+            self._facts_publisher.publish(self._string(data=json.dumps(facts)))
+
+    def _open(self) -> None:
+        connection, body = self._connection, self._body
+        self._string = message_class("std_msgs.msg:String")
+        self._publishers = {
+            stream: connection.publisher(topic, message_class(message), depth=5)
+            for stream, (topic, message) in body.states.items()
+        }
+        offered = qos.BEST_EFFORT if self._settings.best_effort else qos.RELIABLE
+        self._pictures = {
+            camera: connection.publisher(topic, message_class(IMAGE), offered, depth=2)
+            for camera, topic in body.cameras.items()
+        }
+        said = body.say(self._scene.state)
+        for stream, (topic, message) in body.latched.items():
+            profile = qos.profile(qos.RELIABLE, 1, latched=True)
+            kept = connection.node.create_publisher(message_class(message), topic, profile)
+            kept.publish(said[stream])
+        self._facts_publisher = connection.publisher("/sim/facts", self._string)
+        for topic, message in body.commands.items():
+            self._listen(topic, message, self._hear(topic))
+        self._listen("/sim/reset", "std_msgs.msg:Int64", lambda m: self._reset(int(m.data)))
+        self._listen("/sim/fault", "std_msgs.msg:String", lambda m: self._ill(m.data))
+
+    def _listen(self, topic: str, message: str, callback: Callable[[Any], None]) -> None:
+        profile = qos.profile(qos.RELIABLE, 10)
+        self._connection.node.create_subscription(message_class(message), topic, callback, profile)
+
+    def _hear(self, topic: str) -> Callable[[Any], None]:
+        def hear(message: Any) -> None:
+            try:
+                with self._lock:
+                    self._body.hear(topic, message, time.monotonic())
+                    self._commanded = True
+            except BadMessage as error:
+                # What a driver does with nonsense: nothing.
+                refused = self.counts.refused
+                refused[error.what] = refused.get(error.what, 0) + 1
+                if refused[error.what] == 1:
+                    self._reporter.warn(error.what)
+                return
+            self.counts.commands += 1
+
+        return hear
+
+    def _reset(self, seed: int) -> None:
+        with self._lock:
+            self._scene.reset(max(seed, 0))
+            self._body.reset(self._scene.state)
+            self._facts(None)
+            self._commanded = False
+
+    def _ill(self, text: str) -> None:
+        stream, _, mode = text.partition("=")
+        if mode == _WELL:
+            self._faults.clear(stream)
+            return
+        try:
+            stream, fault = Fault.parse(text)
+            check_stream(stream, self._streams)
+        except FluxError as error:
+            self._reporter.warn(str(error))
+            return
+        self._faults.set(stream, fault)
+
+    def _draw(self) -> None:
+        mujoco, settings, model = import_mujoco(), self._settings, self._scene.model
+        renderer, data = Renderer(model), mujoco.MjData(model)
+        outbox, period = Outbox(self._faults), 1.0 / settings.camera_hz
+        start = time.monotonic()
+        cameras = list(self._pictures)
+        # Spread over the period, as cameras that nobody synchronised.
+        due = {c: start + period * i / len(cameras) for i, c in enumerate(cameras)}
+        try:
+            while not self._stopping.is_set():
+                outbox.flush(time.monotonic())
+                camera = min(due, key=due.__getitem__)
+                wait = min(due[camera], outbox.next_due) - time.monotonic()
+                if wait > 0:
+                    self._stopping.wait(wait)
+                    continue
+                with self._lock:
+                    data.qpos[:] = self._scene.data.qpos
+                    stamp = self._connection.node.get_clock().now().to_msg()
+                # All that a picture needs of the physics, given the positions.
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_camlight(model, data)
+                pixels = renderer.render(data, camera, settings.height, settings.width)
+                message = images.fill(message_class(IMAGE)(), pixels, "rgb8")
+                message.header.stamp, message.header.frame_id = stamp, camera
+                now = time.monotonic()
+                outbox.put(camera, self._pictures[camera], message, now)
+                due[camera] = max(due[camera] + period, now)
+                self.counts.pictures += 1
+        finally:
+            renderer.close()
+
+
+def check_stream(stream: str, known: set[str]) -> None:
+    """Refuse a fault for a stream that the robot does not have.
+
+    Raises:
+        UsageError: names those that it has.
+    """
+    if stream not in known:
+        raise UsageError(f"the robot has no stream {stream!r}; it has {', '.join(sorted(known))}")
+
+
+class _Drawing(threading.Thread):
+    """The drawing thread; ``check`` raises what ended it."""
+
+    def __init__(self, draw: Callable[[], None]) -> None:
+        super().__init__(name="fluxvla-sim-cameras")
+        self._draw = draw
+        self._error: BaseException | None = None
+
+    def run(self) -> None:
+        try:
+            self._draw()
+        except BaseException as error:  # noqa: BLE001 - raised again by check
+            self._error = error
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error

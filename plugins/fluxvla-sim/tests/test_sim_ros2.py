@@ -1,0 +1,316 @@
+"""Simulated robots over ROS 2: another process, the real robots' topics, the real operators."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fluxvla_aloha.operator import AlohaOperator
+from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
+from fluxvla_aloha.runner import AlohaInferenceRunner
+from fluxvla_sim.aloha.scene import HOME
+from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
+from fluxvla_sim.ros2.command import timed_fault
+from fluxvla_sim.ur.scene import HOME as UR_HOME
+from fluxvla_ur.embodiment import JOINTS
+from fluxvla_ur.operator import UROperator
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.errors import UsageError
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.faults import Fault
+from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2.trouble import BadMessage, Stale
+from fluxvla_core.testing.ros2 import ros_domain
+
+__all__ = ["ros_domain"]
+
+SMALL = ["--height", "48", "--width", "64", "--camera-hz", "20"]
+# Machines that run tests are busy with others.
+PATIENT = {"height": 48, "width": 64, "connect_timeout_s": 20.0, "max_age_s": 1.0}
+ALOHA = {"camera_names": ("top",), **PATIENT}
+UR = {"camera_names": ("front",), **PATIENT}
+
+
+def wait_for(condition, seconds=20.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "did not happen in time"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def simulate(ros_domain):
+    started = []
+
+    def start(*arguments):
+        run = "import sys; from fluxvla_core.cli.main import main; sys.exit(main())"
+        process = subprocess.Popen(
+            [sys.executable, "-c", run, "sim", *arguments, *SMALL, "--log-format", "json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def connect(ros_domain):
+    opened = []
+
+    def make(cls, **arguments):
+        operator = cls(rate_window_s=0.0, **arguments)
+        opened.append(operator)
+        operator.connect()
+        return operator
+
+    yield make
+    for operator in opened:
+        operator.close()
+
+
+@pytest.fixture
+def topics(ros_domain):
+    """The simulation's own topics: ``facts()`` and ``tell(topic, value)``."""
+    connection = Connection("test")
+    text = message_class("std_msgs.msg:String")
+    kinds = {"/sim/reset": message_class("std_msgs.msg:Int64"), "/sim/fault": text}
+    stream = connection.subscribe("facts", "/sim/facts", text, 1)
+    publishers = {topic: connection.publisher(topic, cls) for topic, cls in kinds.items()}
+
+    def tell(topic, value):
+        wait_for(lambda: publishers[topic].get_subscription_count())
+        publishers[topic].publish(kinds[topic](data=value))
+
+    def facts():
+        wait_for(stream.newest)
+        return json.loads(stream.newest().message.data)
+
+    yield SimpleNamespace(tell=tell, facts=facts)
+    connection.close()
+
+
+def drive(operator, target, seconds=2.0, hz=50.0):
+    """Go there in a straight line, as a control loop does; returns where the arm is then."""
+    start = operator.get_state()
+    begin = time.monotonic()
+    while (share := (time.monotonic() - begin) / seconds) < 1.0:
+        operator.send_action(start + share * (target - start))
+        time.sleep(1.0 / hz)
+    operator.send_action(target)
+    time.sleep(0.5)
+    return operator.get_state()
+
+
+class TestAloha:
+    def test_it_is_driven_reset_and_made_ill_through_topics(self, simulate, connect, topics):
+        simulate("aloha", "--ros2", "--cameras", "top")
+        operator = connect(AlohaOperator, **ALOHA)
+        frame = operator.get_frame()
+        np.testing.assert_allclose(frame.state, HOME, atol=0.02)
+        assert frame.images["top"].std() > 10, "the picture shows nothing"
+        assert topics.facts()["steps"] == 0
+
+        target = HOME.copy()
+        target[[0, 6, 13]] = 0.4, 0.8, 0.9
+        np.testing.assert_allclose(drive(operator, target), target, atol=0.06)
+        facts = topics.facts()
+        assert facts["steps"] > 50
+        assert (facts["transfer_cube"], facts["lift_hold"]) == (False, False)
+
+        topics.tell("/sim/reset", 3)
+        wait_for(lambda: np.allclose(operator.get_state(), HOME, atol=0.02))
+        wait_for(lambda: topics.facts()["steps"] == 0)
+
+        topics.tell("/sim/fault", "top=drop")
+        wait_for(lambda: time.monotonic() - operator.newest("top").receipt > 1.1)
+        with pytest.raises(Stale, match=r"top \(/camera_f/color/image_raw\) is silent"):
+            operator.get_state()
+        topics.tell("/sim/fault", "top=well")
+        wait_for(lambda: time.monotonic() - operator.newest("top").receipt < 0.1)
+        operator.get_frame()
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_a_signal_ends_it_in_order(self, simulate, number):
+        process = simulate("aloha", "--ros2", "--cameras", "top")
+        assert "simulating aloha" in process.stdout.readline()
+        time.sleep(0.5)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=20)
+
+        assert process.returncode == 0, errors
+        assert "periods" in output
+
+    def test_it_ends_by_itself(self, simulate):
+        process = simulate("aloha", "--ros2", "--cameras", "top", "--seconds", "1")
+        output, errors = process.communicate(timeout=30)
+
+        assert process.returncode == 0, errors
+        assert int(output.rpartition('"')[0].partition(" periods")[0].rpartition('"')[2]) <= 51
+
+
+class Waist:
+    """A policy that turns both waists; answers at 10 Hz, five keyframes at a time."""
+
+    action_rate_hz = 10.0
+    horizon = 5
+    cameras = ("top",)
+
+    def __init__(self, embodiment, second_time=lambda: None):
+        self.embodiment = embodiment
+        self.asked = 0
+        self._second_time = second_time
+
+    def reset(self, seed):
+        self.asked = 0
+
+    def predict_action(self, observation):
+        assert observation["images"]["top"].shape == (48, 64, 3)
+        self.asked += 1
+        if self.asked == 2:
+            self._second_time()
+        chunk = np.tile(observation["qpos"].astype(np.float64), (self.horizon, 1))
+        chunk[:, [6, 13]] = np.clip(chunk[:, [6, 13]], 0.0, 1.0)
+        chunk[:, [0, 7]] += 0.05 * np.arange(1, self.horizon + 1)[:, None]
+        return chunk
+
+
+def runner(tmp_path, second_time=lambda: None, **arguments):
+    operator = AlohaOperator(rate_window_s=0.0, **ALOHA)
+    return AlohaInferenceRunner(
+        policy=Waist(operator.embodiment, second_time),
+        operator=operator,
+        task_descriptions={"1": "turn"},
+        safety={"max_age_s": 2.0},
+        context=RunContext(work_dir=tmp_path, task="1", section="inference"),
+        record_fps=None,
+        **arguments,
+    )
+
+
+@pytest.mark.parametrize("async_execution", [False, True])
+def test_a_policy_drives_the_robot_through_the_loop(simulate, tmp_path, async_execution):
+    simulate("aloha", "--ros2", "--cameras", "top")
+    run = runner(tmp_path, max_publish_step=100, async_execution=async_execution)
+    run.run_setup()
+    result = run.run()
+
+    assert result["outcome"] == "max_steps"
+    assert run.policy.asked >= 4
+    assert run.ros_operator.last_action[0] > 0.2
+
+
+@pytest.mark.parametrize("stream", ["top", "left arm"])
+def test_a_stream_that_dies_stops_the_arm_and_is_named(simulate, topics, tmp_path, stream):
+    simulate("aloha", "--ros2", "--cameras", "top")
+    run = runner(tmp_path, lambda: topics.tell("/sim/fault", f"{stream}=drop"))
+    run.run_setup()
+    with pytest.raises(Stale, match=rf"{stream} \(.*\) is silent for 1\.0"):
+        run.run()
+
+    trip = run.latch.tripped
+    assert (trip.rule, "is silent" in trip.what) == ("freshness", True)
+
+
+class TestUR5e:
+    @pytest.mark.parametrize(
+        "controller", ["forward_position_controller", "scaled_joint_trajectory_controller"]
+    )
+    def test_it_is_driven(self, simulate, connect, topics, controller):
+        simulate("ur5e", "--ros2", "--cameras", "front", "--controller", controller)
+        operator = connect(UROperator, controller=controller, publish_rate=50.0, **UR)
+        np.testing.assert_allclose(operator.get_frame().state, UR_HOME, atol=0.02)
+        assert operator.speed_scaling == 1.0
+
+        target = UR_HOME.copy()
+        target[[0, 6]] = target[0] + 0.3, 0.5
+        reached = drive(operator, target)
+        np.testing.assert_allclose(reached[:6], target[:6], atol=0.04)
+        assert abs(reached[6] - 0.5) < 0.15
+        assert topics.facts()["lifted"] is False
+
+
+class TestBodies:
+    def test_aloha_commands_are_taken_by_name_with_raw_grippers(self):
+        body = AlohaBody(COBOT_MAGIC)
+        body.reset(HOME)
+        names = list(reversed(COBOT_MAGIC.joints))
+        raw = COBOT_MAGIC.gripper_open
+        left = SimpleNamespace(name=names, position=[raw, 6, 5, 4, 3, 2, 1])
+        body.hear("/master/joint_left", left, 0.0)
+
+        np.testing.assert_allclose(body.target(0.0), [1, 2, 3, 4, 5, 6, 1.0, *HOME[7:]])
+
+    def test_interbotix_has_grippers_of_its_own(self):
+        body = AlohaBody(INTERBOTIX)
+        body.reset(HOME)
+        arm, gripper = (
+            SimpleNamespace(cmd=[1.0] * 6),
+            SimpleNamespace(cmd=INTERBOTIX.gripper_closed),
+        )
+        body.hear("/follower_right/commands/joint_group", arm, 0.0)
+        body.hear("/follower_right/commands/joint_single", gripper, 0.0)
+
+        np.testing.assert_allclose(body.target(0.0), [*HOME[:7], *[1.0] * 6, 0.0], atol=1e-9)
+
+    def test_trajectories_take_their_time(self):
+        body = URBody("scaled_joint_trajectory_controller")
+        body.reset(np.zeros(7))
+        point = SimpleNamespace(
+            positions=[1.0] * 6, time_from_start=SimpleNamespace(sec=0, nanosec=500_000_000)
+        )
+        message = SimpleNamespace(joint_names=list(JOINTS), points=[point])
+        body.hear("/scaled_joint_trajectory_controller/joint_trajectory", message, 10.0)
+
+        assert [body.target(t)[0] for t in (10.0, 10.25, 10.5, 11.0)] == [0.0, 0.5, 1.0, 1.0]
+
+    @pytest.mark.parametrize(
+        ("message", "what"),
+        [
+            (SimpleNamespace(data=[1.0]), r"/c: 2 values are needed, got \(1,\)"),
+            (SimpleNamespace(data=[1.0, float("nan")]), "/c: a value is not finite"),
+            (SimpleNamespace(points=[]), "/c: a trajectory without points"),
+            (SimpleNamespace(name=["a"], position=[1.0]), "/c: no joint called b"),
+        ],
+    )
+    def test_what_is_no_command_is_refused(self, message, what):
+        with pytest.raises(BadMessage, match=what):
+            command_values(message, ("a", "b"), "/c")
+
+
+class TestCommandLine:
+    def test_faults_may_wait(self):
+        assert timed_fault("top=delay:0.2@3.5") == (3.5, "top", Fault("delay", 0.2))
+        assert timed_fault("top=drop") == (0.0, "top", Fault("drop"))
+
+    def test_a_time_that_is_none_is_refused(self):
+        with pytest.raises(UsageError, match="'soon' is no number of seconds"):
+            timed_fault("top=drop@soon")
+
+    @pytest.mark.parametrize(
+        ("arguments", "what"),
+        [
+            (["aloha"], "a simulated robot is reached over ROS 2 here"),
+            (["aloha", "--ros2", "--fault", "x=drop"], "the robot has no stream 'x'; it has left"),
+            (["aloha", "--ros2", "--preset", "x"], "unknown preset 'x'; known are cobot_magic"),
+            (["aloha", "--ros2", "--cameras", "x"], "no camera 'x'; there are top, left_wrist"),
+            (["ur5e", "--ros2", "--controller", "x"], "unknown controller 'x'"),
+        ],
+    )
+    def test_what_does_not_exist_is_named(self, ros_domain, capsys, arguments, what):
+        from fluxvla_core.cli.main import main
+
+        assert main(["sim", *arguments]) == 2
+        assert what in capsys.readouterr().err

@@ -3,9 +3,10 @@
     python benchmarks/startup.py [--lerobot PATH/TO/lerobot-train] [--rounds 15]
 
 The commands take turns, so that other work on the machine slows all of them alike; figures are
-medians over the rounds. Goals: at most 100 ms more than bare Python, and at least 20 times faster
-than ``lerobot-train --help`` (an environment of its own: LeRobot needs an older torch). Writes
-``benchmarks/results/startup.json``.
+medians over the rounds, of the time on the clock and of the processor time, which other work
+disturbs less; what the commands do is all computing. Goals: at most 100 ms of processor time more
+than bare Python, and at least 20 times faster than ``lerobot-train --help`` (an environment of its
+own: LeRobot needs an older torch). Writes ``benchmarks/results/startup.json``.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import statistics
 import subprocess
 import sys
@@ -26,39 +28,54 @@ MOST_EXTRA_MS = 100.0
 LEAST_RATIO = 20.0
 
 
-def measure(commands: dict[str, Sequence[str]], rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of each command in each round, after one round that fills caches.
+def measure(
+    commands: dict[str, Sequence[str]], rounds: int
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Median milliseconds of each command, on the clock and of processor time.
+
+    A first round, which fills caches, does not count.
 
     Raises:
         SystemExit: a command fails.
     """
-    taken: dict[str, list[float]] = {name: [] for name in commands}
+    clock: dict[str, list[float]] = {name: [] for name in commands}
+    processor: dict[str, list[float]] = {name: [] for name in commands}
     for number in range(rounds + 1):
         for name, command in commands.items():
-            began = time.perf_counter()
+            used, began = children_s(), time.perf_counter()
             done = subprocess.run(command, capture_output=True, text=True, check=False)
-            seconds = time.perf_counter() - began
+            seconds, busy = time.perf_counter() - began, children_s() - used
             if done.returncode:
                 sys.exit(f"{name} failed with {done.returncode}:\n{done.stderr[-2000:]}")
             if number:
-                taken[name].append(seconds * 1e3)
-    return taken
+                clock[name].append(seconds * 1e3)
+                processor[name].append(busy * 1e3)
+    return (
+        {name: statistics.median(values) for name, values in clock.items()},
+        {name: statistics.median(values) for name, values in processor.items()},
+    )
 
 
-def summarise(taken: dict[str, list[float]]) -> dict[str, object]:
-    """Medians and minima (ms), extra time over bare Python, ratios to LeRobot."""
-    medians = {name: statistics.median(values) for name, values in taken.items()}
-    bare = medians["python"]
-    ours = [name for name in medians if name.startswith("fluxvla")]
+def children_s() -> float:
+    """Seconds of processor time of all children that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def summarise(clock: dict[str, float], processor: dict[str, float]) -> dict[str, object]:
+    """Both medians (ms), what ours take beyond bare Python, and ratios to LeRobot."""
+    ours = [name for name in clock if name.startswith("fluxvla")]
+    extra = {name: processor[name] - processor["python"] for name in ours}
     summary: dict[str, object] = {
-        "median_ms": {name: round(value, 1) for name, value in medians.items()},
-        "minimum_ms": {name: round(min(values), 1) for name, values in taken.items()},
-        "extra_over_python_ms": {name: round(medians[name] - bare, 1) for name in ours},
+        "clock_ms": {name: round(value, 1) for name, value in clock.items()},
+        "processor_ms": {name: round(value, 1) for name, value in processor.items()},
+        "extra_processor_ms": {name: round(value, 1) for name, value in extra.items()},
+        "extra_clock_ms": {name: round(clock[name] - clock["python"], 1) for name in ours},
         "goal_extra_ms": MOST_EXTRA_MS,
-        "goal_extra_met": all(medians[name] - bare <= MOST_EXTRA_MS for name in ours),
+        "goal_extra_met": all(value <= MOST_EXTRA_MS for value in extra.values()),
     }
-    if "lerobot-train --help" in medians:
-        ratios = {name: medians["lerobot-train --help"] / medians[name] for name in ours}
+    if "lerobot-train --help" in clock:
+        ratios = {name: clock["lerobot-train --help"] / clock[name] for name in ours}
         summary["times_faster_than_lerobot"] = {n: round(r, 1) for n, r in ratios.items()}
         summary["goal_times_faster"] = LEAST_RATIO
         summary["goal_times_faster_met"] = all(r >= LEAST_RATIO for r in ratios.values())
@@ -84,7 +101,7 @@ def main() -> int:
         "python": platform.python_version(),
         "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
         "rounds": args.rounds,
-        **summarise(measure(commands, args.rounds)),
+        **summarise(*measure(commands, args.rounds)),
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")

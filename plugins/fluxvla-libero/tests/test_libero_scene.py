@@ -50,7 +50,8 @@ def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
     data = env.sim.data
     np.testing.assert_array_equal(scene.data.qpos, data.qpos)
     np.testing.assert_array_equal(scene.data.qvel, data.qvel)
-    assert not scene.done() and not done
+    assert not scene.done()
+    assert not done
     expected = [
         seen["robot0_eef_pos"],
         axis_angle(seen["robot0_eef_quat"]),

@@ -384,7 +384,7 @@ def test_classes_of_this_process_are_checked_too(write: Write, here: None) -> No
 
 def test_requirements(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     text = findings(
-        "requires = ['fluxvla-core>=99', 'nobody-has-this>=1', 'fluxvla-libero', '>=1',\n"
+        "requires = ['fluxvla-core>=99', 'nobody-has-this>=1', 'nor-has-anybody-this', '>=1',\n"
         "  'pip>=1', \"nobody-has-this; python_version < '3'\"]\n",
         write,
     )

@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
-    "fluxvla-aloha": {"runners": ("AlohaInferenceRunner",)},
+    "fluxvla-aloha": {
+        "operators": ("AlohaOperator",),
+        "runners": ("AlohaInferenceRunner",),
+    },
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
     "fluxvla-libero": {
@@ -28,7 +31,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "operators": ("AlohaSimOperator", "URSimOperator"),
         "runners": ("AlohaSimEvalRunner",),
     },
-    "fluxvla-ur": {"runners": ("URInferenceRunner",)},
+    "fluxvla-ur": {"operators": ("UROperator",), "runners": ("URInferenceRunner",)},
 }
 
 

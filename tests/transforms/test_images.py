@@ -12,6 +12,7 @@ from fluxvla_core.transforms.images import (
     NormalizeImages,
     ResizeImages,
     SimpleNormalizeImages,
+    join_planes,
     split,
     stack,
 )
@@ -52,6 +53,28 @@ def test_resize_to_the_same_size_changes_nothing():
     images = frozen(picture(0), picture(1))
     out = ResizeImages(12, 16)({"images": np.concatenate(images)})["images"]
     np.testing.assert_array_equal(out, np.concatenate(images))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda image: image,
+        lambda image: image[:, 2:9, 3:11],
+        lambda image: image[:, ::-1],
+        lambda image: image[:, :, ::2],
+        lambda image: np.ascontiguousarray(image),
+        lambda image: image.astype(np.float32),
+    ],
+)
+def test_joining_planes_is_concatenation_whatever_the_memory_is_like(change):
+    """Decoded pictures are views of (H, W, 3) memory, sometimes read-only or cut."""
+    views = [np.ascontiguousarray(picture(i).transpose(1, 2, 0)).transpose(2, 0, 1) for i in (0, 1)]
+    images = frozen(*(change(view) for view in views))
+    joined = join_planes(images)
+    assert joined.flags.c_contiguous
+    assert joined.flags.writeable
+    assert joined.dtype == images[0].dtype
+    np.testing.assert_array_equal(joined, np.concatenate(images))
 
 
 @given(top=st.integers(0, 6), left=st.integers(0, 8))

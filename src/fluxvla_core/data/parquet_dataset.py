@@ -21,7 +21,7 @@ from fluxvla_core.data.statistics import as_lists, column_statistics
 from fluxvla_core.data.windows import action_statistics, differences, window
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.transforms.images import split
+from fluxvla_core.transforms.images import join_planes, split
 from fluxvla_core.transforms.pipeline import Pipeline
 
 Sample = dict[str, Any]
@@ -212,7 +212,7 @@ class ParquetDataset:
         sample.pop("stats", None)
         images = sample.get("images")
         if isinstance(images, list) and len({image.shape for image in images}) == 1:
-            sample["images"] = np.concatenate(split(images))
+            sample["images"] = join_planes(split(images))
         return sample
 
 

@@ -80,6 +80,19 @@ def test_inspect_decodes_nothing(dataset, fluxvla):
     )
 
 
+def test_names_of_older_datasets(tmp_path, takes, fluxvla):
+    root = write_v2(tmp_path / "old", takes)
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["features"]["action"]["names"] = {"motors": ["a", "b", "c"]}
+    info["features"]["observation.state"]["names"] = ["too", "few"]
+    path.write_text(json.dumps(info))
+    out = fluxvla("inspect", root)[1]
+    assert "vector    action (3): a, b, c" in out
+    assert "vector    observation.state (3)\n" in out
+    assert "  0 " in fluxvla("stats", root)[1]
+
+
 def test_many_tasks_are_not_all_listed(dataset, fluxvla):
     many = pa.table({"task_index": range(30), "task": [f"do {i}" for i in range(30)]})
     pq.write_table(many, dataset / "meta/tasks.parquet")

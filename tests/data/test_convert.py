@@ -126,6 +126,21 @@ def test_videos_of_other_programs(broken, takes, which, tmp_path):
     assert files == {3: 1, 2: 3, 1: 3}[len(which)]
 
 
+def test_columns_of_text_are_kept_and_have_no_statistics(broken, tmp_path):
+    path = broken / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["features"]["note"] = {"dtype": "string", "shape": [1], "names": None}
+    path.write_text(json.dumps(info))
+    for i, file in enumerate(sorted(broken.glob("data/*/*.parquet"))):
+        table = pq.read_table(file)
+        notes = pa.array([f"episode {i}"] * table.num_rows)
+        pq.write_table(table.append_column("note", notes), file)
+    out = convert(broken, tmp_path / "new")
+    notes = pq.read_table(out / "data/chunk-000/file-000.parquet")["note"].to_pylist()
+    assert notes == ["episode 0"] * 7 + ["episode 1"] * 12 + ["episode 2"] * 9
+    assert "note" not in json.loads((out / "meta/stats.json").read_text())
+
+
 def test_large_files_are_split(old, tmp_path, monkeypatch):
     monkeypatch.setattr(convert_module.v3, "VIDEO_FILE_MB", 0.001)
     monkeypatch.setattr(convert_module.v3, "DATA_FILE_MB", 0.001)

@@ -1,9 +1,9 @@
 """ALOHA in simulation, two instructions, one policy: the demo's configuration.
 
-    fluxvla collect aloha --out work_dirs/aloha_sim/dataset --episodes 240
-    fluxvla run --config configs/aloha_sim_transfer.py --section runner --nproc 2
-    fluxvla run --config configs/aloha_sim_transfer.py --section eval
-    fluxvla run --config configs/aloha_sim_transfer.py --section inference --task 1
+fluxvla collect aloha --out work_dirs/aloha_sim/dataset --episodes 240
+fluxvla run --config configs/aloha_sim_transfer.py --section runner --nproc 2
+fluxvla run --config configs/aloha_sim_transfer.py --section eval
+fluxvla run --config configs/aloha_sim_transfer.py --section inference --task 1
 """
 
 DATASET = "work_dirs/aloha_sim/dataset"
@@ -72,8 +72,15 @@ runner = dict(
     collator=dict(
         type="DictCollator",
         keys=[
-            "images", "states", "actions", "action_masks",
-            "lang_tokens", "lang_masks", "noise", "time", "sample_ids",
+            "images",
+            "states",
+            "actions",
+            "action_masks",
+            "lang_tokens",
+            "lang_masks",
+            "noise",
+            "time",
+            "sample_ids",
         ],
         meta_keys=["img_masks", "task_description", "prompt", "info", "stats", "timestamp"],
     ),
@@ -95,7 +102,5 @@ inference = dict(
     task_descriptions=TASKS,
     execute_horizon=5,
     max_publish_step=300,
-    operator=dict(
-        type="AlohaSimOperator", camera_names=("top",), height=144, width=192, seed=7
-    ),
+    operator=dict(type="AlohaSimOperator", camera_names=("top",), height=144, width=192, seed=7),
 )

@@ -27,7 +27,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vlas": ("CompactVLA",),
     },
     "fluxvla-sim": {
-        "commands": ("collect",),
+        "commands": ("collect", "sim"),
         "operators": ("AlohaSimOperator", "URSimOperator"),
         "runners": ("AlohaSimEvalRunner",),
     },

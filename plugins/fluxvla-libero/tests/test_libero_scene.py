@@ -67,7 +67,7 @@ def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
     scene.model.vis.quality.shadowsize = env.sim.model.vis.quality.shadowsize
     scene.model.vis.quality.offsamples = env.sim.model.vis.quality.offsamples
     for camera in ("agentview", "robot0_eye_in_hand"):
-        picture = drawing.picture(scene.data, camera, 64, 64)
+        picture = drawing.picture(scene._shown, camera, 64, 64)
         turned = seen[f"{camera}_image"][::-1, ::-1]
         assert picture.std() > 10, "something is seen"
         np.testing.assert_array_equal(picture, turned)

@@ -110,6 +110,7 @@ def dev_env(session: nox.Session) -> envs.Env:
             words += ["-e", f"{dist.path}{extras}"]
         session.log(f"installing in editable mode: {', '.join(changed)}")
         env.pip_install("--no-build-isolation", *words, constraints=project.CONSTRAINTS)
+        add_model_files(env)
 
     # Sources are used in place; only what an installation reads makes it out of date.
     parts = {d.name: project.digest([d.path / "pyproject.toml"], relative_to=d.path) for d in dists}
@@ -141,6 +142,7 @@ def demo_env(session: nox.Session) -> tuple[envs.Env, str]:
         if not fresh:  # same version, other content: pip would keep what is there
             again = ["--force-reinstall", "--no-deps", *(built[name] for name in changed)]
             env.pip_install(*again, constraints=project.CONSTRAINTS)
+        add_model_files(env)
 
     parts = {d.name: d.fingerprint() for d in dists}
     env.filled(base_of(()), parts, lambda: install_base(session, env, ()), install)
@@ -162,11 +164,15 @@ def install_base(session: nox.Session, env: envs.Env, requirements: tuple[str, .
     session.log(f"installing torch {version} into {env.root.relative_to(ROOT)}")
     way = torch_build.install(env, version, project.CONSTRAINTS, session.log)
     session.log(f"torch came by way of: {way}")
-    if sys.version_info >= (3, 13):  # fluxvla-sim's pyproject.toml says why
-        env.pip_install("--no-deps", "gym-aloha", constraints=project.CONSTRAINTS)
     if requirements:
         session.log(f"installing {len(requirements)} tools and their dependencies")
         env.pip_install(*requirements, constraints=project.CONSTRAINTS)
+
+
+def add_model_files(env: envs.Env) -> None:
+    """The ALOHA's model files without the simulator around them; pyproject of fluxvla-sim: why."""
+    if sys.version_info >= (3, 13):
+        env.pip_install("--no-deps", "gym-aloha", constraints=project.CONSTRAINTS)
 
 
 def install_ros2(session: nox.Session, env: envs.Env, requirements: list[str]) -> None:

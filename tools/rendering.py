@@ -13,7 +13,8 @@ from tools.envs import Env
 from tools.shell import StepFailed
 
 PROBE = Path(__file__).with_name("render_probe.py")
-PACKAGES = ("libegl1", "libegl-mesa0", "libgl1-mesa-dri")
+# libopengl0: PyOpenGL, which mujoco draws with, looks for the GL functions in it.
+PACKAGES = ("libegl1", "libegl-mesa0", "libgl1-mesa-dri", "libopengl0")
 # One software-rasteriser thread for each process: the processes already use all cores.
 VARIABLES = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
 

@@ -49,7 +49,7 @@ def install(env: Env, version: str, constraints: Path, log: Callable[[str], None
         try:
             _quietly(env, way, version, constraints)
         except StepFailed as error:
-            reasons.append(f"{way}: {_last_line(error.output) or error}")
+            reasons.append(f"{way}: {_first_error(error.output) or error}")
             continue
         return way
     if reasons:
@@ -71,6 +71,8 @@ def _quietly(env: Env, way: str, version: str, constraints: Path) -> None:
     env.run(*uv, "-c", str(constraints), f"torch=={version}", quiet=True)
 
 
-def _last_line(text: str) -> str:
+def _first_error(text: str) -> str:
+    """The line that says what went wrong; tools add hints and causes of causes after it."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else ""
+    errors = [line for line in lines if "error" in line.lower()]
+    return (errors or lines or [""])[0]

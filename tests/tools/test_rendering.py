@@ -44,7 +44,7 @@ def test_root_gets_mesa_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     machine.ensure()
     assert machine.ran == [
         "apt-get update -q",
-        "apt-get install -y -q --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri",
+        "apt-get install -y -q --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0",
     ]
     assert "cannot load libEGL" in machine.said[0]
     machine.ensure()
@@ -58,7 +58,7 @@ def test_others_get_the_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "cannot load libEGL" in str(told.value)
     assert (
         "\n    sudo apt-get update -q && sudo apt-get install -y -q --no-install-recommends "
-        "libegl1 libegl-mesa0 libgl1-mesa-dri\n" in str(told.value)
+        "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0\n" in str(told.value)
     )
     assert machine.ran == []
 

@@ -92,11 +92,13 @@ def test_uv_is_asked_next(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_else_the_default_build_with_a_line_that_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     shop = Shop(monkeypatch, "-c c.txt torch==2.13.0")
     monkeypatch.setattr(
-        torch_build, "_quietly", lambda *a: (_ for _ in ()).throw(StepFailed(["x"], 1, "no wheel"))
+        torch_build,
+        "_quietly",
+        lambda *a: (_ for _ in ()).throw(StepFailed(["x"], 1, "WARNING\nERROR: no wheel\nhint\n")),
     )
     assert shop.install() == "plain"
     assert shop.said == [
-        "no CPU build of torch 2.13.0 found (cpu-wheel: no wheel; uv: no wheel): installing the "
+        "no CPU build of torch 2.13.0 found (cpu-wheel: ERROR: no wheel; uv: ERROR: no wheel): installing the "
         "default build, which also works without a GPU but is several GB larger"
     ]
 

@@ -197,7 +197,7 @@ def test_a_machine_without_an_egl_driver_gets_one_clear_message():
     )
     assert run.returncode != 0
     assert "the simulator cannot draw: no OpenGL context could be made" in run.stderr
-    assert "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri" in run.stderr
+    assert "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0" in run.stderr
 
 
 def test_a_machine_without_egl_gets_one_clear_message():

@@ -15,7 +15,7 @@ from types import ModuleType
 from fluxvla_core.errors import MissingPlugin, RunFailed
 
 INSTALL = "pip install 'fluxvla-libero[libero]'"
-APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri"
+APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
 def is_installed() -> bool:

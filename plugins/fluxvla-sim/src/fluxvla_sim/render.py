@@ -22,7 +22,7 @@ import numpy.typing as npt
 from fluxvla_core.errors import RunFailed
 
 QUALITIES = ("cheap", "reference")
-APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri"
+APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 _EGL = "libEGL.so.1"
 
 

@@ -44,7 +44,8 @@ def test_root_gets_mesa_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     machine.ensure()
     assert machine.ran == [
         "apt-get update -q",
-        "apt-get install -y -q --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0",
+        "apt-get install -y -q --no-install-recommends "
+        "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0",
     ]
     assert "cannot load libEGL" in machine.said[0]
     machine.ensure()

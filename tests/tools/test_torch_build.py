@@ -98,8 +98,8 @@ def test_else_the_default_build_with_a_line_that_says_why(monkeypatch: pytest.Mo
     )
     assert shop.install() == "plain"
     assert shop.said == [
-        "no CPU build of torch 2.13.0 found (cpu-wheel: ERROR: no wheel; uv: ERROR: no wheel): installing the "
-        "default build, which also works without a GPU but is several GB larger"
+        "no CPU build of torch 2.13.0 found (cpu-wheel: ERROR: no wheel; uv: ERROR: no wheel): "
+        "installing the default build, which also works without a GPU but is several GB larger"
     ]
 
 

@@ -125,6 +125,7 @@ def by_hand(kind: str) -> Callable[[int], None]:
 def by_runner(kind: str, work_dir: Path) -> Callable[[int], None]:
     """A function that lets the runner's loop do so many steps; checkpoints are not written."""
     from fluxvla_core.train.loop import begin
+    from fluxvla_core.train.progress import Progress
     from fluxvla_core.train.stop import StopRequest
 
     config = {
@@ -143,7 +144,8 @@ def by_runner(kind: str, work_dir: Path) -> Callable[[int], None]:
     runner.save_checkpoint = lambda *args: None
     dataset = Samples()
     runner.run_setup(len(dataset))
-    loop = begin(runner, dataset, StopRequest(runner.world).__enter__())
+    runner.progress = Progress()
+    loop = begin(runner, dataset, StopRequest(runner.world))
 
     def run(steps: int) -> None:
         target = runner.progress.step + steps

@@ -43,7 +43,6 @@ def runner(**settings):
         ({"enable_gradient_checkpointing": "no"}, "must be true or false, got 'no'"),
         ({"lr_scheduler_type": "cosine"}, "lr_scheduler_type: lr_scheduler_type 'cosine' is none"),
         ({"lr_schedule": {0: 1e-4}}, "lr_schedule belongs to lr_scheduler_type 'step-based'"),
-        ({"device": "tpu", "max_steps": 0}, "max_steps"),
     ],
 )
 def test_one_setting(settings, message):

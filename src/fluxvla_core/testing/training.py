@@ -10,9 +10,11 @@ import multiprocessing
 import os
 import signal
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest import mock
 
 import numpy as np
 import torch
@@ -27,8 +29,9 @@ from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 from fluxvla_core.train import stop
 from fluxvla_core.train.base_runner import BaseTrainRunner
-from fluxvla_core.train.checkpoint import folders
+from fluxvla_core.train.checkpoint import ENVIRONMENT, folders
 from fluxvla_core.train.disk import Disk
+from fluxvla_core.train.manifest import NAME as MANIFEST
 
 STATES, HORIZON, ACTIONS = 6, 2, 3
 KEYS = ("states", "actions", "noise", "sample_ids")
@@ -179,11 +182,19 @@ def train(settings: Mapping[str, Any]) -> Any:
     stop.NOTICE_S = settings.get("notice_s", stop.NOTICE_S)
     if settings.get("kill_write"):
         kill_at_operation(settings["kill_write"])
-    runner = build_runner_from_cfg(table, context)
     dataset = TinyDataset(settings.get("length", 37))
-    runner.run_setup(len(dataset))
-    runner.run(dataset)
+    with unflushed():
+        runner = build_runner_from_cfg(table, context)
+        runner.run_setup(len(dataset))
+        runner.run(dataset)
     return runner
+
+
+@contextmanager
+def unflushed() -> Iterator[None]:
+    """Let nothing wait for the device: a process that is killed loses nothing that it wrote."""
+    with mock.patch.object(os, "fsync", return_value=None):
+        yield
 
 
 def train_all(*runs: Mapping[str, Any]) -> None:
@@ -279,23 +290,34 @@ def _free_port() -> int:
 def differences(left: Path, right: Path) -> list[str]:
     """How two work dirs differ: names of checkpoint files whose bytes do, and of metric lines.
 
-    Compares every checkpoint that both should have, and ``metrics.jsonl`` without its wall-clock
-    fields.
+    Compares all checkpoints, and ``metrics.jsonl`` without its wall-clock fields.
     """
     found = []
     names = [[p.name for p in folders(d)] for d in (left, right)]
     if names[0] != names[1]:
         found.append(f"checkpoints: {names[0]} / {names[1]}")
     for a, b in zip(folders(left), folders(right), strict=False):
-        files = {p.relative_to(d) for d in (a, b) for p in d.rglob("*") if p.is_file()}
-        for name in sorted(files):
-            pair = [(d / name).read_bytes() if (d / name).is_file() else None for d in (a, b)]
-            if pair[0] != pair[1]:
-                found.append(f"{a.name}/{name}")
+        found += checkpoint_differences(a, b)
     records = [_records(d / "metrics.jsonl") for d in (left, right)]
     if records[0] != records[1]:
         found.append("metrics.jsonl")
     return found
+
+
+def checkpoint_differences(left: Path, right: Path) -> list[str]:
+    """Names of files that differ between two checkpoints' folders.
+
+    Not compared are ``environment.json``, for what is installed may change between two runs, and
+    the manifest, which follows from the rest.
+    """
+    skipped = {Path(MANIFEST), Path(ENVIRONMENT)}
+    files = {p.relative_to(d) for d in (left, right) for p in d.rglob("*") if p.is_file()}
+    return [
+        f"{left.name}/{name}"
+        for name in sorted(files - skipped)
+        if len({(d / name).read_bytes() if (d / name).is_file() else None for d in (left, right)})
+        > 1
+    ]
 
 
 def _records(path: Path) -> list[dict[str, Any]]:

@@ -349,9 +349,11 @@ class BaseTrainRunner:
         """
         from fluxvla_core.train import distributed
         from fluxvla_core.train.loop import begin
+        from fluxvla_core.train.progress import Progress
         from fluxvla_core.train.stop import StopRequest, stopped
 
         self._prepare()
+        self.progress = Progress()
         outcome = "failed"
         try:
             with StopRequest(self.world) as stop:

@@ -15,7 +15,6 @@ from fluxvla_core.train.batches import StepSampler
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.forward import IDS, ForwardArguments, to_device
 from fluxvla_core.train.optim import trainable
-from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.resuming import restore_rng
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
@@ -28,7 +27,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     options, world, context = run.options, run.world, run.context
     if not world.first:
         run.hooks = HookCaller(context)
-    run.dataset, run.plan, run.progress = dataset, run._plan(len(dataset)), Progress()
+    run.dataset, run.plan = dataset, run._plan(len(dataset))
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))
     run.left_out = left_out(run.model)
     if options.ema_decay is not None:

@@ -114,8 +114,8 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
         )
     if saved["world_size"] != plan.world:
         return (
-            f"{plan.world} processes now and {saved['world_size']} in the checkpoint's run: the "
-            "order of samples stays, results agree only to rounding"
+            f"the number of processes is {plan.world}, the checkpoint's run had "
+            f"{saved['world_size']}: the order of samples stays, results agree only to rounding"
         )
     return None
 

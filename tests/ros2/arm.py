@@ -87,7 +87,7 @@ def frames_for(operator, seconds):
 
 
 def refusal_of(operators, **settings):
-    operator = operators(connect_timeout_s=2.0, **settings)
+    operator = operators(**{"connect_timeout_s": 2.0, **settings})
     with pytest.raises((NotReady, Rejected)) as caught:
         operator.connect()
     return caught.value

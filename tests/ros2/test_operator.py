@@ -155,7 +155,7 @@ class TestCommanding:
 
     def test_another_commander_is_refused_at_the_start(self, operators, robot, drivers):
         drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
-        error = refusal_of(operators, rate_window_s=1.0)
+        error = refusal_of(operators, rate_window_s=1.0, connect_timeout_s=4.0)
 
         assert isinstance(error, Rejected)
         assert "/teleop_" in error.what
@@ -301,7 +301,7 @@ class TestFaults:
 
 
 def test_a_second_connection_to_the_same_robot_is_refused(arm, operators):
-    error = refusal_of(operators, rate_window_s=1.0)
+    error = refusal_of(operators, rate_window_s=1.0, connect_timeout_s=4.0)
 
     assert isinstance(error, Rejected)
     assert "/fluxvla_arm_" in error.what

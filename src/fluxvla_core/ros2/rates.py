@@ -5,7 +5,8 @@ Fast DDS hands messages to processes of the same machine through shared memory, 
 512 KB that belongs to the publisher. A VGA picture has 900 KB: it is cut into pieces that overwrite
 one another before they are read. A reliable subscription gets the pieces again; with best effort
 (what camera drivers offer by default) 93 to 99 of 100 pictures are lost. Only the publishing
-process can be given a larger segment.
+process can be given a larger segment. (On Jazzy a profile's transports are overridden while
+``ROS_AUTOMATIC_DISCOVERY_RANGE`` is ``LOCALHOST``; there the publisher has to offer RELIABLE.)
 """
 
 from __future__ import annotations

@@ -34,8 +34,9 @@ def ros_domain() -> Iterator[int]:
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("ROS_DOMAIN_ID", str(domain))
         environment.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        # What Humble has in its place.
-        environment.setenv("ROS_LOCALHOST_ONLY", "1")
+        if os.environ.get("ROS_DISTRO") == "humble":
+            # What Humble has in its place; later ones let it override transports in profiles.
+            environment.setenv("ROS_LOCALHOST_ONLY", "1")
         environment.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(profile))
         yield domain
 

@@ -461,7 +461,7 @@ def test_a_batch_key_that_the_model_does_not_take_is_refused_at_the_first_step(t
 
 def test_errors_before_the_first_step_are_what_they_are(tmp_path):
     class Broken(TinyDataset):
-        def prepare(self):
+        def prepare(self, reporter):
             raise RuntimeError("the socket of the decoder")
 
     runner = make(tmp_path)

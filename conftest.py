@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 
 # Before torch and MuJoCo are imported: sums must not depend on a number of threads where results
 # of several processes are compared bit for bit, and there is no display to render to.
 for name, value in (("OMP_NUM_THREADS", "1"), ("MUJOCO_GL", "egl"), ("LP_NUM_THREADS", "1")):
     os.environ.setdefault(name, value)
+
+# Started in the background of a script, a process ignores Ctrl-C, and so does all that it starts;
+# a test of Ctrl-C would then wait for nothing.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest  # noqa: E402
 

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
 from tools import envs, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
+from tools.demo import __main__ as demo_program  # noqa: E402
 from tools.steps import Steps  # noqa: E402
 
 nox.needs_version = ">=2024.4.15"
@@ -193,6 +194,7 @@ def make_renderable(session: nox.Session, env: envs.Env) -> None:
 
 
 def run_demo(session: nox.Session, arguments: list[str]) -> None:
+    demo_program.parser().parse_args(arguments)  # a slip is told before anything is installed
     began = time.monotonic()
     env, build = demo_env(session)
     words = ["--build", build, "--installed-in", f"{time.monotonic() - began:.1f}", *arguments]

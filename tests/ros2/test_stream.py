@@ -16,7 +16,7 @@ from fluxvla_core.spec.embodiment import Camera
 CAMERA = {"topic": "/cam", "message": IMAGE, "hz": 30, "height": 480, "width": 640}
 
 
-def wait_for(condition, seconds=8.0):
+def wait_for(condition, seconds=30.0):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "did not happen in time"
@@ -37,13 +37,14 @@ def count(stream, seconds):
 
 
 def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(pictures, drivers):
-    drivers([CAMERA])
+    # So slow that the queue of ten outlasts the seconds for which a busy machine may stop us.
+    drivers([{**CAMERA, "hz": 5}])
     wait_for(pictures.newest)
-    received, lost = count(pictures, 1.0)
+    lost = pictures.lost
+    wait_for(lambda: pictures.ring.received >= 8)
 
     assert pictures.reliability == "reliable"
-    assert lost == 0
-    assert received >= 20
+    assert pictures.lost == lost
     assert len(pictures.ring.items()) == 4
 
 

@@ -255,6 +255,11 @@ class RosOperator(ABC):
         """``(dim,)`` the last command that was sent since connecting, or None."""
         return None if self._last is None else self._last.copy()
 
+    def kept(self, name: str) -> tuple[Received, ...]:
+        """The messages of a stream that are kept, newest last; none without a connection."""
+        connection = self._connection
+        return connection.streams[name].ring.items() if connection is not None else ()
+
     def newest(self, name: str) -> Received | None:
         """The newest message of a stream, None before the first or without a connection."""
         connection = self._connection
@@ -335,6 +340,8 @@ class RosOperator(ABC):
             if not connection.node.get_publishers_info_by_topic(stream.topic):
                 gone.append(stream.topic)
         cause = "the device froze, or its driver was killed or hangs"
+        if len(silent) == sum(spec.required for spec in self._specs):
+            cause = "every stream at once: the network is gone, or this machine is overloaded"
         if gone:
             cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
         return Stale(

@@ -11,6 +11,7 @@ from fluxvla_core.ros2 import joints
 from fluxvla_core.ros2.operator import RosOperator
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, CommandSpec, StreamSpec, camera_stream
+from fluxvla_core.ros2.trouble import Stale
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 NAMES = ("elbow", "wrist", "grip")
@@ -65,23 +66,32 @@ def wait_for(condition, seconds=8.0):
         time.sleep(0.01)
 
 
-def frame_error(operator, seconds=4.0):
-    """The first error of ``get_frame``, waiting for it."""
-    until = time.monotonic() + seconds
+def frame_error(operator, what, seconds=8.0):
+    """The first error of ``get_frame`` that says ``what``, waiting for it.
+
+    On a machine that is busy with others, any stream may fall silent for a moment.
+    """
+    until, seen = time.monotonic() + seconds, []
     while time.monotonic() < until:
         try:
             operator.get_frame()
         except (NotReady, Faulted) as error:
-            return error
+            if what in error.what:
+                return error
+            seen.append(error.what)
         time.sleep(0.01)
-    pytest.fail("get_frame went on working")
+    pytest.fail(f"get_frame never said {what!r}, but {seen[-3:]}")
 
 
-def frames_for(operator, seconds):
-    """Frames of a while; any error fails the test."""
+def frames_of(operator, count=15, seconds=8.0):
+    """So many frames; streams that fall silent for a moment are forgiven."""
     until, frames = time.monotonic() + seconds, []
-    while time.monotonic() < until:
-        frames.append(operator.get_frame())
+    while len(frames) < count:
+        assert time.monotonic() < until, f"only {len(frames)} frames in {seconds} s"
+        try:
+            frames.append(operator.get_frame())
+        except Stale:
+            continue
         time.sleep(0.02)
     return frames
 
@@ -91,3 +101,15 @@ def refusal_of(operators, **settings):
     with pytest.raises((NotReady, Rejected)) as caught:
         operator.connect()
     return caught.value
+
+
+def rejection_of(operators, attempts=4):
+    """What ``connect`` says of another commander, who may be discovered a little late."""
+    for _ in range(attempts):
+        operator = operators(connect_timeout_s=3.0, rate_window_s=0.5)
+        try:
+            operator.connect()
+        except Rejected as error:
+            return error
+        operator.close()
+    pytest.fail("another commander was never noticed")

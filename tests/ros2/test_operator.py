@@ -16,8 +16,8 @@ from tests.ros2.arm import (
     PICTURES,
     STATE,
     frame_error,
-    frames_for,
-    refusal_of,
+    frames_of,
+    rejection_of,
     wait_for,
 )
 
@@ -123,7 +123,7 @@ class TestCommanding:
     def test_stop_holds_the_last_command_when_the_state_is_gone(self, arm, robot):
         arm.send_action([0.9, 0.2, 0.0])
         robot.tell(fault="/arm/state=drop")
-        frame_error(arm)
+        frame_error(arm, "arm (/arm/state) is silent")
         arm.stop()
         wait_for(lambda: len(robot.on("/arm/command")) == 2)
 
@@ -155,11 +155,8 @@ class TestCommanding:
 
     def test_another_commander_is_refused_at_the_start(self, operators, robot, drivers):
         drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
-        error = refusal_of(operators, rate_window_s=1.0, connect_timeout_s=4.0)
 
-        assert isinstance(error, Rejected)
-        assert "/teleop_" in error.what
-        assert "also publishes on /arm/command" in error.what
+        assert "/teleop_" in rejection_of(operators).what
 
     def test_another_commander_stops_the_commands_and_its_leaving_frees_them(self, arm, drivers):
         arm.send_action([0.1, 0.2, 0.5])
@@ -176,11 +173,10 @@ class TestCommanding:
 class TestFaults:
     def test_a_camera_that_falls_silent_is_named(self, arm, robot):
         robot.tell(fault="/cam/image=drop")
-        error = frame_error(arm)
+        error = frame_error(arm, "cam (/cam/image) is silent for ")
 
-        assert error.what.startswith("cam (/cam/image) is silent for 0.5")
-        assert error.what.endswith("; 0.5 s is allowed")
-        assert error.cause == "the device froze, or its driver was killed or hangs"
+        assert error.what.endswith(" s; 0.5 s is allowed")
+        assert (type(error), error.rule) == (Stale, "freshness")
 
     def test_reading_the_state_alone_notices_a_silent_camera_too(self, arm, robot):
         """The loop reads it after each command, and frames only when a policy is asked."""
@@ -193,12 +189,12 @@ class TestFaults:
     def test_a_camera_that_repeats_its_last_picture_is_silent_too(self, arm, robot):
         robot.tell(fault="/cam/image=freeze")
 
-        assert frame_error(arm).what.startswith("cam (/cam/image) is silent for 0.5")
+        frame_error(arm, "cam (/cam/image) is silent for ")
 
     def test_joint_states_that_stop_are_named(self, arm, robot):
         robot.tell(fault="/arm/state=drop")
 
-        assert frame_error(arm).what.startswith("arm (/arm/state) is silent for 0.5")
+        frame_error(arm, "arm (/arm/state) is silent for ")
 
     @pytest.mark.parametrize(
         ("changes", "what"),
@@ -219,10 +215,9 @@ class TestFaults:
     )
     def test_messages_that_change_are_a_fault(self, arm, robot, changes, what):
         robot.tell(change=changes)
-        error = frame_error(arm)
+        error = frame_error(arm, what)
 
-        assert isinstance(error, BadMessage)
-        assert (error.what, error.rule) == (what, "frame")
+        assert (type(error), error.rule) == (BadMessage, "frame")
 
     def test_other_encodings_and_orders_are_understood(self, arm, robot):
         robot.tell(
@@ -231,20 +226,20 @@ class TestFaults:
                 "/arm/state": {"names": list(NAMES), "positions": [0.1, 0.2, 0.5]},
             }
         )
-        for frame in frames_for(arm, 0.5):
+        for frame in frames_of(arm):
             assert (frame.images["cam"] == [10, 20, 30]).all()
             np.testing.assert_array_equal(frame.state, [0.1, 0.2, 0.5])
 
     def test_a_state_that_is_no_number_is_a_fault(self, arm, robot):
         robot.tell(fault="/arm/state=nan")
 
-        assert "the position of elbow, wrist, grip is not a finite number" in frame_error(arm).what
+        frame_error(arm, "the position of elbow, wrist, grip is not a finite number")
 
     @pytest.mark.parametrize("fault", ["duplicate", "out_of_order"])
     def test_repeated_and_overtaken_messages_change_nothing(self, arm, robot, fault):
         robot.tell(fault=f"/arm/state={fault}")
         robot.tell(fault=f"/cam/image={fault}")
-        stamps = [frame.stamps for frame in frames_for(arm, 0.8)]
+        stamps = [frame.stamps for frame in frames_of(arm, 30)]
 
         for name in ("state", "cam"):
             times = [stamp[name] for stamp in stamps]
@@ -257,35 +252,37 @@ class TestFaults:
         """Not only its pictures are old then, but the state that belongs to them."""
         robot.tell(fault="/cam/image=delay:0.7")
         time.sleep(0.8)
-        error = frame_error(arm)
+        error = frame_error(arm, "cam is late: what belongs to its newest message arrived 0.")
 
         assert (type(error), error.rule) == (Stale, "freshness")
-        assert error.what.startswith("cam is late: what belongs to its newest message arrived 0.")
 
     @pytest.mark.parametrize("step", [-3600.0, 3600.0])
     def test_a_stepped_wall_clock_changes_nothing(self, arm, robot, step):
         robot.tell(fault=f"/cam/image=clock:{step}")
         robot.tell(fault=f"/arm/state=clock:{step}")
 
-        assert len(frames_for(arm, 1.0)) > 20
+        frames_of(arm)
+        wait_for(lambda: arm._connection.streams["cam"].ring.clock_steps)
+        frames_of(arm)
+
         assert arm._connection.streams["cam"].ring.clock_steps == 1
 
     def test_clocks_that_differ_are_named_and_receipts_mend_it(self, arm, robot, operators):
         robot.tell(fault="/cam/image=clock:-100")
-        error = frame_error(arm)
+        error = frame_error(arm, "cam is 9")
         assert error.cause == "they arrive together, so the clocks that stamp them differ"
         arm.close()
 
         forgiving = operators(sync_on="receipt")
         forgiving.connect()
-        assert frames_for(forgiving, 0.3)
+        assert frames_of(forgiving)
 
     def test_a_flood_on_a_topic_changes_nothing(self, arm, drivers):
         flood = {**STATE, "hz": 2000, "names": [f"j{i}" for i in range(200)] + list(NAMES)}
         drivers([{**flood, "positions": [0.0] * 200 + [0.1, 0.2, 0.5]}], name="flood")
         wait_for(lambda: arm._connection.streams["arm"].ring.received > 1000)
 
-        assert len(frames_for(arm, 0.5)) > 5
+        frames_of(arm)
         assert len(arm._connection.streams["arm"].ring.items()) <= 128
 
     def test_a_ros_thread_that_ended_is_a_fault(self, arm):
@@ -301,7 +298,4 @@ class TestFaults:
 
 
 def test_a_second_connection_to_the_same_robot_is_refused(arm, operators):
-    error = refusal_of(operators, rate_window_s=1.0, connect_timeout_s=4.0)
-
-    assert isinstance(error, Rejected)
-    assert "/fluxvla_arm_" in error.what
+    assert "/fluxvla_arm_" in rejection_of(operators).what

@@ -17,7 +17,7 @@ from tests.ros2.arm import (
     STATE,
     Arm,
     frame_error,
-    frames_for,
+    frames_of,
     refusal_of,
     wait_for,
 )
@@ -132,14 +132,13 @@ def test_a_driver_that_left_and_comes_back(operators, drivers, ending):
     robot, arm = drivers([STATE, PICTURES], [COMMANDS]), operators()
     arm.connect()
     getattr(robot, ending)()
-    error = frame_error(arm)
-    assert "silent for 0.5" in error.what
+    error = frame_error(arm, "(/cam/image) is silent for ")
     # Who was killed is on the graph for another 20 s.
     assert ("the driver is gone: nobody publishes" in error.cause) == (ending == "close")
 
     drivers([STATE, PICTURES], [COMMANDS])
     wait_for(lambda: all(time.monotonic() - arm.newest(n).receipt < 0.2 for n in ("arm", "cam")))
-    assert frames_for(arm, 0.3)
+    assert frames_of(arm)
 
 
 def test_streams_without_stamps_are_matched_by_receipt(operators, drivers):
@@ -147,7 +146,7 @@ def test_streams_without_stamps_are_matched_by_receipt(operators, drivers):
     operator = operators()
     operator.connect()
 
-    assert frames_for(operator, 0.3)
+    assert frames_of(operator)
 
 
 def test_a_side_stream_that_need_not_be_there_is_not_missed(drivers, operators, monkeypatch):

@@ -144,7 +144,7 @@ class RosOperator(ABC):
             try:
                 self._subscribe_all(connection)
                 self._connection = connection
-                self.get_frame()
+                self._first_frame()
                 self.on_connected(connection)
             except BaseException:
                 self._connection = None
@@ -283,6 +283,19 @@ class RosOperator(ABC):
             log.warning("%s", warning)
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
+
+    def _first_frame(self) -> None:
+        """See that frames can be made; drivers that only now get going are given time."""
+        until = time.monotonic() + self.connect_timeout_s
+        while True:
+            try:
+                self.get_frame()
+            except Stale:
+                if time.monotonic() >= until:
+                    raise
+                time.sleep(_LOOK_S)
+            else:
+                return
 
     def _watch_commanders(self, connection: Connection, topics: Sequence[str]) -> None:
         others = discovery.commanders(connection.node, topics, connection.name)

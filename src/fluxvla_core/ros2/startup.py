@@ -15,6 +15,8 @@ from fluxvla_core.ros2.stream import Stream
 from fluxvla_core.ros2.streams import CommandSpec, StreamSpec
 
 _POLL_S = 0.02
+# So many lost messages, and none received, are no bad luck.
+_HOPELESS = 30
 
 
 class Startup:
@@ -45,6 +47,7 @@ class Startup:
         until = self._since + timeout_s
         while True:
             self._connection.check()
+            self._check_losses()
             late = time.monotonic() >= until
             problem = self._problem(hurry=not late)
             if problem is None:
@@ -84,6 +87,17 @@ class Startup:
             raise contested
         return warnings
 
+    def _check_losses(self) -> None:
+        """Waiting longer does not help a stream of which so much was sent and nothing arrived."""
+        streams = [self._stream(spec) for spec in self._specs]
+        lost = [s for s in streams if s.lost >= _HOPELESS and not s.newest()]
+        if lost:
+            raise self._lossy(lost)
+
+    def _lossy(self, lost: Sequence[Stream]) -> NotReady:
+        span = time.monotonic() - self._since
+        return rates.lossy([Reception(s.label, s.reliability, span, 0, s.lost, 0) for s in lost])
+
     def _problem(self, hurry: bool) -> FluxError | None:
         """What is still wrong; ``hurry`` leaves out what only makes the message better."""
         quiet = [s for spec in self._specs if not (s := self._stream(spec)).newest()]
@@ -113,10 +127,7 @@ class Startup:
                 return discovery.wrong_type(stream.label, stream.topic, wanted, types)
         lost = [s for s in quiet if s.lost]
         if lost:
-            span = time.monotonic() - self._since
-            return rates.lossy(
-                [Reception(s.label, s.reliability, span, 0, s.lost, 0) for s in lost]
-            )
+            return self._lossy(lost)
         return discovery.silent_publishers([s.label for s in quiet])
 
     def _stream(self, spec: StreamSpec) -> Stream:

@@ -2,6 +2,7 @@
 
     nox -s demo [-- --smoke | --full] [--fresh]     from demonstrations to an evaluated policy
     nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
+    nox -s nightly [-- PYTEST ARGUMENTS]            the tests that take minutes each
     nox -s lint | types | layers | bench            one part of it
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
@@ -28,7 +29,9 @@ nox.options.sessions = ["tests"]
 nox.options.default_venv_backend = "none"
 
 EXTRAS = "data,train,report"
-PYTEST = ["-n", os.environ.get("FLUXVLA_TEST_PROCESSES", "2"), "--dist", "loadfile"]
+PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
+PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow"]
+ALONE = ["-m", "realtime and not slow"]
 
 
 @nox.session
@@ -44,9 +47,21 @@ def tests(session: nox.Session) -> None:
         step("types", lambda: dev.run("mypy", cwd=ROOT))
         step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
         make_renderable(session, dev)
-        step("pytest", lambda: dev.run("pytest", *PYTEST, cwd=ROOT, env=rendering.VARIABLES))
+        # A test that waits for a network or a deadline does not share its core with another one.
+        for name, words in (("pytest", PARALLEL), ("pytest, in real time", ALONE)):
+            step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=rendering.VARIABLES))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
         step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))
+
+
+@nox.session
+def nightly(session: nox.Session) -> None:
+    """The tests that take minutes each."""
+    with Steps(session) as step:
+        dev = dev_env(session)
+        make_renderable(session, dev)
+        words = ["-m", "slow", *session.posargs]
+        step("pytest", lambda: dev.run("pytest", *words, cwd=ROOT, env=rendering.VARIABLES))
 
 
 @nox.session

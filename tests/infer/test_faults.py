@@ -109,7 +109,7 @@ def test_a_chunk_a_little_beyond_a_limit_is_clamped(bench):
     bench.assert_within_limits()
 
 
-@pytest.mark.parametrize("realtime", [False, True])
+@pytest.mark.parametrize("realtime", [False, pytest.param(True, marks=pytest.mark.realtime)])
 def test_a_policy_that_raises(bench, make_arm, realtime):
     bench.arm = make_arm(realtime=realtime)
     bench.policy.faults[3] = ValueError("out of memory")
@@ -121,6 +121,7 @@ def test_a_policy_that_raises(bench, make_arm, realtime):
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.realtime
 def test_a_policy_that_hangs_on_a_robot(bench, make_arm, asynchronous):
     """The sender goes on sending holds in the meantime; then the motion is stopped."""
     bench.arm = make_arm(realtime=True)
@@ -178,6 +179,7 @@ def test_an_operator_whose_stop_raises_is_reported_and_closed(bench):
     assert "warning: Arm.stop raised OSError: no answer" in bench.notes.lines
 
 
+@pytest.mark.realtime
 def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, monkeypatch):
     monkeypatch.setattr("fluxvla_core.infer.robot.STOP_S", 0.1)
     bench.arm = make_arm(realtime=True)
@@ -229,6 +231,7 @@ def test_a_robot_that_never_gives_a_reading(bench):
     assert_stopped(bench, "operator", "no complete reading")
 
 
+@pytest.mark.realtime
 def test_a_robot_whose_get_frame_hangs(bench, make_arm):
     bench.arm = make_arm(realtime=True)
     bench.arm.faults["get_frame"] = lambda: time.sleep(2)

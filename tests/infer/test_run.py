@@ -274,6 +274,7 @@ def test_hooks_watch_and_cannot_touch(bench, monkeypatch):
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.realtime
 def test_on_a_robot_all_readings_are_made_in_one_thread_and_all_commands_in_another(
     bench, make_arm, asynchronous
 ):
@@ -298,6 +299,7 @@ def test_on_a_robot_all_readings_are_made_in_one_thread_and_all_commands_in_anot
     bench.assert_within_limits()
 
 
+@pytest.mark.realtime
 def test_while_it_moves_the_policy_is_asked_again_and_again(bench, make_arm):
     bench.arm = make_arm(realtime=True)
 

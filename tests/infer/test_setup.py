@@ -134,6 +134,7 @@ def test_messages_name_the_place_in_the_config(bench):
     assert str(caught.value).startswith("arm.py:12: inference.state_dim: state_dim is 7")
 
 
+@pytest.mark.realtime
 def test_a_slower_rate_is_allowed_on_a_robot(bench, make_arm):
     bench.arm = make_arm(realtime=True)
 

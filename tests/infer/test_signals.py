@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+
+pytestmark = pytest.mark.realtime
 PLUGIN = """
 import time
 from pathlib import Path

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
+from fluxvla_core.testing.ros2 import drivers, lasting_drivers, other_domain, ros_domain
 from tests.ros2.arm import Arm
 
-__all__ = ["drivers", "lasting_drivers", "operators", "ros_domain"]
+__all__ = ["drivers", "lasting_drivers", "operators", "other_domain", "ros_domain"]
 
 
 @pytest.fixture

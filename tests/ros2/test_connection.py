@@ -57,9 +57,8 @@ def test_what_is_published_arrives_with_its_receipt_time(connect):
     assert list(received.message.position) == [0.5]
 
 
-def test_domains_in_one_process_do_not_hear_each_other(connect, ros_domain):
+def test_domains_in_one_process_do_not_hear_each_other(connect, ros_domain, other_domain):
     cls = message_class("std_msgs.msg:Float64")
-    other_domain = ros_domain % 100 + 1
     sender = connect("sender")
     near, far = connect("near"), connect("far", other_domain)
     publisher = sender.publisher("/number", cls)

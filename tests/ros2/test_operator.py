@@ -71,11 +71,10 @@ def test_it_can_be_closed_and_connected_again(arm):
     assert arm.get_frame().state.shape == (3,)
 
 
-def test_the_wrong_domain_is_named(operators, robot, ros_domain):
-    other = ros_domain % 100 + 1
-    operator = operators(domain_id=other, connect_timeout_s=0.3)
+def test_the_wrong_domain_is_named(operators, robot, other_domain):
+    operator = operators(domain_id=other_domain, connect_timeout_s=0.3)
 
-    with pytest.raises(NotReady, match=f"nobody publishes anything on ROS domain {other}"):
+    with pytest.raises(NotReady, match=f"nobody publishes anything on ROS domain {other_domain}"):
         operator.connect()
 
 

@@ -32,10 +32,11 @@ from fluxvla_core.testing.ros2 import ros_domain
 __all__ = ["ros_domain"]
 
 SMALL = ["--height", "48", "--width", "64", "--camera-hz", "20"]
-# Machines that run tests are busy with others.
-PATIENT = {"height": 48, "width": 64, "connect_timeout_s": 20.0, "max_age_s": 1.0}
+# Machines that run tests stall for seconds; where silence is not what is tested, it is forgiven.
+PATIENT = {"height": 48, "width": 64, "connect_timeout_s": 30.0, "max_age_s": 20.0}
 ALOHA = {"camera_names": ("top",), **PATIENT}
 UR = {"camera_names": ("front",), **PATIENT}
+SILENT_S = 2.0
 
 
 def wait_for(condition, seconds=20.0):
@@ -102,16 +103,22 @@ def topics(ros_domain):
     connection.close()
 
 
-def drive(operator, target, seconds=2.0, hz=50.0):
-    """Go there in a straight line, as a control loop does; returns where the arm is then."""
+def drive(operator, target, arrived, steps=100, hz=50.0):
+    """Go there in a straight line, as a control loop does, and wait until the arm is there."""
     start = operator.get_state()
-    begin = time.monotonic()
-    while (share := (time.monotonic() - begin) / seconds) < 1.0:
+    for share in np.linspace(0.0, 1.0, steps):
         operator.send_action(start + share * (target - start))
         time.sleep(1.0 / hz)
-    operator.send_action(target)
-    time.sleep(0.5)
-    return operator.get_state()
+    wait_for(lambda: arrived(operator.get_state()))
+
+
+def says(operator, what=""):
+    """What ``get_state`` says is wrong if it is ``what``; None if it is not, or nothing is."""
+    try:
+        operator.get_state()
+    except Stale as error:
+        return error.what if what in error.what else None
+    return None
 
 
 class TestAloha:
@@ -125,7 +132,7 @@ class TestAloha:
 
         target = HOME.copy()
         target[[0, 6, 13]] = 0.4, 0.8, 0.9
-        np.testing.assert_allclose(drive(operator, target), target, atol=0.06)
+        drive(operator, target, lambda state: np.allclose(state, target, atol=0.06))
         facts = topics.facts()
         assert facts["steps"] > 50
         assert (facts["transfer_cube"], facts["lift_hold"]) == (False, False)
@@ -134,28 +141,27 @@ class TestAloha:
         wait_for(lambda: np.allclose(operator.get_state(), HOME, atol=0.02))
         wait_for(lambda: topics.facts()["steps"] == 0)
 
+    def test_a_stream_that_is_made_ill_is_named_and_may_get_well(self, simulate, connect, topics):
+        simulate("aloha", "--ros2", "--cameras", "top")
+        operator = connect(AlohaOperator, **{**ALOHA, "max_age_s": SILENT_S})
         topics.tell("/sim/fault", "top=drop")
-        wait_for(lambda: time.monotonic() - operator.newest("top").receipt > 1.1)
-        with pytest.raises(Stale, match=r"top \(/camera_f/color/image_raw\) is silent"):
-            operator.get_state()
+        wait_for(lambda: says(operator, r"top (/camera_f/color/image_raw) is silent for"))
         topics.tell("/sim/fault", "top=well")
-        wait_for(lambda: time.monotonic() - operator.newest("top").receipt < 0.1)
-        operator.get_frame()
+        wait_for(lambda: says(operator) is None)
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_a_signal_ends_it_in_order(self, simulate, number):
         process = simulate("aloha", "--ros2", "--cameras", "top")
         assert "simulating aloha" in process.stdout.readline()
-        time.sleep(0.5)
         process.send_signal(number)
-        output, errors = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=60)
 
         assert process.returncode == 0, errors
         assert "periods" in output
 
     def test_it_ends_by_itself(self, simulate):
         process = simulate("aloha", "--ros2", "--cameras", "top", "--seconds", "1")
-        output, errors = process.communicate(timeout=30)
+        output, errors = process.communicate(timeout=60)
 
         assert process.returncode == 0, errors
         assert int(output.rpartition('"')[0].partition(" periods")[0].rpartition('"')[2]) <= 51
@@ -187,13 +193,13 @@ class Waist:
         return chunk
 
 
-def runner(tmp_path, second_time=lambda: None, **arguments):
-    operator = AlohaOperator(rate_window_s=0.0, **ALOHA)
+def runner(tmp_path, second_time=lambda: None, max_age_s=PATIENT["max_age_s"], **arguments):
+    operator = AlohaOperator(rate_window_s=0.0, **{**ALOHA, "max_age_s": max_age_s})
     return AlohaInferenceRunner(
         policy=Waist(operator.embodiment, second_time),
         operator=operator,
         task_descriptions={"1": "turn"},
-        safety={"max_age_s": 2.0},
+        safety={"max_age_s": 2 * max_age_s, "max_skew_s": max_age_s, "starvation_s": 20.0},
         context=RunContext(work_dir=tmp_path, task="1", section="inference"),
         record_fps=None,
         **arguments,
@@ -215,9 +221,10 @@ def test_a_policy_drives_the_robot_through_the_loop(simulate, tmp_path, async_ex
 @pytest.mark.parametrize("stream", ["top", "left arm"])
 def test_a_stream_that_dies_stops_the_arm_and_is_named(simulate, topics, tmp_path, stream):
     simulate("aloha", "--ros2", "--cameras", "top")
-    run = runner(tmp_path, lambda: topics.tell("/sim/fault", f"{stream}=drop"))
+    fault = f"{stream}=drop"
+    run = runner(tmp_path, lambda: topics.tell("/sim/fault", fault), max_age_s=SILENT_S)
     run.run_setup()
-    with pytest.raises(Stale, match=rf"{stream} \(.*\) is silent for 1\.0"):
+    with pytest.raises(Stale, match=rf"{stream} \(.*\) is silent for \d"):
         run.run()
 
     trip = run.latch.tripped
@@ -236,9 +243,8 @@ class TestUR5e:
 
         target = UR_HOME.copy()
         target[[0, 6]] = target[0] + 0.3, 0.5
-        reached = drive(operator, target)
-        np.testing.assert_allclose(reached[:6], target[:6], atol=0.04)
-        assert abs(reached[6] - 0.5) < 0.15
+        allowed = np.array([0.04] * 6 + [0.15])
+        drive(operator, target, lambda state: (abs(state - target) < allowed).all())
         assert topics.facts()["lifted"] is False
 
 

@@ -17,9 +17,7 @@ import pytest
 from fluxvla_core.errors import LoadFailed
 from fluxvla_core.ros2.require import require_rclpy
 from fluxvla_core.testing.ros2_driver import Driver
-
-# Domains up to 101 keep clear of the ports that Linux hands out to others.
-_DOMAINS = 100
+from fluxvla_core.testing.ros_domains import claimed_domain
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +27,21 @@ def ros_domain() -> Iterator[int]:
         require_rclpy()
     except LoadFailed as error:
         pytest.skip(f"{error.what}; {error.next}")
-    domain = 1 + os.getpid() % _DOMAINS
     profile = resources.files("fluxvla_core.testing") / "fastdds_quick_discovery.xml"
-    with pytest.MonkeyPatch.context() as environment:
+    with claimed_domain() as domain, pytest.MonkeyPatch.context() as environment:
         environment.setenv("ROS_DOMAIN_ID", str(domain))
         environment.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         if os.environ.get("ROS_DISTRO") == "humble":
             # What Humble has in its place; later ones let it override transports in profiles.
             environment.setenv("ROS_LOCALHOST_ONLY", "1")
         environment.setenv("FASTDDS_DEFAULT_PROFILES_FILE", str(profile))
+        yield domain
+
+
+@pytest.fixture
+def other_domain(ros_domain: int) -> Iterator[int]:
+    """One more domain of one's own, on which nobody is."""
+    with claimed_domain() as domain:
         yield domain
 
 

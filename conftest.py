@@ -20,21 +20,19 @@ if threading.current_thread() is threading.main_thread():
 
 import pytest  # noqa: E402
 
-PREFIX = "fluxvla_plugin_"
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What opens a ROS network waits for other processes, and needs the machine to itself."""
+    for item in items:
+        if "ros_domain" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.realtime)
 
 
 @pytest.fixture(autouse=True)
 def _forget_plugin_files() -> Iterator[None]:
     """What a test loaded with ``--plugin FILE`` is not there for the next one."""
     yield
-    files = [name for name in sys.modules if name.startswith(PREFIX)]
-    if not files:
-        return
-    from fluxvla_core.plugins.registry import BY_NAME
-
-    for name in files:
-        del sys.modules[name]
-    for registry in BY_NAME.values():
-        for key in list(registry):
-            if getattr(registry.registered(key), "__module__", "").startswith(PREFIX):
-                registry.unregister(key)
+    files = sys.modules.get("fluxvla_core.plugins.files")
+    if files is not None:
+        files.forget_plugin_files()

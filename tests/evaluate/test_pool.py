@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import sys
-import types
 
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluate.pool import WorkerPool, run_jobs
+from fluxvla_core.plugins.files import load_plugin_files
 from tests.evaluate import workers
 
 
@@ -140,10 +139,8 @@ def test_workers_below_one_are_refused():
         next(run_jobs(workers.square, [1], 0))
 
 
-def test_plugin_files_of_the_parent_are_loaded_in_the_workers(tmp_path, monkeypatch):
+def test_plugin_files_of_the_parent_are_loaded_in_the_workers(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text("VALUE = 40\n")
-    module = types.ModuleType("fluxvla_plugin_mine")
-    module.__file__ = str(file)
-    monkeypatch.setitem(sys.modules, "fluxvla_plugin_mine", module)
+    load_plugin_files([file])
     assert [o.result for o in outcomes(workers.uses_plugin_file, [2])] == [42]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from fluxvla_libero.embodiment import libero_spec
 from fluxvla_libero.require import is_installed
 
-from fluxvla_core.cli.plugin_file import load_plugin_files
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core.plugins.files import load_plugin_files
 from fluxvla_core.spec.embodiment import Camera
 
 MODEL = '''
@@ -57,9 +55,6 @@ def drifting(tmp_path):
     file = tmp_path / "drifting.py"
     file.write_text(MODEL)
     load_plugin_files([str(file)])
-    yield
-    VLAS.unregister("DriftingVLA")
-    del sys.modules["fluxvla_plugin_drifting"]
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -11,9 +10,8 @@ from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.eval_runner import AlohaSimEvalRunner
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.cli.plugin_file import load_plugin_files
 from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core.plugins.files import load_plugin_files
 from fluxvla_core.spec.embodiment import Camera
 
 safetensors = pytest.importorskip("safetensors.torch")
@@ -44,9 +42,6 @@ def trembling(tmp_path):
     file = tmp_path / "trembling.py"
     file.write_text(MODEL)
     load_plugin_files([str(file)])
-    yield
-    VLAS.unregister("TremblingVLA")
-    del sys.modules["fluxvla_plugin_trembling"]
 
 
 def save(work_dir, camera="top"):

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
-from fluxvla_core.cli.plugin_file import load_plugin_files
 from fluxvla_core.config import Config, apply_overrides, check_config, keys, load_config
 from fluxvla_core.config.check import Use
+from fluxvla_core.plugins.files import load_plugin_files
 
 
 class Show:

@@ -29,6 +29,7 @@ SLOTS: Mapping[str, str] = {
     "transforms": "transforms",
     "collator": "collators",
     "metric": "metrics",
+    "optimizer": "optimizers",
     "operator": "operators",
     "vision_backbone": "vision_backbones",
     "llm_backbone": "llm_backbones",
@@ -38,6 +39,8 @@ SLOTS: Mapping[str, str] = {
     "tokenizer": "tokenizers",
     "action_filters": "action_filters",
     "hooks": "hooks",
+    "environment": "environments",
+    "policy": "policies",
 }
 """Key -> the registry that a table under it is built from."""
 

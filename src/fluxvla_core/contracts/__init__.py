@@ -1,5 +1,7 @@
 """The contracts between the core and its plugins."""
 
+from fluxvla_core.contracts.continuation import Continuation
+from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
 from fluxvla_core.contracts.protocols import (
     API,
@@ -18,9 +20,13 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 __all__ = [
     "API",
     "STATE",
+    "Actor",
     "Clock",
     "Command",
+    "Continuation",
     "Dataset",
+    "Environment",
+    "EnvironmentSpec",
     "Frame",
     "Observation",
     "Operator",
@@ -30,6 +36,8 @@ __all__ = [
     "Runner",
     "Sample",
     "SilentReporter",
+    "Step",
+    "TaskSpec",
     "TrainRunner",
     "Transform",
 ]

@@ -22,7 +22,10 @@ _METHODS: Mapping[str, Mapping[str, int]] = {
     "runners": {"run": 0, "run_setup": 0},
     "transforms": {"__call__": 1},
     "collators": {"__call__": 1},
+    "optimizers": {"build": 2},
     "datasets": {},
+    "environments": {"reset": 2, "step": 1, "observe": 1, "close": 0},
+    "policies": {"reset": 1, "predict_action": 1},
     "commands": {"add_arguments": 1, "run": 1},
 }
 _FULL_OPERATOR = {"connect": 0, "get_frame": 0, "send_action": 1, "stop": 0, "close": 0}

@@ -11,7 +11,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import time
 import traceback
 from collections import deque
@@ -22,6 +21,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
+from fluxvla_core.plugins.files import load_plugin_files, plugin_files
 
 Work = Callable[[Any], Any]
 Factory = Callable[[], Work]
@@ -73,7 +73,7 @@ class _Worker:
     def __init__(self, factory: Factory) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        arguments = (theirs, factory, _plugin_files())
+        arguments = (theirs, factory, plugin_files())
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
         with _environment(ONE_THREAD):
             self.process.start()
@@ -281,20 +281,13 @@ def _environment(extra: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _plugin_files() -> list[tuple[str, str]]:
-    """Files given as ``--plugin``: what they registered must be there in the workers too."""
-    found = [(n, m) for n, m in sys.modules.items() if n.startswith("fluxvla_plugin_")]
-    return [(name, str(module.__file__)) for name, module in found if module.__file__]
-
-
-def _serve(connection: Connection, factory: Factory, plugins: list[tuple[str, str]]) -> None:
+def _serve(connection: Connection, factory: Factory, plugins: tuple[str, ...]) -> None:
     """A worker process's life: build the worker, answer jobs until the pipe closes."""
     # Ctrl-C reaches the whole group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
         try:
-            for name, file in plugins:
-                _load(name, file)
+            load_plugin_files(plugins)
             work = factory()
         except FluxError as error:
             connection.send(("refused", error))
@@ -316,14 +309,3 @@ def _answer(work: Work, job: Any) -> tuple[str, Any]:
         return "raised", str(error)
     except Exception:  # noqa: BLE001 - an episode's crash is counted, not raised
         return "raised", traceback.format_exc()
-
-
-def _load(name: str, file: str) -> None:
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise RunFailed(f"{file} cannot be loaded in a worker process")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)

@@ -19,8 +19,11 @@ REGISTRIES = (
     "tokenizers",
     "processors",
     "metrics",
+    "optimizers",
     "action_filters",
     "hooks",
+    "environments",
+    "policies",
     "commands",
 )
 

@@ -1,4 +1,7 @@
-"""``--plugin FILE``: a Python file whose classes register themselves in this process."""
+"""``--plugin FILE``: Python files whose classes register themselves in this process.
+
+A worker process is a new interpreter: it loads what :func:`plugin_files` names in its parent.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fluxvla_core.errors import FluxError, LoadFailed, UsageError
+from fluxvla_core.plugins.registry import BY_NAME
+
+_loaded: dict[str, Path] = {}  # module -> its file
 
 
-def load_plugin_files(files: Iterable[str]) -> None:
+def load_plugin_files(files: Iterable[str | Path]) -> None:
     """Execute each file as a module of its own.
 
     Raises:
@@ -20,6 +26,22 @@ def load_plugin_files(files: Iterable[str]) -> None:
     """
     for name in files:
         _load(Path(name))
+
+
+def plugin_files() -> tuple[str, ...]:
+    """Absolute paths of the files that this process loaded, in their order."""
+    return tuple(str(path.resolve()) for path in _loaded.values())
+
+
+def forget_plugin_files() -> None:
+    """Unregister what the files registered; for tests."""
+    for registry in BY_NAME.values():
+        for key in list(registry):
+            if getattr(registry.registered(key), "__module__", "") in _loaded:
+                registry.unregister(key)
+    for module in _loaded:
+        sys.modules.pop(module, None)
+    _loaded.clear()
 
 
 def _load(path: Path) -> None:
@@ -36,7 +58,6 @@ def _load(path: Path) -> None:
     try:
         spec.loader.exec_module(loaded)
     except BaseException as error:
-        # Worker processes load every such module again; one that failed must not be among them.
         del sys.modules[module]
         if isinstance(error, FluxError) or not isinstance(error, (Exception, SystemExit)):
             raise
@@ -47,3 +68,4 @@ def _load(path: Path) -> None:
             f"--plugin {path}: raised {type(error).__name__}: {error}",
             where=f"{path}:{line}" if line else str(path),
         ) from error
+    _loaded[module] = path

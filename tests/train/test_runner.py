@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -97,7 +98,7 @@ def test_a_run_ends_with_a_checkpoint_that_is_enough_by_itself(tmp_path):
     assert found.embodiment() == TinyDataset.embodiment
     assert found.statistics() == TinyDataset.statistics
     assert found.config()["model"] == {"type": "TinyVLA"}
-    assert found.json("environment.json")["packages"]["torch"] == torch.__version__
+    assert found.json("environment.json")["packages"]["torch"] == version("torch")
     assert not list(tmp_path.rglob("*.pt"))
     assert said.artifacts == [("checkpoint", "step-000000006")]
 

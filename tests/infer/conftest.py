@@ -184,8 +184,10 @@ class Bench:
         return json.loads((self.work_dir / "inference" / name / "episode.json").read_text())
 
     def trace(self, name: str = "001-1") -> list[dict[str, Any]]:
+        """What happened, without the events that say what it was made of."""
         lines = (self.work_dir / "inference" / name / "trace.jsonl").read_text().splitlines()
-        return [json.loads(line) for line in lines]
+        frame = ("start", "observation", "end")
+        return [row for row in map(json.loads, lines) if row["event"] not in frame]
 
     def assert_within_limits(self, start: tuple[float, ...] = HOME) -> None:
         """Whatever was sent kept every limit, from positions alone."""

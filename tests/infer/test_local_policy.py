@@ -321,6 +321,6 @@ def test_the_runner_loads_the_work_dirs_checkpoint(bench, make_arm):
     assert result["outcome"] == "max_steps"
     summary = bench.episode()
     assert set(summary["timings"]) == {
-        "receipt", "observe", "policy", "preprocess", "inference", "postprocess", "late", "send",
+        "receipt", "sync", "policy", "preprocess", "inference", "postprocess", "late", "send",
     }  # fmt: skip
     assert any("step-000000100" in line for line in bench.notes.lines)

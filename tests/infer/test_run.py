@@ -104,9 +104,9 @@ def test_an_episode_is_recorded_line_by_line(bench):
     assert len(chunks) == summary["chunks"] == len(bench.policy.asked)
     assert set(chunks[0]["ms"]) == {"policy"}
     assert commands[0].keys() == {
-        "event", "t", "phase", "wanted", "command", "state", "clamps", "late_ms", "send_ms",
+        "event", "t", "phase", "wanted", "command", "state", "clamps", "ms",
     }  # fmt: skip
-    assert set(summary["timings"]) == {"receipt", "observe", "policy", "late", "send"}
+    assert set(summary["timings"]) == {"receipt", "sync", "policy", "late", "send"}
     assert summary["timings"]["send"].keys() == {"count", "p50_ms", "p95_ms", "p99_ms", "max_ms"}
     assert summary["joints"] == ["shoulder", "elbow", "jaw"]
     assert (summary["seed"], summary["trips"], summary["problem"]) == (7, [], None)

@@ -22,7 +22,7 @@ def test_lines_come_in_order_with_arrays_as_lists(tmp_path):
     assert [json.loads(line)["command"] for line in lines] == [[0.5, 0], [0.5, 1], [0.5, 2]]
     assert json.loads((tmp_path / "e" / "episode.json").read_text()) == {
         "outcome": "done",
-        "dropped_frames": 0,
+        "dropped": {"frames": 0, "pictures": 0, "events": 0},
     }
     assert sorted(p.name for p in (tmp_path / "e").iterdir()) == ["episode.json", "trace.jsonl"]
 
@@ -50,7 +50,7 @@ def test_without_a_rate_there_are_no_videos(tmp_path):
 
 def test_frames_that_come_too_fast_are_dropped_and_counted(tmp_path, monkeypatch):
     pytest.importorskip("av")
-    monkeypatch.setattr("fluxvla_core.record.trace._WAITING_FRAMES", 2)
+    monkeypatch.setattr("fluxvla_core.record.trace._WAITING_BYTES", 2 * 240 * 320 * 3)
     trace = EpisodeTrace(tmp_path, 10)
     for _ in range(200):
         trace.frames({"front": np.zeros((240, 320, 3), np.uint8)})
@@ -58,7 +58,7 @@ def test_frames_that_come_too_fast_are_dropped_and_counted(tmp_path, monkeypatch
     trace.close({})
 
     summary = json.loads((tmp_path / "episode.json").read_text())
-    assert summary["dropped_frames"] > 0
+    assert summary["dropped"]["frames"] > 0
     assert (tmp_path / "trace.jsonl").read_text() == '{"step": 1}\n'
 
 

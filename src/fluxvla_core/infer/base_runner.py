@@ -14,9 +14,13 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.build import RunContext, build_action_filter_from_cfg, build_operator_from_cfg
+from fluxvla_core.build import (
+    RunContext,
+    build_action_filter_from_cfg,
+    build_operator_from_cfg,
+    build_policy_from_cfg,
+)
 from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.contracts.protocols import Policy
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.joining import LatestOnly, Synchronous
 from fluxvla_core.control.worker import Worker
@@ -26,6 +30,7 @@ from fluxvla_core.infer.episode import Episode
 from fluxvla_core.infer.plan import Plan
 from fluxvla_core.infer.robot import Robot
 from fluxvla_core.infer.tasks import Task, check_descriptions, resolve_task, tasks
+from fluxvla_core.record.ros_messages import typestore
 from fluxvla_core.record.trace import next_folder
 from fluxvla_core.safety.ramp import check_pose
 from fluxvla_core.safety.settings import SafetySettings
@@ -45,7 +50,7 @@ class BaseInferenceRunner:
         seed: of the policy's noise; episode ``n`` uses ``seed + n``.
         ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
-        policy: an object of the Policy contract instead of a checkpoint.
+        policy: table or object of the Policy contract, instead of a checkpoint.
         task_descriptions: id -> instruction; what ``--task ID`` may name.
         state_dim: checked against the robot's state, if given.
         action_chunk: how many of a chunk's actions may be used; all by default.
@@ -62,7 +67,11 @@ class BaseInferenceRunner:
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
         device: of torch.
-        record_fps: frames a second of the recorded videos; None records none.
+        record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
+            and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
+            work dir.
+        record_fps: frames a second of the recorded videos, and of a simulation's recorded
+            pictures; None records none.
         ready_timeout: seconds that the robot may take to give its first reading.
 
     Raises:
@@ -79,7 +88,7 @@ class BaseInferenceRunner:
         ckpt_path: str | None = None,
         dataset: Any = None,
         denormalize_action: Any = None,
-        policy: Policy | None = None,
+        policy: Any = None,
         task_descriptions: Mapping[str, str] | None = None,
         state_dim: int | None = None,
         action_chunk: int | None = None,
@@ -95,6 +104,7 @@ class BaseInferenceRunner:
         safety: Mapping[str, Any] | None = None,
         mixed_precision_dtype: str = "float32",
         device: str = "cpu",
+        record: str | None = None,
         record_fps: float | None = 10.0,
         ready_timeout: float = 10.0,
     ) -> None:
@@ -104,7 +114,7 @@ class BaseInferenceRunner:
         self.ckpt_path = ckpt_path
         self.dataset = dataset
         self.denormalize_action = denormalize_action
-        self.policy = policy
+        self.policy: Any = build_policy_from_cfg(policy, context)
         self.task_descriptions = check_descriptions(task_descriptions)
         self.action_chunk = action_chunk
         self.execute_horizon = execute_horizon
@@ -114,6 +124,7 @@ class BaseInferenceRunner:
         self.async_execution = async_execution
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
+        self.record = record
         self.record_fps = record_fps
         self.ready_timeout = ready_timeout
         self.safety = SafetySettings.of(safety)
@@ -161,6 +172,8 @@ class BaseInferenceRunner:
             SpecMismatch: the policy is for another robot, or for other views.
             ConfigError, UsageError: a pose, a camera or the task does not fit.
         """
+        if self.record is not None:
+            typestore()  # before anything moves: what recording needs is installed
         if self.context.task is not None:
             resolve_task(self.context.task, self.task_descriptions)
         if self.policy is None:
@@ -258,7 +271,8 @@ class BaseInferenceRunner:
         assert self.policy is not None, "run_setup() comes before run()"
         hooks, worker = self._work
         reporter = self.context.reporter
-        folder = next_folder(Path(self.context.work_dir) / FOLDER, task.name)
+        root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
+        folder = next_folder(root, task.name)
         reporter.info(f"task: {task.instruction}")
         # While it moves and thinks, a chunk is left when the next is there, not before.
         horizon = None if self.async_execution else self.execute_horizon
@@ -280,6 +294,7 @@ class BaseInferenceRunner:
             look=self._look,
             execute=self._execute_actions,
             video_fps=self.record_fps,
+            record=self.record is not None,
             ready_s=self.ready_timeout,
             interrupts=self._interrupts,
             worker=worker,

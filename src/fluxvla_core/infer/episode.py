@@ -24,7 +24,6 @@ from fluxvla_core.errors import FluxError, NotReady, OperatorError, RunFailed
 from fluxvla_core.infer.episode_record import EpisodeRecord
 from fluxvla_core.infer.plan import Answer, Plan, PolicyFailed
 from fluxvla_core.infer.tasks import Task
-from fluxvla_core.record.trace import EpisodeTrace
 from fluxvla_core.safety.gates import FreshnessGate, check_frame
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
@@ -72,8 +71,7 @@ class Episode:
         self._columns = action_columns(embodiment)
         self._phase = "start"
         self._executing = False
-        trace = EpisodeTrace(folder, plan.video_fps)
-        self._record = EpisodeRecord(plan, trace, self._rate)
+        self._record = EpisodeRecord(plan, task, self._seed, folder, self._rate)
 
     def run(self) -> dict[str, Any]:
         """The whole episode.
@@ -111,7 +109,9 @@ class Episode:
         plan = self._plan
         plan.robot.begin(self._task.instruction, self._number)
         window, frame = self._first_reading()
-        self._limiter.start(self._checked(window, frame)[self._columns])
+        state = self._checked(window, frame)
+        self._record.seen(state, window["images"], frame, {})
+        self._limiter.start(state[self._columns])
         pose = self._limiter.last
         for each in plan.filters:
             reset = getattr(each, "reset", None)
@@ -187,6 +187,7 @@ class Episode:
         plan, clock = self._plan, self._plan.robot.clock
         began = time.perf_counter()
         window, frame = plan.look()
+        seconds = {"sync": time.perf_counter() - began}
         try:
             _check_complete(window, plan.cameras)
         except NotReady as error:
@@ -195,11 +196,11 @@ class Episode:
         now, age = clock.now(), 0.0
         if frame is not None:
             age = max(self._gate.check(frame.stamps, plan.cameras, now), 0.0)
-            self._record.timings.add("receipt", age)
-        self._tracking.check(last, state, now)
-        self._record.seen(state, window["images"])
+            seconds = {"receipt": age, **seconds}
+        if plan.robot.follows:
+            self._tracking.check(last, state, now)
+        self._record.seen(state, window["images"], frame, seconds)
         observation = {**window, "task_description": self._task.instruction}
-        self._record.timings.add("observe", time.perf_counter() - began)
         return Seen(observation, now - age)
 
     def _think(self, seen: Seen) -> Answer:
@@ -249,7 +250,7 @@ class Episode:
         if self._phase not in ("ramp", "run"):
             return
         plan.interrupts.check()
-        if state is not None and sent is not None:
+        if state is not None and sent is not None and plan.robot.follows:
             self._tracking.check(sent.command, state, plan.robot.clock.now())
         if self._phase != "run" or sent is None:
             return
@@ -300,7 +301,7 @@ class Episode:
             plan.context.reporter.warn(f"task_success failed: {_what(error)}")
             success = None
         try:
-            summary = self._record.close(self._task, self._seed, outcome, success, problem)
+            summary = self._record.close(outcome, success, problem)
         except RunFailed as error:
             if problem is None:
                 raise

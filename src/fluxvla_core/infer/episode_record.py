@@ -2,125 +2,160 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.control.path import Sent
 from fluxvla_core.control.rate import Rate
 from fluxvla_core.infer.plan import Plan
 from fluxvla_core.infer.tasks import Task
-from fluxvla_core.record.timings import Timings
-from fluxvla_core.record.trace import EpisodeTrace
-from fluxvla_core.safety.limits import count_clamps
+from fluxvla_core.record import tally
+from fluxvla_core.record.trace import EpisodeTrace, Recording
 
 Array = npt.NDArray[np.float64]
 
 
 class EpisodeRecord:
-    """Lines of the trace, frames of the videos, counts and timings.
+    """Events, pictures and videos of an episode, and what they add up to.
 
     Args:
         plan: of the episode.
-        trace: open; ``close`` finishes it.
+        task, seed: of the episode.
+        folder: where the record goes; ``close`` finishes it.
         rate: of the episode's commands.
+
+    Raises:
+        RunFailed: the folder cannot be written to.
     """
 
-    def __init__(self, plan: Plan, trace: EpisodeTrace, rate: Rate) -> None:
+    def __init__(self, plan: Plan, task: Task, seed: int, folder: Path, rate: Rate) -> None:
         self._plan = plan
-        self._trace = trace
         self._rate = rate
         self._trips = len(plan.latch.trips)
+        self._tally = tally.Tally()
         self._beats = 0
-        self._clamps: dict[str, dict[str, int]] = {}
         self._images: dict[str, Any] = {}
         self._state: Array | None = None
-        self.timings = Timings()
-        self.chunks = 0
         self.steps = 0
-
-    def seen(self, state: Array, images: dict[str, Any]) -> None:
-        """The newest observation: what lines and videos show where nothing newer is known."""
-        self._state, self._images = state, dict(images)
-
-    def chunk(self, keyframes: Array, observed: float, seconds: dict[str, float]) -> None:
-        """A chunk was admitted; ``seconds`` by stage."""
-        self.chunks += 1
-        for stage, value in seconds.items():
-            self.timings.add(stage, value)
+        spec = plan.robot.embodiment
+        source = getattr(plan.robot.operator, "pictures_after", None)
+        names = {"state": spec.state_names, "action": spec.joint_names}
+        recording = Recording(names, spec.camera_names, source) if plan.record else None
+        self._trace = EpisodeTrace(folder, plan.video_fps, recording)
         self.event(
-            "chunk",
+            tally.START,
+            format=tally.FORMAT,
+            task=task.name,
+            instruction=task.instruction,
+            seed=seed,
+            robot=plan.robot.name,
+            embodiment=spec.to_dict(),
+            rate_hz=plan.rate_hz,
+            action_rate_hz=plan.policy.action_rate_hz,
+            horizon=plan.policy.horizon,
+            lockstep=plan.robot.lockstep,
+            native=source is not None,
+            began=time.time(),
+        )
+
+    def seen(
+        self,
+        state: Array,
+        images: Mapping[str, Any],
+        frame: Frame | None,
+        seconds: Mapping[str, float],
+    ) -> None:
+        """A reading that was looked at.
+
+        Args:
+            state: ``(state_dim,)``.
+            images: camera -> picture, those of the policy.
+            frame: what they are of, where the operator has frames.
+            seconds: by stage.
+        """
+        now = self._plan.robot.clock.now()
+        self._state, self._images = state, dict(images)
+        pictures = images if frame is None else frame.images
+        stamps = dict(frame.stamps) if frame is not None else dict.fromkeys((STATE, *images), now)
+        for camera, image in pictures.items():
+            self._trace.picture(camera, stamps.get(camera, now), image)
+        self.event(tally.OBSERVATION, state=state, stamps=stamps, ms=_milliseconds(seconds))
+
+    def chunk(self, keyframes: Array, observed: float, seconds: Mapping[str, float]) -> None:
+        """A chunk was admitted; ``seconds`` by stage."""
+        self.event(
+            tally.CHUNK,
             observed=observed,
+            rate_hz=self._plan.policy.action_rate_hz,
             keyframes=keyframes,
-            ms={stage: round(value * 1e3, 3) for stage, value in seconds.items()},
+            ms=_milliseconds(seconds),
         )
 
     def command(self, sent: Sent, phase: str, state: Array | None) -> None:
         """A command was sent in ``phase``; ``state`` if it was read at this beat."""
         self._beats += 1
-        sent_s, late_s = self._plan.robot.sent_s, self._rate.late_s
-        self.timings.add("late", late_s)
-        if sent_s is not None:
-            self.timings.add("send", sent_s)
-        for joint, reasons in count_clamps([sent.clamps]).items():
-            counts = self._clamps.setdefault(joint, {})
-            for reason, count in reasons.items():
-                counts[reason] = counts.get(reason, 0) + count
+        seconds = {"send": self._plan.robot.sent_s, "late": self._rate.late_s}
         self.event(
-            "command",
+            tally.COMMAND,
             phase=phase,
             wanted=sent.target,
             command=sent.command,
-            state=self._state if state is None else state,
+            state=state,
             clamps=[asdict(clamp) for clamp in sent.clamps],
-            late_ms=round(late_s * 1e3, 3),
-            send_ms=None if sent_s is None else round(sent_s * 1e3, 3),
+            ms=_milliseconds({k: v for k, v in seconds.items() if v is not None}),
         )
         self._film()
 
     def event(self, kind: str, **fields: Any) -> None:
-        """One line of the trace, stamped on the operator's clock."""
-        self._trace.write({"event": kind, "t": self._plan.robot.clock.now(), **fields})
+        """One event, stamped on the operator's clock."""
+        event = {"event": kind, "t": self._plan.robot.clock.now(), **fields}
+        self._tally.add(event)
+        self._trace.write(event)
 
-    def close(
-        self, task: Task, seed: int, outcome: str, success: bool | None, problem: str | None
-    ) -> dict[str, Any]:
-        """Finish the files; the summary that ``episode.json`` holds.
+    def close(self, outcome: str, success: bool | None, problem: str | None) -> dict[str, Any]:
+        """Finish the files, and say what was not recorded; what ``episode.json`` holds.
 
         Raises:
             RunFailed: something could not be written.
         """
-        robot = self._plan.robot
-        summary: dict[str, Any] = {
-            "format": "fluxvla-episode-1",
-            "task": task.name,
-            "instruction": task.instruction,
-            "outcome": outcome,
-            "success": success,
-            "problem": problem,
-            "steps": self.steps,
-            "chunks": self.chunks,
-            "seed": seed,
-            "robot": robot.name,
-            "embodiment": robot.embodiment.name,
-            "joints": list(robot.embodiment.joint_names),
-            "rate_hz": self._plan.rate_hz,
-            "skipped_beats": self._rate.skipped,
-            "clamps": self._clamps,
-            "trips": [asdict(trip) for trip in self._plan.latch.trips[self._trips :]],
-            "timings": self.timings.summary(),
-        }
-        self._trace.close(summary)
+        trips = [asdict(trip) for trip in self._plan.latch.trips[self._trips :]]
+        self.event(
+            tally.END,
+            outcome=outcome,
+            success=success,
+            problem=problem,
+            skipped_beats=self._rate.skipped,
+            trips=trips,
+        )
+        summary = self._trace.close(self._tally.summary())
+        lost = [f"{count} {what}" for what, count in self._trace.dropped.items() if count]
+        if lost:
+            self._plan.context.reporter.warn(
+                f"{' and '.join(lost)} were not recorded: the disk or the processor did not keep up"
+            )
         return summary
 
     def _film(self) -> None:
         """A frame for each video: fresh from a simulation, else the last one that was seen."""
-        fps, robot = self._plan.video_fps, self._plan.robot
-        if fps is None or self._beats % max(1, round(self._plan.rate_hz / fps)):
+        plan, robot = self._plan, self._plan.robot
+        if plan.video_fps is None or self._beats % max(1, round(plan.rate_hz / plan.video_fps)):
             return
         images = self._images
         if robot.lockstep and robot.complete:
-            images = robot.operator.get_frame().images
-        self._trace.frames({name: images[name] for name in self._plan.cameras if name in images})
+            frame = robot.operator.get_frame()
+            images = frame.images
+            for camera, image in images.items():
+                self._trace.picture(camera, frame.stamps[camera], image)
+        shown = plan.cameras or images
+        self._trace.frames({name: images[name] for name in shown if name in images})
+
+
+def _milliseconds(seconds: Mapping[str, float]) -> dict[str, float]:
+    return {stage: round(value * 1e3, 3) for stage, value in seconds.items()}

@@ -54,6 +54,7 @@ class Plan:
         look: makes an observation and, if it can, the frame that it is made of.
         execute: sends commands: ``(N, D)`` and the rate.
         video_fps: of the recorded videos; None records none.
+        record: whether everything is recorded, pictures too.
         ready_s: how long the robot may take to give its first reading.
         interrupts, worker, hooks, context: of the run.
     """
@@ -74,6 +75,7 @@ class Plan:
     look: Callable[[], tuple[dict[str, Any], Frame | None]]
     execute: Execute
     video_fps: float | None
+    record: bool
     ready_s: float
     interrupts: Interrupts
     worker: Worker

@@ -53,6 +53,8 @@ class Robot:
         if not sends:
             self._require("send_action()", lacks, "no command could be sent to it")
         self.sent_s: float | None = None
+        # A recorded robot goes its own way; that it does is no fault of its.
+        self.follows = bool(getattr(operator, "follows_commands", True))
         self.clock = clock_of(operator)
         self.lockstep = in_lockstep(self.clock)
 

@@ -1,0 +1,259 @@
+"""A recorded episode, read back: its events, and the pictures of a bag.
+
+An episode that was not recorded with ``record`` has events and no pictures: its policy can be
+replayed, its robot cannot. What a process left that was killed is read as far as it goes.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import STATE
+from fluxvla_core.errors import DataError
+from fluxvla_core.record import ros_messages as ros
+from fluxvla_core.record import tally
+from fluxvla_core.record.logs import LINES
+from fluxvla_core.record.mcap import Entry, McapFile
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+Event = dict[str, Any]
+# Times are rounded to nanoseconds on their way into a file.
+_ROUNDING_S = 1e-6
+
+
+class Pictures:
+    """One camera's pictures in the order of their times; each is read when it is asked for.
+
+    ``times`` are seconds on the loop's clock, when each arrived.
+    """
+
+    def __init__(self, file: McapFile, unpacker: ros.Unpacker) -> None:
+        self.times: list[float] = []
+        self._places: list[tuple[int, int, int]] = []
+        self._file = file
+        self._unpacker = unpacker
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def add(self, time: float, place: tuple[int, int, int]) -> None:
+        """One more; out of order is allowed."""
+        at = bisect_right(self.times, time)
+        self.times.insert(at, time)
+        self._places.insert(at, place)
+
+    def newest(self, time: float) -> int | None:
+        """Index of the newest picture that had arrived by ``time``; None before the first."""
+        index = bisect_right(self.times, time + _ROUNDING_S) - 1
+        return index if index >= 0 else None
+
+    def read(self, index: int) -> npt.NDArray[np.uint8]:
+        """``(H, W, 3)`` uint8 RGB, a fresh array."""
+        return self._unpacker.picture(self._file.read(self._places[index]))[1]
+
+
+class Recorded:
+    """One episode. ``open_recording`` makes it.
+
+    Args:
+        path: the episode's folder, or its MCAP file.
+        events: in the order in which they happened.
+        pictures: camera -> its pictures.
+        whole: whether the record was finished.
+
+    Raises:
+        DataError: the record does not say what it is of.
+    """
+
+    def __init__(
+        self, path: Path, events: Sequence[Event], pictures: Mapping[str, Pictures], whole: bool
+    ) -> None:
+        if not events or events[0].get("event") != tally.START:
+            raise DataError(
+                "the record does not say what it is of",
+                where=str(path),
+                cause="it was cut short within its first half second, or an older version wrote it",
+            )
+        self.path = path
+        self.events = events
+        self.pictures = pictures
+        self.whole = whole
+        self.start = events[0]
+        if self.start.get("format") != tally.FORMAT:
+            raise DataError(
+                f"the record has format {self.start.get('format')!r}; {tally.FORMAT!r} is read here",
+                where=str(path),
+            )
+        self.embodiment = EmbodimentSpec.from_dict(self.start["embodiment"])
+
+    @property
+    def instruction(self) -> str:
+        """What was to be done."""
+        return str(self.start["instruction"])
+
+    @property
+    def native(self) -> bool:
+        """Whether every picture that arrived was recorded, not only those that were looked at."""
+        return bool(self.start["native"])
+
+    @property
+    def success(self) -> bool | None:
+        """Whether it was done, where the robot could tell."""
+        ends = self.of(tally.END)
+        found = ends[-1].get("success") if ends else None
+        return None if found is None else bool(found)
+
+    def of(self, kind: str) -> list[Event]:
+        """The events of one kind."""
+        return [event for event in self.events if event["event"] == kind]
+
+    def commands(self, phase: str | None = None) -> tuple[Array, Array]:
+        """Times ``(N,)`` and commands ``(N, D)``, of one phase or of all."""
+        found = [e for e in self.of(tally.COMMAND) if phase in (None, e["phase"])]
+        times = np.array([e["t"] for e in found], dtype=np.float64)
+        values = np.array([e["command"] for e in found], dtype=np.float64)
+        return times, values.reshape(len(found), self.embodiment.dim)
+
+    def states(self) -> tuple[Array, Array]:
+        """Times ``(N,)`` and states ``(N, state_dim)`` of every reading."""
+        found = [e for e in self.events if e.get("state") is not None]
+        times = np.array([e["t"] for e in found], dtype=np.float64)
+        values = np.array([e["state"] for e in found], dtype=np.float64)
+        return times, values.reshape(len(found), self.embodiment.state_dim)
+
+    def chunks(self) -> list[Array]:
+        """The policy's answers, ``(T, D)`` each."""
+        return [np.array(e[ros.KEYFRAMES], dtype=np.float64) for e in self.of(tally.CHUNK)]
+
+    def summary(self) -> dict[str, Any]:
+        """As ``episode.json``, counted anew."""
+        return tally.summarise(self.events)
+
+
+def open_recording(path: str | Path) -> Recorded:
+    """Read one recorded episode.
+
+    Args:
+        path: its folder, its MCAP file, or a folder that holds it alone.
+
+    Raises:
+        DataError: there is none, there are several, or it cannot be read.
+        RunFailed: rosbags is not installed.
+    """
+    found = find_recordings(path)
+    if len(found) > 1:
+        raise DataError(
+            f"{len(found)} recorded episodes are here; name one of them: "
+            + ", ".join(p.name for p in found[:8]),
+            where=str(path),
+        )
+    return _read(found[0])
+
+
+def find_recordings(path: str | Path) -> list[Path]:
+    """The recorded episodes at ``path``: itself, or those in it, in the order of their names.
+
+    Raises:
+        DataError: there are none.
+    """
+    root = Path(path)
+    if is_recording(root):
+        return [root]
+    found = sorted(p for p in root.glob("*/") if is_recording(p)) if root.is_dir() else []
+    if not found:
+        raise DataError(
+            "there is no recorded episode here",
+            where=str(root),
+            cause=None if root.exists() else "there is no such file or folder",
+            next="fluxvla run --config … --section inference --record DIR makes one",
+        )
+    return found
+
+
+def is_recording(path: Path) -> bool:
+    """Whether there are events of an episode at ``path``."""
+    if path.is_dir():
+        return bool(bag_of(path)) or (path / LINES).is_file()
+    return path.suffix == ".mcap" and path.is_file()
+
+
+def bag_of(folder: Path) -> Path | None:
+    """The MCAP file in an episode's folder."""
+    return next(iter(sorted(folder.glob("*.mcap"))), None)
+
+
+def read_lines(path: Path) -> tuple[list[Event], bool]:
+    """The events of a ``trace.jsonl``, and whether it is whole; half a last line is left out.
+
+    Raises:
+        DataError: another line is no event.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    whole = not lines or lines[-1].endswith("\n")
+    events: list[Event] = []
+    for number, line in enumerate(lines if whole else lines[:-1], start=1):
+        try:
+            events.append(json.loads(line))
+        except ValueError as error:
+            raise DataError(f"this line is no event: {error}", where=f"{path}:{number}") from error
+    return events, whole and bool(events) and events[-1].get("event") == tally.END
+
+
+def _read(path: Path) -> Recorded:
+    bag = bag_of(path) if path.is_dir() else path
+    if bag is None:
+        events, whole = read_lines(path / LINES)
+        return Recorded(path, events, {}, whole)
+    file, unpacker = McapFile(bag), ros.Unpacker(ros.typestore())
+    events = []
+    pictures: list[Entry] = []
+    offset: int | None = None
+    for entry in file.entries():
+        if entry.kind == ros.IMAGE:
+            pictures.append(Entry(entry.topic, entry.kind, entry.ns, memoryview(b""), entry.place))
+            continue
+        event = unpacker.add(entry.topic, entry.kind, entry.ns, entry.data)
+        if event is None:
+            continue
+        events.append(event)
+        if offset is None:
+            offset = entry.ns - ros.nanoseconds(event["t"])
+    whole = file.whole
+    recorded = Recorded(path, events, {}, whole)
+    cameras = recorded.embodiment.camera_names
+    by_topic = {ros.camera_topic(camera): camera for camera in cameras}
+    found = {camera: Pictures(file, unpacker) for camera in cameras}
+    for entry in pictures:
+        camera = by_topic.get(entry.topic)
+        if camera is not None:
+            found[camera].add((entry.ns - (offset or 0)) / 1e9, entry.place)
+    return Recorded(path, events, {c: p for c, p in found.items() if len(p)}, whole)
+
+
+def age_at(event: Event, stream: str) -> float:
+    """How old, in seconds, a stream of an ``observation`` event was when it was looked at."""
+    stamp = event["stamps"].get(stream, event["stamps"].get(STATE, event["t"]))
+    return max(0.0, float(event["t"]) - float(stamp))
+
+
+def check_same_embodiment(recordings: Iterable[Recorded]) -> EmbodimentSpec:
+    """The robot that all of them are of.
+
+    Raises:
+        SpecMismatch: two of them are of different robots; names both.
+    """
+    from fluxvla_core.spec.embodiment import check_match
+
+    first, *others = recordings
+    for other in others:
+        who = (f"recording {first.path.name}", f"recording {other.path.name}")
+        check_match(first.embodiment, other.embodiment, *who)
+    return first.embodiment

@@ -1,0 +1,218 @@
+"""An event of an episode as ROS 2 messages, and back.
+
+What ROS has a type for is a message of that type, so that any ROS tool plots it: joint vectors are
+``sensor_msgs/JointState``, a policy's chunk is a ``trajectory_msgs/JointTrajectory``, pictures are
+``sensor_msgs/Image``. The rest of the event is JSON in a ``std_msgs/String``, which comes after
+those messages and completes the event. No value is written twice.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import DataError, RunFailed
+
+ROOT = "/fluxvla"
+EVENTS = f"{ROOT}/events"
+CAMERAS = f"{ROOT}/camera/"
+VECTORS: Mapping[str, str] = {
+    "state": f"{ROOT}/state",
+    "wanted": f"{ROOT}/target",
+    "command": f"{ROOT}/command",
+}
+"""Field of an event -> topic of its ``JointState``."""
+CHUNKS = f"{ROOT}/chunk"
+KEYFRAMES = "keyframes"
+
+STRING = "std_msgs/msg/String"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+IMAGE = "sensor_msgs/msg/Image"
+
+_FIELDS = {topic: field for field, topic in VECTORS.items()}
+
+
+def typestore() -> Any:
+    """rosbags' message types.
+
+    Raises:
+        RunFailed: rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise RunFailed(
+            "a recording is an MCAP file, and the package 'rosbags' is not installed",
+            next="pip install 'fluxvla-core[record]'",
+        ) from error
+    # The oldest release that is in use: these types are the same in all that came after.
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def camera_topic(camera: str) -> str:
+    """The topic of a camera's pictures; ``frame_id`` has the camera's true name."""
+    return CAMERAS + (re.sub(r"[^0-9A-Za-z_]", "_", camera) or "_")
+
+
+def nanoseconds(seconds: float) -> int:
+    """Whole nanoseconds."""
+    return round(seconds * 1e9)
+
+
+class Packer:
+    """Makes messages.
+
+    Args:
+        store: see ``typestore``.
+    """
+
+    def __init__(self, store: Any) -> None:
+        self._store = store
+
+    def event(
+        self,
+        event: Mapping[str, Any],
+        stamps: Mapping[str, int],
+        names: Mapping[str, Sequence[str]],
+    ) -> Iterator[tuple[str, str, memoryview]]:
+        """Topic, type and CDR of each message that an event becomes; the JSON comes last.
+
+        Args:
+            event: with ``event`` and ``t``; its arrays must have the lengths of their ``names``.
+            stamps: ``t``, and ``observed`` if the event has that, in nanoseconds of real time.
+            names: ``state`` and ``action`` -> joint names.
+
+        Raises:
+            TypeError: a value is no JSON.
+        """
+        rest = dict(event)
+        for field, topic in VECTORS.items():
+            values = rest.get(field)
+            if values is None:
+                continue
+            del rest[field]
+            of = names["state" if field == "state" else "action"]
+            yield topic, JOINT_STATE, self._joints(values, of, stamps["t"])
+        if rest.get(KEYFRAMES) is not None:
+            chunk = np.asarray(rest.pop(KEYFRAMES), dtype=np.float64)
+            message = self._trajectory(
+                chunk, names["action"], stamps["observed"], float(rest["rate_hz"])
+            )
+            yield CHUNKS, TRAJECTORY, message
+        text = json.dumps(rest, default=plain)
+        kind = self._store.types[STRING]
+        yield EVENTS, STRING, self._store.serialize_cdr(kind(text), STRING)
+
+    def picture(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
+        """The CDR of an ``Image``: ``(H, W, 3)`` uint8 RGB."""
+        height, width = image.shape[:2]
+        message = self._store.types[IMAGE](
+            header=self._header(ns, camera),
+            height=height,
+            width=width,
+            encoding="rgb8",
+            is_bigendian=0,
+            step=3 * width,
+            data=np.ascontiguousarray(image).reshape(-1),
+        )
+        packed: memoryview = self._store.serialize_cdr(message, IMAGE)
+        return packed
+
+    def _joints(self, values: Any, names: Sequence[str], ns: int) -> memoryview:
+        empty = np.zeros(0)
+        message = self._store.types[JOINT_STATE](
+            header=self._header(ns),
+            name=list(names),
+            position=np.asarray(values, dtype=np.float64),
+            velocity=empty,
+            effort=empty,
+        )
+        packed: memoryview = self._store.serialize_cdr(message, JOINT_STATE)
+        return packed
+
+    def _trajectory(
+        self, chunk: npt.NDArray[np.float64], names: Sequence[str], ns: int, rate_hz: float
+    ) -> memoryview:
+        types, empty = self._store.types, np.zeros(0)
+        duration = types["builtin_interfaces/msg/Duration"]
+        point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+        points = [
+            point(
+                positions=row,
+                velocities=empty,
+                accelerations=empty,
+                effort=empty,
+                time_from_start=duration(*divmod(nanoseconds((index + 1) / rate_hz), 10**9)),
+            )
+            for index, row in enumerate(chunk)
+        ]
+        message = types[TRAJECTORY](header=self._header(ns), joint_names=list(names), points=points)
+        packed: memoryview = self._store.serialize_cdr(message, TRAJECTORY)
+        return packed
+
+    def _header(self, ns: int, frame: str = "") -> Any:
+        types = self._store.types
+        stamp = types["builtin_interfaces/msg/Time"](*divmod(ns, 10**9))
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+
+class Unpacker:
+    """Puts events together again.
+
+    Args:
+        store: see ``typestore``.
+    """
+
+    def __init__(self, store: Any) -> None:
+        self._store = store
+        self._parts: dict[str, Any] = {}
+        self._of = -1
+
+    def add(self, topic: str, kind: str, ns: int, data: memoryview) -> dict[str, Any] | None:
+        """The event that this message completes, with arrays as lists; None for a part of one.
+
+        Raises:
+            DataError: the message is not what ``Packer`` makes.
+        """
+        if ns != self._of:
+            self._parts, self._of = {}, ns
+        if kind == TRAJECTORY:
+            points = self._read(data, kind).points
+            self._parts[KEYFRAMES] = [point.positions.tolist() for point in points]
+        elif topic in _FIELDS:
+            self._parts[_FIELDS[topic]] = self._read(data, kind).position.tolist()
+        elif topic == EVENTS:
+            event = json.loads(self._read(data, kind).data)
+            if not isinstance(event, dict):
+                raise DataError(f"an event of the recording is no object: {event!r:.80}")
+            parts, self._parts = self._parts, {}
+            return {**event, **parts}
+        return None
+
+    def picture(self, data: memoryview) -> tuple[str, npt.NDArray[np.uint8]]:
+        """Camera and ``(H, W, 3)`` uint8 RGB, a fresh array."""
+        message = self._read(data, IMAGE)
+        shape = message.height, message.width, 3
+        return message.header.frame_id, np.array(message.data, np.uint8).reshape(shape)
+
+    def _read(self, data: memoryview, kind: str) -> Any:
+        return self._store.deserialize_cdr(data, kind)
+
+
+def plain(value: Any) -> Any:
+    """Arrays and numpy's numbers as JSON has them.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a trace holds JSON values and arrays, not {type(value).__name__}")

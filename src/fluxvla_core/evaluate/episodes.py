@@ -98,9 +98,11 @@ def _error_line(record: dict[str, Any]) -> str:
     )
 
 
-def open_ledger(path: Path, what: dict[str, Any], reporter: Reporter) -> Ledger:
+def open_ledger(
+    path: Path, what: dict[str, Any], reporter: Reporter, beside: str | None = None
+) -> Ledger:
     """The ledger of an evaluation of ``what``; says so if another one was in the way."""
-    ledger = Ledger(path, what)
+    ledger = Ledger(path, what, beside)
     if ledger.set_aside is not None:
         reporter.info(
             f"{path.name} was about another evaluation; it is {ledger.set_aside.name} now"

@@ -42,6 +42,8 @@ class Ledger:
         path: the file; its folder is made if need be.
         what: what is evaluated, as JSON values. A file that was written about something else is
             set aside under a name of its own.
+        beside: a pattern of file names in the same folder, where others keep episodes of the same
+            evaluation; what they have finished is finished here, too.
 
     Attributes:
         set_aside: where such a file went, else None.
@@ -50,17 +52,20 @@ class Ledger:
         RunFailed: the file cannot be read or written.
     """
 
-    def __init__(self, path: Path, what: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, what: Mapping[str, Any], beside: str | None = None) -> None:
         self.path = path
         self.set_aside: Path | None = None
+        self._beside = beside
         self._header = {"format": FORMAT, "evaluation": json.loads(json.dumps(what))}
         self._done: dict[EpisodeKey, dict[str, Any]] = {}
+        self._errors: dict[EpisodeKey, dict[str, Any]] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 self._read()
             if not path.exists():
                 self._write(self._header)
+            self.look_beside()
         except OSError as error:
             raise RunFailed(f"episodes cannot be kept: {error}", where=str(path)) from error
 
@@ -91,6 +96,32 @@ class Ledger:
         """Finished records among ``keys``, in the order of ``keys``."""
         return [self._done[key] for key in keys if key in self._done]
 
+    def settled(self, keys: Iterable[EpisodeKey]) -> list[dict[str, Any]] | None:
+        """The record of every one of ``keys``, in their order, or None while one is missing.
+
+        An error counts: whoever had the episode tried it as often as it may be tried.
+        """
+        records = [self._done.get(key, self._errors.get(key)) for key in keys]
+        found = [record for record in records if record is not None]
+        return found if len(found) == len(records) else None
+
+    def look_beside(self) -> None:
+        """Take in what others have written by now.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        for path in sorted(self.path.parent.glob(self._beside)) if self._beside else []:
+            if path == self.path:
+                continue
+            data = path.read_bytes()
+            lines = data[: data.rfind(b"\n") + 1].decode("utf-8", "replace").splitlines()
+            if lines and _parsed(lines[0]) == self._header:
+                for line in lines[1:]:
+                    record = _parsed(line)
+                    if record is not None:
+                        self._keep(record)
+
     def _read(self) -> None:
         data = self.path.read_bytes()
         # A crash can leave the last line cut short; it was never reported as finished.
@@ -113,9 +144,11 @@ class Ledger:
         self.path.replace(self.set_aside)
 
     def _keep(self, record: Mapping[str, Any]) -> None:
+        key = EpisodeKey(record["group"], record["task"], record["seed"])
         if record.get("status") == DONE:
-            key = EpisodeKey(record["group"], record["task"], record["seed"])
             self._done[key] = dict(record)
+        else:
+            self._errors[key] = dict(record)
 
     def _write(self, record: Mapping[str, Any]) -> None:
         with self.path.open("ab") as file:

@@ -24,7 +24,8 @@ from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
 from fluxvla_core.plugins.files import load_plugin_files, plugin_files
 
 Work = Callable[[Any], Any]
-Factory = Callable[[], Work]
+Factory = Callable[..., Work]
+Link = Callable[[], Connection]
 
 ONE_THREAD: Mapping[str, str] = {
     "OMP_NUM_THREADS": "1",
@@ -70,14 +71,17 @@ def run_jobs(
 class _Worker:
     """One process and the job that it has."""
 
-    def __init__(self, factory: Factory) -> None:
+    def __init__(self, factory: Factory, link: Link | None) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        arguments = (theirs, factory, plugin_files())
+        more = None if link is None else link()
+        arguments = (theirs, factory, plugin_files(), more)
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
         with _environment(ONE_THREAD):
             self.process.start()
         theirs.close()
+        if more is not None:
+            more.close()
         self.ready = False
         self.job: int | None = None
         self.deadline: float | None = None
@@ -110,6 +114,8 @@ class WorkerPool:
         workers: processes; never more than there are jobs.
         retries: how often a job that failed is tried again.
         timeout_s: how long one attempt may take before its process is ended.
+        link: gives each new process a connection of its own to something in this one; the factory
+            is called with it then.
 
     Attributes:
         ready_s: how long the first worker took to be built; None before there is one.
@@ -124,6 +130,7 @@ class WorkerPool:
         workers: int,
         retries: int = 1,
         timeout_s: float | None = None,
+        link: Link | None = None,
     ) -> None:
         if workers < 1:
             raise ValueError(f"workers must be at least 1, got {workers}")
@@ -132,6 +139,7 @@ class WorkerPool:
         self._most = workers
         self._retries = retries
         self._timeout_s = timeout_s
+        self._link = link
         self._workers: list[_Worker] = []
         self._failed_starts = 0
         self._began = 0.0
@@ -158,7 +166,7 @@ class WorkerPool:
                 if worker.ready:
                     self._next(worker)
             while len(self._workers) < min(self._most, left):
-                self._workers.append(_Worker(self._factory))
+                self._workers.append(_Worker(self._factory, self._link))
             while left:
                 for outcome in self._wait():
                     left -= 1
@@ -243,7 +251,7 @@ class WorkerPool:
                     cause="out of memory, or a library that crashes while it is loaded",
                     next="try again with workers=1",
                 )
-        self._workers.append(_Worker(self._factory))
+        self._workers.append(_Worker(self._factory, self._link))
         return None if index is None else self._again(index, why)
 
     def _again(self, index: int, why: str) -> Outcome | None:
@@ -281,14 +289,19 @@ def _environment(extra: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(connection: Connection, factory: Factory, plugins: tuple[str, ...]) -> None:
+def _serve(
+    connection: Connection,
+    factory: Factory,
+    plugins: tuple[str, ...],
+    link: Connection | None,
+) -> None:
     """A worker process's life: build the worker, answer jobs until the pipe closes."""
     # Ctrl-C reaches the whole group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
         try:
             load_plugin_files(plugins)
-            work = factory()
+            work = factory() if link is None else factory(link)
         except FluxError as error:
             connection.send(("refused", error))
             return

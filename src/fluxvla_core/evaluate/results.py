@@ -42,7 +42,7 @@ def timing(
     """How fast the episodes were, as JSON values.
 
     Args:
-        records: with ``steps``, ``calls`` (of the policy) and ``timing.policy_seconds``.
+        records: with ``steps``, ``calls`` (of the policy) and ``timing``: see ``run_episode``.
         new: how many of them this run made; where it is not all of them, only the policy's
             answer has a meaningful mean.
         seconds: this run's wall time.
@@ -50,14 +50,20 @@ def timing(
     """
     done = [r for r in records if r["status"] == DONE]
     calls = sum(r["calls"] for r in done)
-    policy = sum(r["timing"]["policy_seconds"] for r in done)
+    steps = sum(r["steps"] for r in done)
+
+    def mean_ms(name: str, count: int) -> float:
+        return 1e3 * sum(r["timing"].get(name, 0.0) for r in done) / max(count, 1)
+
     found: dict[str, Any] = {
         "episodes": 0,
         "workers": workers,
-        "policy_ms": 1e3 * policy / max(calls, 1),
+        "policy_ms": mean_ms("policy_seconds", calls),
+        "observe_ms": mean_ms("observe_seconds", calls),
+        "step_ms": mean_ms("step_seconds", steps),
+        "worker_memory_mb": max((r["timing"].get("memory_mb", 0.0) for r in done), default=0.0),
     }
     if new == len(records):
-        steps = sum(r["steps"] for r in done)
         per_s = steps / max(seconds, 1e-9)
         found |= {"episodes": new, "steps": steps, "seconds": seconds, "steps_per_s": per_s}
     return found

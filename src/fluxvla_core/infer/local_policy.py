@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +31,25 @@ Array = npt.NDArray[np.float64]
 PRECISIONS = ("float32", "bf16")
 
 
+@dataclass(frozen=True)
+class Question:
+    """One episode's question: what it sees, its seed, and how many it asked before."""
+
+    observation: Observation
+    seed: int
+    call: int
+
+
 class LocalPolicy:
     """A model in this process as the Policy contract has it; ``load_policy`` makes one.
 
     The noise of call ``n`` of an episode follows from (seed, n) alone, so that an episode can be
     repeated. ``stages`` holds the seconds that the last call took: ``preprocess``,
-    ``inference``, ``postprocess``.
+    ``inference``, ``postprocess``. Every forward pass has ``batch_size`` rows (1 unless it is
+    set), however many questions there are: kernels, and so sums, depend on the size.
 
     Args:
-        model: ``predict_action(**batch) -> (1, T, D)``, in evaluation mode.
+        model: ``predict_action(**batch) -> (B, T, D)``, in evaluation mode.
         prepare: observation -> batch of one.
         denormalize: ``{"action": (1, T, D), "states": (S,)}`` -> ``(T, dim)`` physical units.
         embodiment: the robot that it was trained for.
@@ -72,10 +83,11 @@ class LocalPolicy:
         self.action_rate_hz = action_rate_hz
         self.horizon = horizon
         self.source = source
+        self.batch_size = 1
         self.stages: dict[str, float] = {}
         self._prepare = prepare
         self._denormalize = denormalize
-        self._device = device
+        self.device = device
         self._precision = precision
         self._seed = 0
         self._calls = 0
@@ -93,34 +105,61 @@ class LocalPolicy:
         Raises:
             DataError, ConfigError: the observation lacks something that the transforms need.
         """
+        chunk = self.predict_batch([Question(observation, self._seed, self._calls)])[0]
+        self._calls += 1
+        return chunk
+
+    def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
+        """An answer to each of at most ``batch_size`` questions, in one forward pass.
+
+        Raises:
+            DataError, ConfigError: an observation lacks something that the transforms need.
+        """
         import torch
 
+        if not 1 <= len(questions) <= self.batch_size:
+            raise ValueError(f"{len(questions)} questions, and batch_size is {self.batch_size}")
         start = time.perf_counter()
-        batch = self._prepare(self._sized(observation))
-        if "noise" in self._takes:
-            batch["noise"] = torch.from_numpy(self._noise())
-        if not self._takes_all:
-            batch = {key: value for key, value in batch.items() if key in self._takes}
-        device = torch.device(self._device)
+        rows = [self._row(question) for question in questions]
+        rows += rows[:1] * (self.batch_size - len(rows))
+        device = torch.device(self.device)
         batch = {
-            key: value.to(device) if isinstance(value, torch.Tensor) else value
-            for key, value in batch.items()
+            key: torch.cat([row[key] for row in rows]).to(device)
+            if isinstance(value, torch.Tensor)
+            else [item for row in rows for item in row[key]]
+            for key, value in rows[0].items()
         }
         prepared = time.perf_counter()
         mixed = self._precision == "bf16"
         with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=mixed):
             actions = self.model.predict_action(**batch).float().cpu().numpy()
         inferred = time.perf_counter()
-        self._calls += 1
-        chunk: Array = self._denormalize(
-            {"action": actions, "states": np.asarray(observation["qpos"])}
-        )
+        chunks = [
+            self._denormalize(
+                {
+                    "action": actions[place : place + 1],
+                    "states": np.asarray(question.observation["qpos"]),
+                }
+            )
+            for place, question in enumerate(questions)
+        ]
         self.stages = {
             "preprocess": prepared - start,
             "inference": inferred - prepared,
             "postprocess": time.perf_counter() - inferred,
         }
-        return chunk
+        return chunks
+
+    def _row(self, question: Question) -> dict[str, Any]:
+        """A batch of one, with what the model takes."""
+        import torch
+
+        row = self._prepare(self._sized(question.observation))
+        if "noise" in self._takes:
+            row["noise"] = torch.from_numpy(self._noise(question.seed, question.call))
+        if not self._takes_all:
+            row = {key: value for key, value in row.items() if key in self._takes}
+        return row
 
     def _sized(self, observation: Observation) -> dict[str, Any]:
         """The observation with pictures of the size that the policy was trained on.
@@ -140,9 +179,9 @@ class LocalPolicy:
                 )
         return {**observation, "images": images}
 
-    def _noise(self) -> npt.NDArray[np.float32]:
+    def _noise(self, seed: int, call: int) -> npt.NDArray[np.float32]:
         # A key of its own for each call; counter-based, so that calls share no numbers.
-        key = np.array([self._seed, self._calls], dtype=np.uint64)
+        key = np.array([seed, call], dtype=np.uint64)
         generator = np.random.Generator(np.random.Philox(key=key))
         shape = (1, *self.model.action_shape)
         return generator.standard_normal(shape, dtype=np.float32)

@@ -1,0 +1,196 @@
+"""Which policy is measured: a checkpoint's, its untrained twin, or a registered one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import build_policy_from_cfg
+from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.errors import ConfigError, SpecMismatch
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, check_match
+
+if TYPE_CHECKING:
+    from fluxvla_core.infer.local_policy import LocalPolicy
+
+CHECKPOINT, UNTRAINED, EXPERT, RANDOM = "checkpoint", "untrained", "expert", "random"
+NAMES = (CHECKPOINT, UNTRAINED, EXPERT, RANDOM)
+FROM_CHECKPOINT = (CHECKPOINT, UNTRAINED)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a policy comes from; sent to worker processes.
+
+    Args:
+        what: ``checkpoint`` or ``untrained``, or the table of a registered policy.
+        ckpt_path: its folder, where one is needed.
+        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
+        norm_stats_key: which of its statistics; what it was trained with by default.
+        device: of torch.
+        precision: ``float32`` or ``bf16``.
+        batch_size: how many rows every forward pass has; results follow from it.
+    """
+
+    what: str | Mapping[str, Any]
+    ckpt_path: str | None = None
+    dataset: Any = None
+    denormalize_action: Any = None
+    norm_stats_key: str | None = None
+    device: str = "cpu"
+    precision: str = "float32"
+    batch_size: int = 1
+
+
+def resolve_name(policy: str | Mapping[str, Any], environment: Any) -> str | Mapping[str, Any]:
+    """``checkpoint`` or ``untrained`` as they are; everything else as a table with a ``type``.
+
+    Args:
+        environment: its class may say, as ``expert``, which registered policy is its expert.
+
+    Raises:
+        ConfigError: the environment names no expert.
+    """
+    if not isinstance(policy, str) or policy in FROM_CHECKPOINT:
+        return policy
+    if policy == RANDOM:
+        return {"type": "RandomPolicy"}
+    if policy != EXPERT:
+        return {"type": policy}
+    expert = getattr(environment, "expert", None)
+    if expert is None:
+        raise ConfigError(
+            f"{type(environment).__name__} names no expert",
+            next=f"choose another policy: {CHECKPOINT}, {RANDOM}, or dict(type='...')",
+        )
+    return {"type": expert}
+
+
+def make_policy(source: Source) -> Actor:
+    """Build or load it.
+
+    Raises:
+        SpecMismatch: the checkpoint has no statistics under ``norm_stats_key``.
+        CheckpointError, ConfigError, PluginError: see ``load_policy``, ``build_from_cfg``.
+    """
+    if not isinstance(source.what, str):
+        made: Actor = build_policy_from_cfg(source.what)
+        return made
+    return load(source)
+
+
+def load(source: Source) -> LocalPolicy:
+    """The policy of a checkpoint, or its untrained twin: the same model with fresh random weights
+    and everything else as it is, which tells what the pipeline does without having learned."""
+    from fluxvla_core.evaluate.subject import untrained_model
+    from fluxvla_core.infer.local_policy import load_policy
+
+    assert source.ckpt_path is not None
+    dataset, denormalize = source.dataset, source.denormalize_action
+    if source.norm_stats_key is not None:
+        dataset, denormalize = _with_statistics(source)
+    policy = load_policy(source.ckpt_path, source.device, dataset, denormalize, source.precision)
+    if source.what == UNTRAINED:
+        policy.model = untrained_model(source.ckpt_path, source.device)
+    policy.batch_size = source.batch_size
+    return policy
+
+
+def fit(
+    policy: Any, spec: EnvironmentSpec, size: tuple[int, int] | None = None
+) -> tuple[Camera, ...]:
+    """The cameras that ``policy`` looks at, in the sizes that it was trained with.
+
+    Args:
+        policy: where it has no ``embodiment`` it is taken to be made for this environment.
+        size: height and width of all pictures instead.
+
+    Raises:
+        SpecMismatch: its numbers mean something else here: joints, units, frames, rotations,
+            gripper polarity, absolute or delta, rate; or a camera is missing.
+    """
+    embodiment: EmbodimentSpec | None = getattr(policy, "embodiment", None)
+    trained = {c.name: c for c in embodiment.cameras} if embodiment is not None else {}
+    names = tuple(getattr(policy, "cameras", trained))
+    if embodiment is not None:
+        check_match(embodiment, spec.embodiment, "the policy", spec.name, cameras=names)
+    rate = getattr(policy, "action_rate_hz", None)
+    if not spec.limited and rate is not None and rate != spec.embodiment.rate_hz:
+        raise SpecMismatch(
+            f"the policy's actions are for steps of 1/{rate:g} s, "
+            f"{spec.name}'s for 1/{spec.embodiment.rate_hz:g} s",
+            cause="it was trained on data of another frame rate",
+            next=f"train on data recorded at {spec.embodiment.rate_hz:g} frames a second",
+        )
+    here = {camera.name: camera for camera in spec.embodiment.cameras}
+    missing = [name for name in names if name not in here]
+    if missing:
+        raise SpecMismatch(
+            f"the policy looks at {', '.join(missing)}; {spec.name} has {', '.join(here) or 'none'}"
+        )
+    cameras = [trained.get(name, here[name]) for name in names]
+    if size is not None:
+        cameras = [replace(camera, height=size[0], width=size[1]) for camera in cameras]
+    return tuple(cameras)
+
+
+class RandomPolicy:
+    """Uniform within the limits of every joint; what chance alone does.
+
+    Args:
+        horizon: actions in a chunk.
+    """
+
+    cameras: tuple[str, ...] = ()
+
+    def __init__(self, horizon: int = 1) -> None:
+        if horizon < 1:
+            raise ConfigError(f"RandomPolicy: horizon must be at least 1, got {horizon}")
+        self.horizon = horizon
+        self._rng = np.random.default_rng(0)
+        self._low = self._high = np.zeros(0)
+
+    def enter(self, environment: Environment) -> None:
+        joints = environment.spec.embodiment.joints
+        self._low = np.array([joint.lower for joint in joints])
+        self._high = np.array([joint.upper for joint in joints])
+
+    def reset(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
+        """``(horizon, dim)``."""
+        return self._rng.uniform(self._low, self._high, (self.horizon, len(self._low)))
+
+
+def _with_statistics(source: Source) -> tuple[Any, Any]:
+    """The section's tables with the statistics' key in both."""
+    from fluxvla_core.data.mixture import first_dataset
+    from fluxvla_core.train.checkpoint import Checkpoint
+
+    assert source.ckpt_path is not None
+    checkpoint, key = Checkpoint.open(source.ckpt_path), source.norm_stats_key
+    have = checkpoint.statistics()
+    if key not in have:
+        raise SpecMismatch(
+            f"the checkpoint has no statistics {key!r}; it has {', '.join(sorted(have))}",
+            where=str(checkpoint.path),
+            cause="it was trained on another dataset, or under another statistic_name",
+            next="set norm_stats_key to one of these, or leave it out",
+        )
+    dataset, denormalize = source.dataset, source.denormalize_action
+    if dataset is None:
+        trained_on = first_dataset(checkpoint.config()["train_dataloader"]["dataset"])
+        wanted = ("img_keys", "transforms", "embodiment_id")
+        dataset = {k: trained_on[k] for k in wanted if k in trained_on}
+        dataset["type"] = "PrivateInferenceDataset"
+    if isinstance(dataset, Mapping):
+        dataset = {**dataset, "statistic_name": key}
+    if isinstance(denormalize, Mapping):
+        denormalize = {**denormalize, "statistic_name": key}
+    return dataset, denormalize

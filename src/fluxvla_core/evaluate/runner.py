@@ -1,0 +1,364 @@
+"""``EvalRunner``: how often a policy does what it is told, in any environment.
+
+Every episode's outcome follows from the policy, its task and its seed. Neither the number of
+processes, nor the machines, nor an interruption changes anything but the time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fluxvla_core.build import RunContext, build_environment_from_cfg
+from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.evaluate import results
+from fluxvla_core.evaluate.behaviours import count_behaviours, instruction_test
+from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
+from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
+from fluxvla_core.evaluate.policies import (
+    CHECKPOINT,
+    FROM_CHECKPOINT,
+    UNTRAINED,
+    Source,
+    load,
+    resolve_name,
+)
+from fluxvla_core.evaluate.pool import WorkerPool
+from fluxvla_core.evaluate.rollout import Course
+from fluxvla_core.evaluate.serving import PolicyServer
+from fluxvla_core.evaluate.shards import Shard, shard_of
+from fluxvla_core.evaluate.showing import choose_episodes, record_videos
+from fluxvla_core.evaluate.subject import chosen_checkpoint
+from fluxvla_core.evaluate.summary import summarise
+from fluxvla_core.evaluate.worker import (
+    POLICY,
+    SWAPPED,
+    EpisodeWorker,
+    Job,
+    Settings,
+    Video,
+    choose_tasks,
+)
+
+FOLDER = "eval"
+
+
+class EvalRunner:
+    """Evaluates a policy in an environment: ``run_setup()``, then ``run()``.
+
+    Writes ``<work_dir>/eval/``: ``results.json``, ``episodes.jsonl``, ``videos/*.mp4``. Started
+    again in the same work dir it goes on where it was. Started as several processes (torchrun, a
+    SLURM array, ``srun``) each runs its part of the episodes, and the last one writes the results.
+
+    Args:
+        cfg: the whole config (injected).
+        context: what the run knows (injected): work dir, reporter.
+        environment: table of a registered environment.
+        policy: ``checkpoint``, ``untrained``, ``expert`` (the environment's own), ``random``, or
+            the table of a registered policy.
+        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
+        episodes: for each task.
+        seed: of each task's first episode; the others count up from it.
+        policy_seed: the policy's seed is this more than the episode's.
+        tasks: names of the tasks; all by default.
+        replan_every: how many actions of a chunk are used before the policy is asked again; all of
+            them by default.
+        max_steps: control steps after which an episode ends, instead of the environment's.
+        instruction_swap: also tell the policy another task's instruction, and test whether the
+            right one does better.
+        swap_seed: of the first of these episodes; by default they repeat those of the policy.
+        baseline: also evaluate the same model with fresh random weights, on the same seeds.
+        workers: processes that simulate; ``--nproc`` overrides it.
+        batch_size: rows of every forward pass of the policy. Results follow from it, because sums
+            do; they do not follow from how many of the rows were in use.
+        serve_policy: one model in this process answers all workers, in batches; otherwise each
+            worker has its own. Changes nothing but time and memory; by default True where
+            ``batch_size`` is above 1 or the device is no CPU.
+        record_videos: how many episodes to show: failures first, then successes.
+        video_cameras: side by side; the environment's first by default.
+        video_height, video_width: of each camera's picture; the environment's own by default.
+        video_fps: frames a second.
+        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
+        norm_stats_key: which of the checkpoint's statistics.
+        height, width: of the policy's pictures; as in its training data by default.
+        device, mixed_precision_dtype: of the policy.
+        episode_timeout_s: an episode that takes longer is tried again in a new process.
+
+    Raises:
+        ConfigError: a value is impossible.
+        PluginError: there is no such environment.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(
+        self,
+        cfg: Mapping[str, Any] | None = None,
+        context: RunContext | None = None,
+        environment: Mapping[str, Any] | None = None,
+        policy: str | Mapping[str, Any] = CHECKPOINT,
+        ckpt_path: str | None = None,
+        episodes: int = 50,
+        seed: int = 0,
+        policy_seed: int = 0,
+        tasks: Sequence[str] | None = None,
+        replan_every: int | None = None,
+        max_steps: int | None = None,
+        instruction_swap: bool = False,
+        swap_seed: int | None = None,
+        baseline: bool = False,
+        workers: int = 2,
+        batch_size: int = 1,
+        serve_policy: bool | None = None,
+        record_videos: int = 4,
+        video_cameras: Sequence[str] | None = None,
+        video_height: int | None = None,
+        video_width: int | None = None,
+        video_fps: float = 10.0,
+        dataset: Any = None,
+        denormalize_action: Any = None,
+        norm_stats_key: str | None = None,
+        height: int | None = None,
+        width: int | None = None,
+        device: str = "cpu",
+        mixed_precision_dtype: str = "float32",
+        episode_timeout_s: float = 1800.0,
+    ) -> None:
+        self.context = context or RunContext(config=cfg or {})
+        self.shard = shard_of()
+        # Under a launcher, nproc is the number of launched processes, not of each one's workers.
+        own = self.context.nproc > 1 and self.shard.count == 1
+        self.workers = self.context.nproc if own else workers
+        self.ckpt_path = ckpt_path
+        self.episodes = episodes
+        self.seed = seed
+        self.swap_seed = seed if swap_seed is None else swap_seed
+        self.instruction_swap = instruction_swap
+        self.baseline = baseline
+        self.record_videos = record_videos
+        self.episode_timeout_s = episode_timeout_s
+        self.folder = Path(self.context.work_dir) / FOLDER
+        self._given = tasks
+        for name, value, least in (
+            ("episodes", episodes, 1),
+            ("workers", self.workers, 1),
+            ("batch_size", batch_size, 1),
+            ("replan_every", replan_every, 1),
+            ("max_steps", max_steps, 1),
+            ("record_videos", record_videos, 0),
+            ("seed", seed, 0),
+            ("swap_seed", swap_seed, 0),
+        ):
+            if value is not None and value < least:
+                raise self.wrong(name, f"must be at least {least}, got {value}")
+        if (height is None) != (width is None):
+            raise self.wrong("height", "and width belong together: give both or none")
+        if video_fps <= 0:
+            raise self.wrong("video_fps", f"must be positive, got {video_fps:g}")
+        if environment is None:
+            raise ConfigError(
+                f"{type(self).__name__} has no environment: where is the policy to act?",
+                where=self.context.where(self.context.section),
+                next="set environment = dict(type='...') in this section",
+            )
+        self._environment = plain(environment)
+        self._video = (video_cameras, video_height, video_width, video_fps)
+        self._policy = policy if isinstance(policy, str) else plain(policy)
+        self._source = Source(
+            what=CHECKPOINT,
+            dataset=dataset,
+            denormalize_action=denormalize_action,
+            norm_stats_key=norm_stats_key,
+            device=device,
+            precision=mixed_precision_dtype,
+            batch_size=batch_size,
+        )
+        served = batch_size > 1 or not device.startswith("cpu")
+        self._serve = served if serve_policy is None else serve_policy
+        self._course = Course((), replan_every, max_steps, policy_seed)
+        self._size = None if height is None or width is None else (height, width)
+        self._checkpoint: dict[str, Any] | None = None
+        self._spec: EnvironmentSpec | None = None
+        self._tasks: tuple[TaskSpec, ...] = ()
+        self._settings: Settings | None = None
+
+    def run_setup(self) -> None:
+        """Look at the environment and find the checkpoint.
+
+        Raises:
+            ConfigError: the environment has no such task or camera, or names no expert.
+            CheckpointError: there is no checkpoint, or the one that is named is damaged.
+        """
+        environment = build_environment_from_cfg(self._environment)
+        self._spec = environment.spec
+        what = resolve_name(self._policy, environment)
+        environment.close()
+        self._tasks = choose_tasks(self._spec.tasks, self._given)
+        if what in FROM_CHECKPOINT or self.baseline:
+            self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
+            self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
+        path = None if self._checkpoint is None else self._checkpoint["path"]
+        sources = {POLICY: replace(self._source, what=what, ckpt_path=path)}
+        if self.baseline:
+            sources[UNTRAINED] = replace(sources[POLICY], what=UNTRAINED)
+        self._settings = Settings(
+            environment=self._environment,
+            tasks=tuple(task.name for task in self._tasks),
+            sources=sources,
+            course=self._course,
+            size=self._size,
+            video=self._film(self._spec),
+        )
+
+    def run(self) -> dict[str, Any]:
+        """Run this process's episodes; write ``results.json`` once all there are have ended.
+
+        Returns:
+            What is in ``results.json``, or, while other processes have episodes to run, ``shard``
+            and ``episodes_left``.
+
+        Raises:
+            SpecMismatch: the policy is for another robot.
+            RunFailed: no episode gave a result, or results cannot be written.
+        """
+        reporter, keys = self.context.reporter, self.keys()
+        what = self.what()
+        ledger = open_ledger(self.folder / self.shard.ledger, what, reporter, "episodes*.jsonl")
+        mine = self.shard.of(keys)
+        new = sum(key not in ledger for key in mine)
+        with self._pool() as pool:
+            began = time.monotonic()
+            run_in_pool(pool, mine, ledger, reporter)
+            # Loading libraries and models is not what is measured.
+            seconds = time.monotonic() - began - (pool.ready_s or 0.0)
+            ledger.look_beside()
+            records = ledger.settled(keys)
+            if records is None:
+                return self._leave_to_others(keys, ledger)
+            results.check_any_done(records, ledger.path)
+            shown = choose_episodes(records, self.record_videos)
+            videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
+        found = {
+            "format": results.FORMAT,
+            "policy": what["policy"] if isinstance(what["policy"], str) else what["policy"]["type"],
+            "environment": what["environment"]["type"],
+            "groups": summarise(records),
+            "instruction_test": instruction_test(records),
+            "behaviours": count_behaviours(records),
+            "checkpoint": self._checkpoint,
+            "settings": what["settings"],
+            "videos": videos,
+            "timing": results.timing(records, new, seconds, self.workers),
+        }
+        path = self.folder / "results.json"
+        results.write_results(path, found)
+        reporter.artifact("evaluation", path)
+        results.tell(reporter, found, self.folder)
+        return found
+
+    def keys(self) -> list[EpisodeKey]:
+        """Every episode of the evaluation, in the order in which they are given out."""
+        groups = [(POLICY, self.seed)]
+        groups += [(SWAPPED, self.swap_seed)] if self.instruction_swap else []
+        groups += [(UNTRAINED, self.seed)] if self.baseline else []
+        spec = self._ready()[0]
+        numbers, tasks = range(self.episodes), [task.name for task in self._tasks]
+        # In turn, so that an evaluation that is watched tells of all tasks from the start.
+        pairs = [(task, number) for number in numbers for task in tasks]
+        if spec.keep_together:
+            pairs = [(task, number) for task in tasks for number in numbers]
+        return [
+            EpisodeKey(group, task, first + number)
+            for task, number in pairs
+            for group, first in groups
+        ]
+
+    def what(self) -> dict[str, Any]:
+        """What outcomes follow from, beside each episode's key; JSON values."""
+        spec, settings = self._ready()
+        source = asdict(settings.sources[POLICY])
+        policy = source.pop("what")
+        del source["ckpt_path"]
+        course = asdict(settings.course)
+        del course["cameras"]
+        values: dict[str, Any] = {**course, "size": settings.size, **source, **spec.details}
+        if self.instruction_swap:
+            values["wrong_instructions_of"] = settings.tasks
+        return plain(
+            {
+                "policy": policy,
+                "environment": self._environment,
+                "checkpoint": None if self._checkpoint is None else self._checkpoint["sha256"],
+                "settings": values,
+            }
+        )
+
+    def wrong(self, name: str, what: str) -> ConfigError:
+        """An error about a key of this section."""
+        where = self.context.where(f"{self.context.section}.{name}")
+        return ConfigError(f"{name} {what}", where=where)
+
+    @contextmanager
+    def _pool(self) -> Iterator[WorkerPool]:
+        settings = self._ready()[1]
+        loaders = {
+            name: partial(load, source)
+            for name, source in settings.sources.items()
+            if self._serve and source.what in FROM_CHECKPOINT
+        }
+        timeout = self.episode_timeout_s
+        if not loaders:
+            factory = partial(EpisodeWorker, settings)
+            with WorkerPool(factory, self.workers, timeout_s=timeout) as pool:
+                yield pool
+            return
+        with PolicyServer(loaders) as server:
+            factory = partial(EpisodeWorker, replace(settings, served=server.facts))
+            with WorkerPool(factory, self.workers, timeout_s=timeout, link=server.link) as pool:
+                yield pool
+
+    def _leave_to_others(self, keys: Sequence[EpisodeKey], ledger: Ledger) -> dict[str, Any]:
+        left = sum(ledger.settled([key]) is None for key in keys)
+        part: Shard = self.shard
+        self.context.reporter.info(
+            f"part {part.index} of {part.count} is done; {left} episodes of others are not, and "
+            "whoever ends last writes the results"
+        )
+        return {"shard": part.index, "episodes_left": left}
+
+    def _film(self, spec: EnvironmentSpec) -> Video:
+        names, height, width, fps = self._video
+        known = {camera.name: camera for camera in spec.embodiment.cameras}
+        for name in names or ():
+            if name not in known:
+                there = ", ".join(known) or "none"
+                raise self.wrong("video_cameras", f"{name!r} is none of {there}")
+        chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
+        return Video(
+            tuple(
+                replace(camera, height=height or camera.height, width=width or camera.width)
+                for camera in chosen
+            ),
+            fps,
+        )
+
+    def _ready(self) -> tuple[EnvironmentSpec, Settings]:
+        assert self._spec is not None, "run_setup() comes first"
+        assert self._settings is not None
+        return self._spec, self._settings
+
+
+def plain(table: Any) -> Any:
+    """A config's table as plain JSON values, which can be sent to other processes."""
+    return json.loads(json.dumps(table, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else str(value)

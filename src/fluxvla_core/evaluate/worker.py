@@ -1,0 +1,206 @@
+"""What an evaluation's worker processes do; imported there, and light until then."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.build import build_environment_from_cfg
+from fluxvla_core.contracts.environment import Actor, Environment, TaskSpec
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.policies import Source, fit, make_policy
+from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
+from fluxvla_core.evaluate.serving import Facts, ServedPolicy
+from fluxvla_core.spec.embodiment import Camera
+
+POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
+"""Groups of episodes: the policy, the policy told another task, its untrained twin."""
+
+
+@dataclass(frozen=True)
+class Video:
+    """How videos of episodes look.
+
+    Args:
+        cameras: side by side; sizes as far as the environment can draw them.
+        fps: frames a second of simulated time.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    fps: float = 10.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode, and where its video goes; no video by default."""
+
+    key: EpisodeKey
+    video: str | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What workers need to know; every outcome follows from it and the episode's key.
+
+    Args:
+        environment: the table of a registered environment.
+        tasks: names of the tasks that are evaluated; a wrong instruction is one of theirs if it
+            can be.
+        sources: where the policy of ``policy`` and that of ``untrained`` come from.
+        course: how episodes are run; its cameras are filled in for each policy.
+        size: height and width of the policy's pictures; as it was trained by default.
+        served: policies that the parent answers for, by group.
+    """
+
+    environment: Mapping[str, Any]
+    tasks: tuple[str, ...]
+    sources: Mapping[str, Source]
+    course: Course
+    size: tuple[int, int] | None = None
+    video: Video = field(default_factory=Video)
+    served: Mapping[str, Facts] = field(default_factory=dict)
+
+
+class EpisodeWorker:
+    """Runs episodes in one process: a function from a job to the record of its episode.
+
+    The environment is made at once, policies when they are first needed; both are kept.
+
+    Args:
+        link: to a ``PolicyServer``, where there are served policies.
+    """
+
+    def __init__(self, settings: Settings, link: Connection | None = None) -> None:
+        self._settings = settings
+        self._link = link
+        self.environment: Environment = build_environment_from_cfg(settings.environment)
+        self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
+
+    def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
+        """The record of an episode: JSON values.
+
+        Raises:
+            SpecMismatch: a policy is for another robot, or wants cameras that are not there.
+            FluxError: a policy cannot be loaded, or answers something impossible.
+        """
+        if isinstance(job, EpisodeKey):
+            job = Job(job)
+        settings, key = self._settings, job.key
+        # First of all, so that a policy that does not fit is refused before a scene is built.
+        actor, cameras = self.actor(key.group)
+        tasks = self.environment.spec.tasks
+        told = None
+        if key.group == SWAPPED:
+            told = find_task(tasks, told_instead(self.environment, key.task, settings.tasks))
+        film = None if job.video is None else Film(Path(job.video), settings.video)
+        try:
+            record = run_episode(
+                self.environment,
+                actor,
+                find_task(tasks, key.task),
+                key.seed,
+                replace(settings.course, cameras=cameras),
+                told,
+                film,
+            )
+        finally:
+            if film is not None:
+                film.close()
+        record["timing"]["memory_mb"] = memory_mb()
+        return record
+
+    def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:
+        """A group's policy and the cameras that it looks at."""
+        name = group if group in self._settings.sources else POLICY
+        if name not in self._actors:
+            actor: Actor
+            if name in self._settings.served and self._link is not None:
+                actor = ServedPolicy(self._link, name, self._settings.served[name])
+            else:
+                actor = make_policy(self._settings.sources[name])
+            cameras = fit(actor, self.environment.spec, self._settings.size)
+            self._actors[name] = actor, cameras
+        return self._actors[name]
+
+
+class Film:
+    """A video of an episode: call it at every step, then close it."""
+
+    def __init__(self, path: Path, video: Video) -> None:
+        self._path = path
+        self._video = video
+        self._writer: Any = None
+
+    def __call__(self, environment: Environment, steps: int) -> None:
+        import numpy as np
+
+        from fluxvla_core.record.video import VideoWriter
+
+        rate = environment.spec.embodiment.rate_hz
+        stride = max(1, round(rate / self._video.fps))
+        if steps % stride or not self._video.cameras:
+            return
+        images = environment.observe(self._video.cameras)["images"]
+        pictures = [images[camera.name] for camera in self._video.cameras]
+        lowest = min(picture.shape[0] for picture in pictures)
+        frame = np.hstack([picture[:lowest] for picture in pictures])
+        if self._writer is None:
+            self._writer = VideoWriter(self._path, rate / stride, *frame.shape[:2])
+        self._writer.add(frame)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def told_instead(environment: Any, task: str, wanted: Sequence[str]) -> str:
+    """The task to ask for instead of ``task``: the next one, round and round, that could be done
+    in its scene; one of ``wanted`` if there is one.
+
+    Raises:
+        ConfigError: the environment's scenes allow no other task.
+    """
+    names = [each.name for each in environment.spec.tasks]
+    others = list(environment.others(task)) if hasattr(environment, "others") else []
+    others = [name for name in others if name in wanted] or others
+    if not others:
+        raise ConfigError(
+            f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
+            f"of {task!r}",
+            next="evaluate without instruction_swap",
+        )
+    here = names.index(task)
+    return min(others, key=lambda name: (names.index(name) <= here, names.index(name)))
+
+
+def memory_mb() -> float:
+    """The most memory that this process ever had (resident), in MiB; 0 where nobody tells."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(most / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
+
+
+def choose_tasks(tasks: Sequence[TaskSpec], names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
+    """The tasks that are meant, in the order of ``names``; all of them for None.
+
+    Raises:
+        ConfigError: there is none of that name, or one is named twice.
+    """
+    if names is None:
+        return tuple(tasks)
+    known = {task.name: task for task in tasks}
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
+    if not names or len(set(names)) != len(names):
+        raise ConfigError(f"tasks must name each task once, got {list(names)}")
+    return tuple(known[name] for name in names)

@@ -23,7 +23,8 @@ def test_one_record_a_step(tmp_path):
     """O1 of the field notes: numbers as numbers, and nothing that is a constant."""
     metric = VLAMetric(run_dir=str(tmp_path))
     metric.start(0, {})
-    commit(metric, 1, 0.5, grad_norm=2.0, step_time=0.1, samples_per_s=80.0, data_wait=0.0)
+    measured = {"step_time": 0.1, "samples_per_s": 80.0, "data_wait": 0.0}
+    commit(metric, 1, 0.5, grad_norm=2.0, **measured, mfu=0.4, memory_gb=1.5)
     commit(metric, 2, 0.25, grad_norm=None)
     assert metric.push() == "step 2 · epoch 0.20 · loss 0.25000 · lr 0.001"
     metric.finalize()

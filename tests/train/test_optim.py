@@ -10,18 +10,17 @@ import torch
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.train.optim import (
-    clip_,
-    decay_groups,
-    make_adamw,
-    named_state,
-    torch_state,
-)
+from fluxvla_core.train.optim import clip_, decay_groups, named_state, torch_state
+from fluxvla_core.train.optimizers import AdamW
 
 
 def model():
     torch.manual_seed(0)
     return nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
+
+
+def make_adamw(net, learning_rate, weight_decay):
+    return AdamW().build(decay_groups(net, weight_decay), learning_rate)
 
 
 def trained(net, steps=3):

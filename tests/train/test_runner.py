@@ -119,6 +119,7 @@ def test_progress_and_metrics_of_every_step(tmp_path):
         "step_time",
         "samples_per_s",
         "data_wait",
+        "memory_gb",
     }
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4, 5, 6]

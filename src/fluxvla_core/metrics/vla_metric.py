@@ -12,7 +12,7 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.metrics.trackers import Guarded, check_trackers, open_tracker
 
-WALL_CLOCK = ("step_time", "samples_per_s", "data_wait", "time")
+WALL_CLOCK = ("step_time", "samples_per_s", "data_wait", "mfu", "memory_gb", "time")
 """Fields that differ between two runs of the same training; all others are equal."""
 
 

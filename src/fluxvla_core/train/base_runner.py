@@ -15,28 +15,21 @@ from fluxvla_core.build import (
     RunContext,
     build_collator_from_cfg,
     build_metric_from_cfg,
+    build_optimizer_from_cfg,
     build_tokenizer_from_cfg,
     build_vla_from_cfg,
 )
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.train.options import LoaderOptions, TrainOptions
+from fluxvla_core.train.running import TrainRun
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-    from fluxvla_core.train.batches import StepPlan
-    from fluxvla_core.train.checkpoint import Checkpoint
-    from fluxvla_core.train.distributed import World
-    from fluxvla_core.train.ema import Ema
-    from fluxvla_core.train.forward import ForwardArguments
-    from fluxvla_core.train.loop import StepLoop
-    from fluxvla_core.train.progress import Progress
-    from fluxvla_core.train.weights import LeftOut
 
-
-class BaseTrainRunner:
+class BaseTrainRunner(TrainRun):
     """The training loop with everything around it; works as it is on one process.
 
     Called as ``run_setup(n_train_examples)`` and then ``run(dataset)``. Batch size and loader
@@ -58,6 +51,7 @@ class BaseTrainRunner:
         save_iter_interval: save every so many steps; 10000 in step-based runs that say nothing,
             only by epochs in epoch-based ones. The end of a run is always saved.
         max_keep_ckpts: newest checkpoints (by step) to keep; 0 keeps all.
+        optimizer: table of ``fluxvla.optimizers``; ``AdamW`` if None.
         lr_scheduler_type: ``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``.
         lr_schedule: for ``step-based``: ``{part of the run: rate}``, with 0.
         warmup_ratio: part of the run over which the rate rises.
@@ -66,12 +60,21 @@ class BaseTrainRunner:
             optimizer stay fp32.
         mixed_precision_dtype: ``bf16``.
         enable_gradient_checkpointing: recompute the model's ``fsdp_units`` in the backward pass.
+        compile_blocks: ``torch.compile`` each of the model's ``fsdp_units``.
+        init_from: weights to start from: a checkpoint's folder, a work dir, a safetensors file.
+        lora: train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
+            ``alpha``, ``dropout``, ``modules_to_save``.
         ema_decay: keep averaged weights too, and act with those; None does not.
+        val_iter_interval: with a ``val_dataloader``: its loss every so many steps and at the end;
+            None with every checkpoint. The best one by it is kept and called ``best``.
+        early_stop_patience: end after so many validations in a row without a better one.
         seed: initial weights, order of samples, and everything drawn.
         resume_from: ``auto`` or a checkpoint's path; the command line's ``--resume`` goes first.
         log_iter_interval: fetch losses, and look for NaN, every so many steps; every step is
             logged all the same.
         device: ``auto`` (a GPU if there is one), ``cpu``, ``cuda``.
+        peak_tflops: what one device can do at most, for ``mfu``; by default what the makers of
+            known GPUs state for bf16.
 
     Raises:
         ConfigError: a setting that cannot be meant, with its place.
@@ -94,6 +97,7 @@ class BaseTrainRunner:
         sampler: str | None = None,
         tokenizer: Any = None,
         metric: Any = None,
+        optimizer: Any = None,
         save_epoch_interval: int = 1,
         save_iter_interval: int | None = None,
         max_keep_ckpts: int = 2,
@@ -104,11 +108,17 @@ class BaseTrainRunner:
         enable_mixed_precision_training: bool = False,
         mixed_precision_dtype: str = "bf16",
         enable_gradient_checkpointing: bool = False,
+        compile_blocks: bool = False,
+        init_from: str | None = None,
+        lora: Mapping[str, Any] | None = None,
         ema_decay: float | None = None,
+        val_iter_interval: int | None = None,
+        early_stop_patience: int | None = None,
         seed: int = 42,
         resume_from: str | None = None,
         log_iter_interval: int = 10,
         device: str = "auto",
+        peak_tflops: float | None = None,
     ) -> None:
         self.context = context or RunContext(config=cfg or {}, section="runner")
         self.cfg: Mapping[str, Any] = self.context.config if cfg is None else cfg
@@ -129,14 +139,22 @@ class BaseTrainRunner:
             enable_mixed_precision_training=enable_mixed_precision_training,
             mixed_precision_dtype=mixed_precision_dtype,
             enable_gradient_checkpointing=enable_gradient_checkpointing,
+            compile_blocks=compile_blocks,
+            init_from=init_from,
+            lora=lora,
             ema_decay=ema_decay,
+            val_iter_interval=val_iter_interval,
+            early_stop_patience=early_stop_patience,
             seed=seed,
             resume_from=resume_from,
             log_iter_interval=log_iter_interval,
             device=device,
+            peak_tflops=peak_tflops,
         )
         self.options.check(self.context)
         self.loader_options = LoaderOptions.read(self.cfg, self.context)
+        self.lora = self.options.lora_options(self.context)
+        self.val_options = LoaderOptions.for_validation(self.cfg, self.context, self.options)
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.max_grad_norm = max_grad_norm
         self.max_epochs, self.max_steps = max_epochs, max_steps
@@ -145,19 +163,10 @@ class BaseTrainRunner:
         self.metric = build_metric_from_cfg(
             {"type": "VLAMetric"} if metric is None else metric, self.context
         )
+        self.optimizer_settings = build_optimizer_from_cfg(
+            {"type": "AdamW"} if optimizer is None else optimizer, self.context
+        )
         self.hooks = build_hooks(self.context)
-        self.vla: Any = None
-        self.optimizer: Any = None
-        self.lr_scheduler: Any = None
-        self.ema: Ema | None = None
-        self.dataset: Any = None
-        self.left_out: LeftOut | None = None
-        self.plan: StepPlan
-        self.progress: Progress
-        self._world: World | None = None
-        self._checkpoint: Checkpoint | None = None
-        self._arguments: ForwardArguments | None = None
-        self._loop: StepLoop | None = None
 
     # What a strategy may override.
 
@@ -173,9 +182,10 @@ class BaseTrainRunner:
         self.lr_scheduler = self._build_lr_scheduler(n_train_examples)
 
     def _build_vla(self) -> nn.Module:
-        """The config's ``model``, from equal random weights on every rank."""
-        from fluxvla_core.train.forward import checkpoint_activations
+        """The config's ``model``, from equal weights on every rank, as the settings have it."""
+        from fluxvla_core.train import flops, forward, lora
         from fluxvla_core.train.state import seed_all
+        from fluxvla_core.train.weights import start_from
 
         self._prepare()
         if "model" not in self.cfg:
@@ -186,8 +196,18 @@ class BaseTrainRunner:
             )
         seed_all(self.options.seed)
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
-        if self.options.enable_gradient_checkpointing:
-            checkpoint_activations(vla)
+        options = self.options
+        if options.init_from is not None:
+            start_from(vla, options.init_from)
+        if self.lora is not None:
+            if options.init_from is not None:
+                vla.__dict__["frozen_source"] = options.init_from
+            lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
+        self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
+        if options.enable_gradient_checkpointing:
+            forward.checkpoint_activations(vla)
+        if options.compile_blocks:
+            forward.compile_units(vla)
         return vla
 
     def _wrap_model(self, vla: nn.Module) -> nn.Module:
@@ -211,10 +231,12 @@ class BaseTrainRunner:
         return vla.module if isinstance(vla, DistributedDataParallel) else vla
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
-        """AdamW with decay on matrices only."""
-        from fluxvla_core.train.optim import make_adamw
+        """The config's ``optimizer``, with weight decay on matrices only."""
+        from fluxvla_core.train.optim import decay_groups
 
-        return make_adamw(self.model, self.learning_rate, self.weight_decay)
+        groups = decay_groups(self.model, self.weight_decay)
+        built: torch.optim.Optimizer = self.optimizer_settings.build(groups, self.learning_rate)
+        return built
 
     def _build_lr_scheduler(self, n_train_examples: int) -> Any:
         """The schedule over all steps of the run; has ``step`` and a JSON ``state_dict``."""
@@ -233,13 +255,15 @@ class BaseTrainRunner:
 
     def _training_step(self, batch: dict[str, Any]) -> Tensor:
         """Forward pass of one batch on the device: its loss, a scalar with a gradient."""
-        from fluxvla_core.train.forward import loss_of
+        from fluxvla_core.train.forward import loss_of, sample_losses_of
         from fluxvla_core.train.precision import autocast
 
         if self._arguments is None:
             raise RuntimeError("a batch's arguments are known inside run() only")
         with autocast(self.world.device, self.compute_dtype):
-            return loss_of(self.vla(**self._arguments(batch)), self.model)
+            output = self.vla(**self._arguments(batch))
+        self.sample_losses = sample_losses_of(output)
+        return loss_of(output, self.model)
 
     def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
@@ -287,6 +311,7 @@ class BaseTrainRunner:
             take_snapshot(self, train_loss, only_trainable),
             self.options.max_keep_ckpts,
             self.context.reporter.warn,
+            self.progress.best_step,
         )
         if self.world.first:
             self.context.reporter.artifact("checkpoint", path)
@@ -332,109 +357,3 @@ class BaseTrainRunner:
         """Steps until ``max_steps`` are done; the signal that ended them early, or 0."""
         steps = self.max_steps or 0
         return self.loop.run(lambda: self.progress.step >= steps, self._steps_due)
-
-    # What is the same for all.
-
-    def run(self, vla_dataset: Any) -> Path:
-        """Train on ``vla_dataset`` (``get_sample(index, epoch)``, ``__len__``) to the end.
-
-        Returns:
-            The work dir, with the last checkpoint in it.
-
-        Raises:
-            KeyboardInterrupt: after SIGINT, with everything saved.
-            RunFailed: after SIGTERM, with everything saved; a loss that is not finite; another
-                rank that was lost; a checkpoint that could not be written.
-            CheckpointError, ConfigError, DataError: the inputs do not fit.
-        """
-        from fluxvla_core.train import distributed
-        from fluxvla_core.train.loop import begin
-        from fluxvla_core.train.progress import Progress
-        from fluxvla_core.train.stop import StopRequest, stopped
-
-        self._prepare()
-        self.progress = Progress()
-        outcome = "failed"
-        try:
-            with StopRequest(self.world) as stop:
-                self._loop = begin(self, vla_dataset, stop)
-                steps = self.max_steps is not None
-                number = self._run_step_based() if steps else self._run_epoch_based()
-                self.loop.save()
-            outcome = "interrupted" if number else "ok"
-        except RuntimeError as error:
-            lost = distributed.explain(error, self.world, self.progress.step + 1)
-            if lost is None:
-                raise
-            raise lost from error
-        finally:
-            if self._loop is not None:
-                self._loop.close()
-            if self.world.first:
-                self.metric.finalize()
-            self.hooks.call("run_finished", outcome=outcome)
-            distributed.stop(self.world, failed=outcome == "failed")
-        if number:
-            raise stopped(number, f"step {self.progress.step} in {self.context.work_dir}")
-        return self.context.work_dir
-
-    @property
-    def world(self) -> World:
-        """This process among those that train; known from ``_build_vla`` on."""
-        if self._world is None:
-            raise RuntimeError("the world is known from _build_vla on")
-        return self._world
-
-    @property
-    def loop(self) -> StepLoop:
-        """The loop of the present ``run``."""
-        if self._loop is None:
-            raise RuntimeError("there is a loop only inside run()")
-        return self._loop
-
-    @property
-    def model(self) -> nn.Module:
-        """The model without what trains it around it."""
-        return self._unwrap(self.vla)
-
-    @property
-    def compute_dtype(self) -> torch.dtype | None:
-        """What the forward pass computes in; None for the weights' own fp32."""
-        from fluxvla_core.train.precision import compute_dtype
-
-        options = self.options
-        return compute_dtype(options.enable_mixed_precision_training, options.mixed_precision_dtype)
-
-    @property
-    def total_steps(self) -> int:
-        """Optimizer steps of the whole run."""
-        return self._total(self.plan)
-
-    def _prepare(self) -> None:
-        """Join the other ranks, see that checkpoints can be written, choose one to go on from."""
-        from fluxvla_core.train import distributed
-        from fluxvla_core.train.resuming import choose
-
-        if self._world is not None:
-            return
-        self._world = distributed.start(self.options.device, self.needs_process_group)
-        wanted = self.context.resume or self.options.resume_from
-        self._checkpoint = choose(self._world, self.context, wanted)
-
-    def _plan(self, samples: int) -> StepPlan:
-        from fluxvla_core.train.batches import StepPlan
-
-        return StepPlan(
-            samples,
-            self.loader_options.per_device_batch_size,
-            self.options.grad_accumulation_steps,
-            self.world.size,
-            self.options.seed,
-        )
-
-    def _total(self, plan: StepPlan) -> int:
-        return self.max_steps or plan.steps_per_epoch * (self.max_epochs or 0)
-
-    def _steps_due(self) -> bool:
-        every = self.options.save_steps
-        return every is not None and self.progress.step % every == 0

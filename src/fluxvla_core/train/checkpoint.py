@@ -7,6 +7,7 @@ and a robot that reads an embodiment use the same door as the trainer.
         manifest.json            sizes and SHA-256 of everything below
         model.safetensors        weights and buffers, but for frozen ones that the model brings
         ema.safetensors          averaged weights, when they are kept
+        adapter/                 what LoRA trains, as peft has it, instead of in the model's file
         optimizer.safetensors    optimizer state by parameter name, whole (not per rank)
         optimizer.json           its groups and scalars
         trainer.json             step, epoch, cursor, scheduler, last loss
@@ -192,13 +193,6 @@ class Checkpoint:
         if not self.has(name):
             raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
         return read_tensors(self.path / name)
-
-    def inference_weights(self) -> dict[str, torch.Tensor]:
-        """Weights to act with: the saved ones, with the averaged ones in their place if kept."""
-        weights = self.tensors(MODEL)
-        if self.has(EMA):
-            weights.update(self.tensors(EMA))
-        return weights
 
 
 def folders(place: str | Path) -> list[Path]:

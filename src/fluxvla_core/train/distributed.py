@@ -182,7 +182,7 @@ def on_first(world: World, work: Callable[[], str]) -> str:
     return str(told["answer"])
 
 
-def explain(error: RuntimeError, world: World, step: int) -> RunFailed | None:
+def explain(error: Exception, world: World, step: int) -> RunFailed | None:
     """What a broken collective operation means; None if ``error`` is about something else."""
     text = str(error).lower()
     if world.size == 1 or not any(sign in text for sign in _LOST):

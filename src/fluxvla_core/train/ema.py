@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +33,23 @@ class Ema:
                 [_local(p.detach()) for p in self._parameters.values()],
                 1.0 - decay,
             )
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """The model has the averages as its weights inside, and its own again afterwards."""
+        self._swap()
+        try:
+            yield
+        finally:
+            self._swap()
+
+    def _swap(self) -> None:
+        with torch.no_grad():
+            for name, parameter in self._parameters.items():
+                ours, theirs = _local(self.shadow[name]), _local(parameter.detach())
+                kept = theirs.clone()
+                theirs.copy_(ours)
+                ours.copy_(kept)
 
     def load(self, tensors: Mapping[str, Tensor], where: str) -> None:
         """Take the full averages in ``tensors``.

@@ -82,6 +82,12 @@ def loss_of(output: Any, model: nn.Module) -> Tensor:
     return loss
 
 
+def sample_losses_of(output: Any) -> Tensor | None:
+    """``output["sample_losses"]``, ``(B,)``, if the model tells each sample's: for the records."""
+    losses = output.get("sample_losses") if isinstance(output, Mapping) else None
+    return losses.detach() if isinstance(losses, Tensor) else None
+
+
 def checkpoint_activations(model: nn.Module) -> None:
     """Recompute the model's ``fsdp_units`` in the backward pass instead of keeping their insides.
 
@@ -98,6 +104,25 @@ def checkpoint_activations(model: nn.Module) -> None:
         )
     for unit in units:
         unit.__dict__["forward"] = _recomputed(unit.forward, checkpoint)
+
+
+def compile_units(model: nn.Module) -> None:
+    """Compile each of the model's ``fsdp_units`` by itself; names and state stay as they are.
+
+    Only what is inside a unit's ``forward``: what sharding does before and after it, and drawing
+    noise and time, stay outside.
+
+    Raises:
+        ConfigError: the model names no units.
+    """
+    units: list[nn.Module] = getattr(model, "fsdp_units", list)()
+    if not units:
+        raise ConfigError(
+            f"compile_blocks: {type(model).__name__} names no blocks to compile",
+            cause="it has no fsdp_units()",
+        )
+    for unit in units:
+        unit.__dict__["forward"] = torch.compile(unit.forward)
 
 
 def _recomputed(forward: Any, checkpoint: Any) -> Any:

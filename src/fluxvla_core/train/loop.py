@@ -14,10 +14,13 @@ from fluxvla_core.hooks import HookCaller
 from fluxvla_core.train.batches import StepSampler
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.forward import IDS, ForwardArguments, to_device
+from fluxvla_core.train.memory import GB, peak_bytes
 from fluxvla_core.train.optim import trainable
 from fluxvla_core.train.resuming import restore_rng
+from fluxvla_core.train.shelf import name_best
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
+from fluxvla_core.train.validation import Validation
 from fluxvla_core.train.weights import left_out
 from fluxvla_core.train.window import StepRecord, Window
 
@@ -33,7 +36,9 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     if options.ema_decay is not None:
         run.ema = Ema(trainable(run.model), options.ema_decay)
     run.resume()
+    validation = None if run.val_options is None else Validation(run)
     if world.first:
+        name_best(context.work_dir, run.progress.best_step)
         run.metric.start(run.progress.step, context.config)
     sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
     loader = make_loader(
@@ -44,7 +49,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
         pin_memory=world.device.type == "cuda",
         reporter=context.reporter if world.first else None,
     )
-    loop = StepLoop(run, iter(loader), stop)
+    loop = StepLoop(run, iter(loader), stop, validation)
     run.vla.train()
     run.hooks.call("run_started")
     # Last, so that nothing above has drawn from the generators that are restored.
@@ -59,13 +64,21 @@ class StepLoop:
         run: the runner.
         batches: micro-batches of this rank, from the run's cursor on, without end.
         stop: asked after every step.
+        validation: of the run, if it has one.
     """
 
-    def __init__(self, run: Strategy, batches: Iterator[Any], stop: StopRequest) -> None:
+    def __init__(
+        self,
+        run: Strategy,
+        batches: Iterator[Any],
+        stop: StopRequest,
+        validation: Validation | None = None,
+    ) -> None:
         self._run = run
         self._source = self._batches = batches
         self._stop = stop
-        self._window = Window(run.world)
+        self._validation = validation
+        self._window = Window(run.world, getattr(run.dataset, "parts", {}))
 
     def run(self, finished: Callable[[], bool], due: Callable[[], bool]) -> int:
         """Step until ``finished()``, saving whenever ``due()``, and at the end.
@@ -74,22 +87,65 @@ class StepLoop:
             The signal that asked for a stop, 0 if none did.
         """
         run, stopped = self._run, 0
-        if not finished():
-            first = next(self._batches)
-            run._warm_up(to_device(first, run.world.device))
-            self._batches = chain([first], self._batches)
+        if not (finished() or self._enough()):
+            self._look_ahead()
         self._window.restart_clock()
-        while not stopped and not finished():
+        while not (stopped or finished() or self._enough()):
             step = run.progress.step + 1
             run.hooks.call("before_step", step=step)
             self._step(step)
             stopped = self._stop.wanted(step)
-            save = due() or bool(stopped) or finished()
-            if save or step == 1 or step % run.options.log_iter_interval == 0:
-                self._report()
+            save = due() or finished()
+            validate = self._validates(save, finished())
+            if (
+                save
+                or stopped
+                or validate
+                or step == 1
+                or step % run.options.log_iter_interval == 0
+            ):
+                found = self._fetch()
+                better = validate and self._validate(found)
+                self._report(found)
+                save = save or better or bool(stopped) or self._enough()
             if save:
                 self.save()
         return stopped
+
+    def _look_ahead(self) -> None:
+        """Show the first batch to whoever has to see one before the first step."""
+        run = self._run
+        first = next(self._batches)
+        self._batches = chain([first], self._batches)
+        if run.flops is not None and run._arguments is not None:
+            trouble = run.flops.look(run._arguments(first))
+            if trouble is not None and run.world.first:
+                run.context.reporter.warn(f"mfu is not reported: {trouble}")
+        run._warm_up(to_device(first, run.world.device))
+
+    def _enough(self) -> bool:
+        patience = self._run.options.early_stop_patience
+        return patience is not None and self._run.progress.worse >= patience
+
+    def _validates(self, save: bool, last: bool) -> bool:
+        if self._validation is None:
+            return False
+        every = self._run.options.val_iter_interval
+        return last or (save if every is None else self._run.progress.step % every == 0)
+
+    def _validate(self, found: list[dict[str, Any]]) -> bool:
+        """Add the validation loss to the newest of ``found``; whether it is the best so far."""
+        run = self._run
+        assert self._validation is not None
+        loss = found[-1]["val_loss"] = self._validation.loss(run)
+        better = run.progress.validated(loss)
+        if self._enough() and run.world.first:
+            run.context.reporter.info(
+                f"no better validation loss than {run.progress.best:.6g} (step "
+                f"{run.progress.best_step}) in {run.progress.worse} validations: training ends"
+            )
+        self._window.restart_clock()
+        return better
 
     def close(self) -> None:
         """End the loader's workers now; left to the garbage collector it takes them seconds."""
@@ -101,7 +157,7 @@ class StepLoop:
     def _step(self, step: int) -> None:
         run = self._run
         parts = run.options.grad_accumulation_steps
-        losses, ids, waited = [], [], 0.0
+        losses, ids, each, waited = [], [], [], 0.0
         for part in range(parts):
             asked = time.perf_counter()
             batch = to_device(next(self._batches), run.world.device)
@@ -111,6 +167,7 @@ class StepLoop:
                 torch.autograd.backward(loss / parts if parts > 1 else loss)
             losses.append(loss.detach())
             ids.append(batch.get(IDS))
+            each.append(run.sample_losses)
         norm = run.clip_grad_norm()
         rate = run.optimizer.param_groups[0]["lr"]
         run.optimizer.step()
@@ -121,25 +178,33 @@ class StepLoop:
         plan, progress = run.plan, run.progress
         epoch = progress.cursor.epoch + progress.cursor.samples / plan.length
         progress.step, progress.cursor = step, plan.after_step(progress.cursor)
-        self._window.add(step, epoch, rate, losses, ids, norm, plan.step_samples, waited)
+        self._window.add(step, epoch, rate, losses, ids, norm, plan.step_samples, waited, each)
 
-    def _report(self) -> None:
+    def _fetch(self) -> list[dict[str, Any]]:
+        """What the steps since the last time gave, as a metric is given it."""
         run = self._run
         records = self._window.fetch()
-        if not records:
-            return
-        last = records[-1]
-        run.progress.loss = last.loss
+        run.progress.loss = records[-1].loss
         self._stop.pace(sum(r.step_time for r in records) / len(records))
+        found = [as_metrics(record) for record in records]
+        if run.flops is not None:
+            for values in found:
+                parts = run.options.grad_accumulation_steps
+                values["mfu"] = run.flops.mfu(parts, values["step_time"])
+        found[-1]["memory_gb"] = peak_bytes(run.world.device.type == "cuda") / GB
+        return found
+
+    def _report(self, found: list[dict[str, Any]]) -> None:
+        run = self._run
         if not run.world.first:
             return
-        for record in records:
-            run.metric.commit(**as_metrics(record))
-        shown = dict(as_metrics(last))
-        shown.pop("global_step")
+        for values in found:
+            run.metric.commit(**values)
+        shown = dict(found[-1])
+        step = shown.pop("global_step")
         run.metric.push()
-        run.context.reporter.progress("train", last.step, run.total_steps, **shown)
-        run.hooks.call("after_step", step=last.step, metrics=shown)
+        run.context.reporter.progress("train", step, run.total_steps, **shown)
+        run.hooks.call("after_step", step=step, metrics=shown)
 
     def save(self) -> None:
         """A checkpoint of where the run stands, unless there is one already."""
@@ -152,6 +217,8 @@ class StepLoop:
             run.context.work_dir, progress.step, progress.cursor.epoch, progress.loss
         )
         progress.saved = progress.step
+        if run.world.first and progress.best_step == progress.step:
+            name_best(run.context.work_dir, progress.step)
         self._window.restart_clock()
 
 
@@ -167,4 +234,5 @@ def as_metrics(record: StepRecord) -> dict[str, Any]:
         "step_time": seconds,
         "samples_per_s": record.samples_per_s,
         "data_wait": record.data_wait / seconds if seconds > 0 else 0.0,
+        **{f"loss/{name}": loss for name, loss in record.by_dataset.items()},
     }

@@ -40,11 +40,6 @@ def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
     return [group for group in groups if group["params"]]
 
 
-def make_adamw(model: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
-    """AdamW over :func:`decay_groups`, in one fused kernel (CPU and CUDA have one)."""
-    return torch.optim.AdamW(decay_groups(model, weight_decay), lr=learning_rate, fused=True)
-
-
 def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:
     """Scale gradients in place so that their norm over all ranks is at most ``max_norm``.
 

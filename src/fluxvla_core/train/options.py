@@ -10,6 +10,7 @@ from typing import Any
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.check import LOADER_KEYS
 from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.train.lora import LoraOptions, check_installed
 from fluxvla_core.train.schedule import make_schedule
 
 DTYPES = ("bf16",)
@@ -37,11 +38,17 @@ class TrainOptions:
     enable_mixed_precision_training: bool
     mixed_precision_dtype: str
     enable_gradient_checkpointing: bool
+    compile_blocks: bool
+    init_from: str | None
+    lora: Mapping[str, Any] | None
     ema_decay: float | None
+    val_iter_interval: int | None
+    early_stop_patience: int | None
     seed: int
     resume_from: str | None
     log_iter_interval: int
     device: str
+    peak_tflops: float | None
 
     def check(self, context: RunContext) -> None:
         """Refuse values that cannot be meant.
@@ -66,7 +73,13 @@ class TrainOptions:
         if (self.max_epochs is None) == (self.max_steps is None):
             given = "both" if self.max_steps is not None else "none"
             found.append(("max_epochs", f"give max_epochs or max_steps, got {given}"))
-        for key in ("max_epochs", "max_steps", "save_iter_interval"):
+        for key in (
+            "max_epochs",
+            "max_steps",
+            "save_iter_interval",
+            "val_iter_interval",
+            "early_stop_patience",
+        ):
             value = getattr(self, key)
             need(key, value is None or _count(value, 1), "must be a whole number above 0")
         for key in ("save_epoch_interval", "grad_accumulation_steps", "log_iter_interval"):
@@ -91,13 +104,34 @@ class TrainOptions:
         )
         need("sampler", self.sampler in (None, "distributed"), "must be None or 'distributed'")
         need("mixed_precision_dtype", self.mixed_precision_dtype in DTYPES, f"must be in {DTYPES}")
-        for key in ("enable_mixed_precision_training", "enable_gradient_checkpointing"):
+        need(
+            "peak_tflops",
+            self.peak_tflops is None or _positive(self.peak_tflops),
+            "must be a positive number, or None",
+        )
+        for key in (
+            "enable_mixed_precision_training",
+            "enable_gradient_checkpointing",
+            "compile_blocks",
+        ):
             need(key, isinstance(getattr(self, key), bool), "must be true or false")
         try:
             make_schedule(self.lr_scheduler_type, 1.0, 100, self.warmup_ratio, self.lr_schedule)
         except ConfigError as error:
             found.append(("lr_scheduler_type", error.what))
         return found
+
+    def lora_options(self, context: RunContext) -> LoraOptions | None:
+        """The table ``lora``, checked; None without one.
+
+        Raises:
+            ConfigError: it cannot be meant, or peft is not installed.
+        """
+        if self.lora is None:
+            return None
+        where = context.where(f"{context.section}.lora")
+        check_installed(where)
+        return LoraOptions.read(self.lora, where)
 
     @property
     def save_steps(self) -> int | None:
@@ -115,13 +149,40 @@ class LoaderOptions:
     per_device_num_workers: int = 0
 
     @classmethod
-    def read(cls, config: Mapping[str, Any], context: RunContext) -> LoaderOptions:
+    def for_validation(
+        cls, config: Mapping[str, Any], context: RunContext, options: TrainOptions
+    ) -> LoaderOptions | None:
+        """``val_dataloader`` of the config, None without one; it takes over the batch size.
+
+        Raises:
+            ConfigError: it cannot be meant, or something is asked of it and it is not there.
+        """
+        if config.get("val_dataloader") is None:
+            for key in ("val_iter_interval", "early_stop_patience"):
+                if getattr(options, key) is not None:
+                    raise ConfigError(
+                        f"{key} needs a val_dataloader, which the config does not have",
+                        where=context.where(f"{context.section}.{key}"),
+                        next="val_dataloader = dict(dataset=dict(type=…, episodes=[…]))",
+                    )
+            return None
+        train = {k: v for k, v in config["train_dataloader"].items() if k != "dataset"}
+        table = {**train, **config["val_dataloader"]}
+        if table.get("dataset") is None:
+            raise ConfigError(
+                "val_dataloader needs a dataset", where=context.where("val_dataloader")
+            )
+        return cls.read({"val_dataloader": table}, context, "val_dataloader")
+
+    @classmethod
+    def read(
+        cls, config: Mapping[str, Any], context: RunContext, section: str = "train_dataloader"
+    ) -> LoaderOptions:
         """Take and check the table.
 
         Raises:
             ConfigError: it is missing, has unknown keys, or values that cannot be meant.
         """
-        section = "train_dataloader"
         table = config.get(section)
         if not isinstance(table, Mapping):
             raise ConfigError(

@@ -20,6 +20,7 @@ from fluxvla_core.train.checkpoint import (
     newest_whole,
 )
 from fluxvla_core.train.distributed import World, on_first
+from fluxvla_core.train.lora import adapter_tensors
 from fluxvla_core.train.optim import torch_state
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
@@ -131,7 +132,7 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     warning = check_same_run(saved, run.plan, where)
     if warning and run.world.first:
         run.context.reporter.warn(warning)
-    tensors = checkpoint.tensors(MODEL)
+    tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
     check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
     run._load_model_state(tensors)
     state = torch_state(

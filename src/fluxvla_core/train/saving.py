@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.resolved import environment
 from fluxvla_core.train import checkpoint as ckpt
+from fluxvla_core.train import lora
 from fluxvla_core.train.distributed import World, gather, on_first
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.optim import named_state
@@ -37,6 +38,7 @@ class Snapshot:
         model: unwrapped of what trains it.
         left_out: frozen weights that are not saved.
         trainer: ``trainer.json``.
+        adapter: what LoRA trains, by peft's names; it is not among the model's file.
         documents: file name -> JSON object, fixed for the run.
         folders: folder name -> what fills it.
     """
@@ -46,6 +48,7 @@ class Snapshot:
     trainer: Mapping[str, Any]
     left_out: LeftOut = field(default_factory=LeftOut)
     ema: Ema | None = None
+    adapter: Mapping[str, Tensor] = field(default_factory=dict)
     documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     folders: Mapping[str, Callable[[Path], Any]] = field(default_factory=dict)
 
@@ -58,8 +61,11 @@ def save_snapshot(
     snapshot: Snapshot,
     keep: int,
     warn: Callable[[str], None],
+    spare: int | None = None,
 ) -> Path:
     """Write the checkpoint of ``step``, then remove all but the ``keep`` newest (0: keep all).
+
+    The one of step ``spare`` stays too.
 
     Every rank calls this; the first one writes. Old ones that cannot be removed are only warned
     of.
@@ -69,7 +75,10 @@ def save_snapshot(
     """
     writer = CheckpointWriter(work_dir, step, epoch) if world.first else None
     with writer or nullcontext():
-        save_tensors(writer, ckpt.MODEL, model_tensors(snapshot.model, snapshot.left_out.names))
+        elsewhere = {*snapshot.left_out.names, *lora.adapter_names(snapshot.model)}
+        save_tensors(writer, ckpt.MODEL, model_tensors(snapshot.model, elsewhere))
+        if snapshot.adapter:
+            save_tensors(writer, lora.WEIGHTS, snapshot.adapter)
         if snapshot.ema is not None:
             save_tensors(writer, ckpt.EMA, snapshot.ema.shadow)
         tensors, described = named_state(snapshot.model, snapshot.optimizer)
@@ -86,7 +95,7 @@ def save_snapshot(
                 writer.write_folder(name, fill)
             path = writer.commit()
             try:
-                rotate(work_dir, keep)
+                rotate(work_dir, keep, spare=spare)
             except OSError as error:
                 warn(f"old checkpoints could not be removed: {error}")
             return str(path)
@@ -115,6 +124,11 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         only_trainable: leave out frozen weights that the model brings itself.
     """
     without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
+    state = model_tensors(run.model)
+    adapter = {theirs: state[name] for name, theirs in lora.adapter_names(run.model).items()}
+    documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
+    if run.lora is not None:
+        documents[lora.CONFIG] = run.lora.for_peft(run.options.init_from)
     trainer = {
         **run.progress.to_dict(),
         "train_loss": train_loss,
@@ -132,7 +146,8 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         trainer,
         without,
         run.ema,
-        run_documents(run.context, run.dataset, run.model) if run.world.first else {},
+        adapter,
+        documents,
         run_folders(run.dataset, run.tokenizer),
     )
 

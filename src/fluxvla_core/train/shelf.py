@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.train.checkpoint import FOLDER, folders, step_of
+from fluxvla_core.train.checkpoint import FOLDER, folders, step_name, step_of
 from fluxvla_core.train.disk import Disk, aside
 
 PARTIAL = ".partial"
 REMOVING = ".removing"
+BEST = "best"
 
 
 def prepare(work_dir: Path) -> None:
@@ -32,18 +34,33 @@ def prepare(work_dir: Path) -> None:
         ) from error
 
 
-def rotate(work_dir: Path, keep: int, disk: Disk | None = None) -> list[Path]:
+def rotate(
+    work_dir: Path, keep: int, disk: Disk | None = None, spare: int | None = None
+) -> list[Path]:
     """Remove all but the ``keep`` newest checkpoints by step (0 keeps all); return the removed.
+
+    The one of step ``spare`` stays too.
 
     A folder loses its name before its files: a kill in between leaves no torn checkpoint.
     """
     disk = disk or Disk()
-    removed = folders(work_dir)[:-keep] if keep else []
+    removed = [f for f in folders(work_dir)[:-keep] if step_of(f) != spare] if keep else []
     for folder in removed:
         doomed = folder.with_name(folder.name + REMOVING)
         disk.rename(folder, doomed)
         disk.remove_folder(doomed)
     return removed
+
+
+def name_best(work_dir: Path, step: int) -> None:
+    """Let ``checkpoints/best`` point to the checkpoint of ``step``, if that is there."""
+    link = work_dir / FOLDER / BEST
+    if not (link.parent / step_name(step)).is_dir():
+        return
+    aside = link.with_name(f".{BEST}.{os.getpid()}")
+    aside.unlink(missing_ok=True)
+    aside.symlink_to(step_name(step))
+    os.replace(aside, link)
 
 
 def set_aside_later(work_dir: Path, step: int, disk: Disk | None = None) -> list[Path]:

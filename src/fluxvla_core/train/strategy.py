@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from fluxvla_core.train.checkpoint import Checkpoint
     from fluxvla_core.train.distributed import World
     from fluxvla_core.train.ema import Ema
+    from fluxvla_core.train.flops import Meter
     from fluxvla_core.train.forward import ForwardArguments
+    from fluxvla_core.train.lora import LoraOptions
     from fluxvla_core.train.options import LoaderOptions, TrainOptions
     from fluxvla_core.train.progress import Progress
     from fluxvla_core.train.weights import LeftOut
@@ -37,6 +39,10 @@ class Strategy(Protocol):
     progress: Progress
     ema: Ema | None
     left_out: LeftOut | None
+    lora: LoraOptions | None
+    flops: Meter | None
+    sample_losses: Tensor | None
+    val_options: LoaderOptions | None
     dataset: Any
     tokenizer: Any
     metric: Any

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.checkpoint import MODEL, TRAINER, Checkpoint
-from fluxvla_core.train.tensors import check_names, like
+from fluxvla_core.train import lora
+from fluxvla_core.train.checkpoint import EMA, MODEL, TRAINER, Checkpoint
+from fluxvla_core.train.tensors import check_names, like, read_tensors
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,12 @@ def left_out(model: nn.Module) -> LeftOut:
         if (source := getattr(module, "frozen_source", None)) is not None
     }
     state = model.state_dict(keep_vars=True)
+    # What stands in no part by itself but in the whole model may be a buffer that training changes.
     names = frozenset(
         name
         for name, tensor in state.items()
-        if not tensor.requires_grad and any(_inside(name, prefix) for prefix in sources)
+        if not tensor.requires_grad
+        and any(_inside(name, p) and (p or isinstance(tensor, nn.Parameter)) for p in sources)
     )
     digest = hashlib.sha256()
     for name in sorted(names):
@@ -122,12 +126,52 @@ def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
 def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     """Put a checkpoint's weights (the averaged ones if kept) into a freshly built ``model``.
 
+    Adapters are merged: the model keeps its names, and which of its parts are trainable.
+
     Raises:
         CheckpointError: they are not this model's, or frozen parts have changed.
     """
-    tensors = checkpoint.inference_weights()
     saved = checkpoint.json(TRAINER)["left_out"]
+    options = lora.LoraOptions.of_checkpoint(checkpoint)
+    trained = {name: p.requires_grad for name, p in model.named_parameters()}
+    if options is not None:
+        base = saved.get("sources", {}).get("")
+        if base is not None:
+            start_from(model, base)
+            model.__dict__["frozen_source"] = base
+        lora.attach(model, options)
+    tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
+    if checkpoint.has(EMA):
+        tensors.update(checkpoint.tensors(EMA))
     check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
+    put_model_tensors(model, tensors)
+    if options is not None:
+        lora.merge_(model)
+        model.__dict__.pop("frozen_source", None)
+        for name, parameter in model.named_parameters():
+            parameter.requires_grad_(trained[name])
+
+
+def start_from(model: nn.Module, place: str | Path) -> None:
+    """Give a freshly built ``model`` the weights of another training, or of an export.
+
+    Args:
+        place: a checkpoint's folder, a work dir (its newest one), or a safetensors file.
+
+    Raises:
+        CheckpointError: there is nothing there, it is damaged, or it is of another model.
+    """
+    path = Path(place)
+    if path.suffix != ".safetensors":
+        checkpoint = Checkpoint.open(path)
+        checkpoint.verify()
+        load_for_inference(model, checkpoint)
+        return
+    if not path.is_file():
+        raise CheckpointError(f"there are no weights at {path}")
+    tensors = read_tensors(path)
+    brings = left_out(model).names - set(tensors)
+    check_names(tensors, model_tensors(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -23,6 +24,8 @@ from fluxvla_core.train.distributed import World, texts, total
 class StepRecord:
     """One step over all ranks: mean loss, gradient norm (None without clipping), and times.
 
+    ``by_dataset`` is the mean loss of the samples of each dataset that the step used.
+
     ``data_wait`` and ``step_time`` are seconds, means over the ranks; ``lr`` is the rate used.
     """
 
@@ -34,6 +37,7 @@ class StepRecord:
     step_time: float
     data_wait: float
     samples_per_s: float
+    by_dataset: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -43,6 +47,7 @@ class _Pending:
     lr: float
     losses: list[Tensor]
     ids: list[Any]
+    each: list[Tensor | None]
     norm: Tensor | None
     samples: int
     wait: float
@@ -51,9 +56,13 @@ class _Pending:
 
 @dataclass
 class Window:
-    """Collects steps until :meth:`fetch`. All ranks fetch at the same steps."""
+    """Collects steps until :meth:`fetch`. All ranks fetch at the same steps.
+
+    ``parts`` maps the datasets of a mixture to how many sample ids each has, in their order.
+    """
 
     world: World
+    parts: Mapping[str, int] = field(default_factory=dict)
     began: float = field(default_factory=time.perf_counter)
     _pending: list[_Pending] = field(default_factory=list)
 
@@ -71,13 +80,17 @@ class Window:
         norm: Tensor | None,
         samples: int,
         wait: float,
+        each: Sequence[Tensor | None] = (),
     ) -> None:
         """Keep one step: a loss and the sample ids of each micro-batch, all still on the device.
 
+        ``each`` are the losses ``(B,)`` of a micro-batch's samples, where the model tells them.
         ``samples`` is over all ranks; ``wait`` the seconds spent waiting for data.
         """
         now = time.perf_counter()
-        self._pending.append(_Pending(step, epoch, lr, losses, ids, norm, samples, wait, now))
+        self._pending.append(
+            _Pending(step, epoch, lr, losses, ids, list(each), norm, samples, wait, now)
+        )
 
     def fetch(self) -> list[StepRecord]:
         """Everything since the last fetch, averaged over ranks; the host waits for the device.
@@ -100,6 +113,7 @@ class Window:
         mean /= self.world.size
         if not bool(torch.isfinite(mean[:2]).all()):
             raise self._not_finite(steps, losses, mean)
+        shares = self._by_dataset(steps)
         return [
             StepRecord(
                 step=s.step,
@@ -110,8 +124,31 @@ class Window:
                 step_time=seconds,
                 data_wait=wait,
                 samples_per_s=s.samples / seconds if seconds > 0 else 0.0,
+                by_dataset=share,
             )
-            for s, loss, norm, seconds, wait in zip(steps, *mean.tolist(), strict=True)
+            for s, share, loss, norm, seconds, wait in zip(
+                steps, shares, *mean.tolist(), strict=True
+            )
+        ]
+
+    def _by_dataset(self, steps: list[_Pending]) -> list[dict[str, float]]:
+        if len(self.parts) < 2:
+            return [{} for _ in steps]
+        # Sums and counts of every step and dataset: ranks without the one add zeros.
+        sums = torch.zeros(2, len(steps), len(self.parts), dtype=torch.float64)
+        ends = torch.tensor(list(self.parts.values())).cumsum(0)
+        for row, step in enumerate(steps):
+            for losses, ids in zip(step.each, step.ids, strict=False):
+                if losses is None or not isinstance(ids, Tensor):
+                    continue
+                part = torch.bucketize(ids.cpu(), ends, right=True).clamp(max=len(ends) - 1)
+                sums[0, row].index_add_(0, part, losses.double().cpu())
+                sums[1, row].index_add_(0, part, torch.ones(len(part), dtype=torch.float64))
+        summed, counts = total(self.world, sums)
+        means = summed / counts
+        return [
+            {name: m for name, m, n in zip(self.parts, row, count, strict=True) if n}
+            for row, count in zip(means.tolist(), counts.tolist(), strict=True)
         ]
 
     def _not_finite(self, steps: list[_Pending], losses: Tensor, mean: Tensor) -> RunFailed:

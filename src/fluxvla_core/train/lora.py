@@ -1,0 +1,227 @@
+"""Low-rank adapters (LoRA, Hu et al. 2021) by way of peft, for every strategy.
+
+peft puts its layers into the model in place, so that it stays the class that it is. What is
+trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the base stays where
+``init_from`` says that it came from, and a sum in the checkpoint proves that it is still the same.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+from fluxvla_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from fluxvla_core.train.checkpoint import Checkpoint
+
+FOLDER = "adapter"
+WEIGHTS = f"{FOLDER}/adapter_model.safetensors"
+CONFIG = f"{FOLDER}/adapter_config.json"
+_PREFIX = "base_model.model."
+_OURS = re.compile(r"\.(?:modules_to_save|lora_\w+)\.default(?=\.|$)")
+
+
+@dataclass(frozen=True)
+class LoraOptions:
+    """The table ``lora`` of a train runner.
+
+    Args:
+        rank: of the added matrices.
+        alpha: their sum is scaled by ``alpha / rank``; ``rank`` if not given.
+        dropout: on their input.
+        target_modules: linear and convolution layers that get one: ends of names, or one regular
+            expression for whole names.
+        modules_to_save: modules, by the ends of their names, that are trained as a whole.
+    """
+
+    rank: int
+    target_modules: tuple[str, ...] | str
+    alpha: float | None = None
+    dropout: float = 0.0
+    modules_to_save: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, table: Any, where: str | None) -> LoraOptions:
+        """Take and check the table.
+
+        Raises:
+            ConfigError: unknown or missing keys, or values that cannot be meant.
+        """
+        known = [field.name for field in fields(cls)]
+        if not isinstance(table, Mapping):
+            raise ConfigError(f"lora must be a table, got {table!r}", where=where)
+        for key in table:
+            if key not in known:
+                near = difflib.get_close_matches(key, known, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
+                raise ConfigError(f"lora has no {key!r}; {hint}", where=where)
+        lacking = [key for key in ("rank", "target_modules") if key not in table]
+        if lacking:
+            raise ConfigError(f"lora needs {' and '.join(map(repr, lacking))}", where=where)
+        values: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list | tuple) else v for k, v in table.items()
+        }
+        options = cls(**values)
+        for key, fine, rule in (
+            ("rank", _whole(options.rank), "a whole number above 0"),
+            ("alpha", options.alpha is None or _number(options.alpha), "a positive number"),
+            (
+                "dropout",
+                options.dropout == 0 or (_number(options.dropout) and options.dropout < 1),
+                "at least 0 and below 1",
+            ),
+            (
+                "target_modules",
+                bool(options.target_modules)
+                and (isinstance(options.target_modules, str) or _names(options.target_modules)),
+                "names, or one regular expression",
+            ),
+            ("modules_to_save", _names(options.modules_to_save), "names of modules"),
+        ):
+            if not fine:
+                value = getattr(options, key)
+                raise ConfigError(f"lora.{key} must be {rule}, got {value!r}", where=where)
+        return options
+
+    def for_peft(self, base: str | None = None) -> dict[str, Any]:
+        """``adapter_config.json`` as peft reads it; ``base`` is where the base weights are from."""
+        targets = self.target_modules
+        return {
+            "peft_type": "LORA",
+            "r": self.rank,
+            "lora_alpha": self.alpha if self.alpha is not None else self.rank,
+            "lora_dropout": self.dropout,
+            "target_modules": targets if isinstance(targets, str) else list(targets),
+            "modules_to_save": list(self.modules_to_save) or None,
+            "base_model_name_or_path": base,
+            "inference_mode": True,
+        }
+
+    @classmethod
+    def of_checkpoint(cls, checkpoint: Checkpoint) -> LoraOptions | None:
+        """The adapter that a checkpoint holds, None if it holds none."""
+        if not checkpoint.has(CONFIG):
+            return None
+        saved = checkpoint.json(CONFIG)
+        targets = saved["target_modules"]
+        return cls(
+            saved["r"],
+            targets if isinstance(targets, str) else tuple(targets),
+            saved["lora_alpha"],
+            saved["lora_dropout"],
+            tuple(saved["modules_to_save"] or ()),
+        )
+
+
+def check_installed(where: str | None) -> None:
+    """Refuse ``lora`` before anything is built where peft is missing.
+
+    Raises:
+        ConfigError: with the pip command.
+    """
+    import importlib.util
+
+    if importlib.util.find_spec("peft") is None:
+        raise ConfigError(
+            "lora needs the package peft, which is not installed",
+            where=where,
+            next="pip install 'fluxvla-core[lora]'",
+        )
+
+
+def attach(model: nn.Module, options: LoraOptions, where: str | None = None) -> None:
+    """Freeze ``model`` and put trainable adapters into it, drawn from torch's generator.
+
+    Raises:
+        ConfigError: no module has such a name, or one is of a kind that takes no adapter.
+    """
+    from peft import LoraConfig, inject_adapter_in_model
+
+    check = [n for n in options.modules_to_save if not _ends(model, n)]
+    if check:
+        raise ConfigError(
+            f"lora.modules_to_save: no module's name ends in {check[0]!r}",
+            where=where,
+            next=f"the model has {_some(model)}",
+        )
+    settings = {k: v for k, v in options.for_peft().items() if k != "inference_mode"}
+    try:
+        inject_adapter_in_model(LoraConfig(**settings), model)
+    except ValueError as error:
+        raise ConfigError(
+            f"lora.target_modules: {str(error).splitlines()[0]}",
+            where=where,
+            next=f"the model has {_some(model)}",
+        ) from error
+
+
+def adapter_names(model: nn.Module) -> dict[str, str]:
+    """Names of what the adapters added to ``state_dict`` -> their names in peft's files."""
+    names = [name for name in model.state_dict(keep_vars=True) if _OURS.search(name)]
+    return {name: _PREFIX + _peft_name(name) for name in names}
+
+
+def adapter_tensors(model: nn.Module, checkpoint: Checkpoint) -> dict[str, Tensor]:
+    """The checkpoint's adapter under the names that ``model`` has for it.
+
+    What ``model`` does not have keeps peft's name, so that it is noticed as unexpected.
+    """
+    if not checkpoint.has(WEIGHTS):
+        return {}
+    ours = {theirs: name for name, theirs in adapter_names(model).items()}
+    return {ours.get(name, name): t for name, t in checkpoint.tensors(WEIGHTS).items()}
+
+
+def merge_(model: nn.Module) -> None:
+    """Add the adapters to the layers that they stand beside, in place; none leaves no trace.
+
+    The model then has the names, the classes and the size that it had before :func:`attach`.
+    """
+    from peft.tuners.tuners_utils import BaseTunerLayer
+    from peft.utils import ModulesToSaveWrapper
+
+    for name, module in list(model.named_modules()):
+        if isinstance(module, ModulesToSaveWrapper):
+            plain = module.modules_to_save["default"]
+        elif isinstance(module, BaseTunerLayer):
+            module.merge(safe_merge=True)
+            plain = module.get_base_layer()
+        else:
+            continue
+        parent, _, child = name.rpartition(".")
+        setattr(model.get_submodule(parent), child, plain)
+    model.__dict__.pop("peft_config", None)
+
+
+def _peft_name(name: str) -> str:
+    # modules_to_save.default.weight -> weight; lora_A.default.weight -> lora_A.weight
+    return re.sub(
+        r"\.default(?=\.|$)", "", name.replace(".modules_to_save.default", "", 1), count=1
+    )
+
+
+def _ends(model: nn.Module, end: str) -> bool:
+    return any(n == end or n.endswith("." + end) for n, _ in model.named_modules() if n)
+
+
+def _some(model: nn.Module) -> str:
+    leaves = [n for n, m in model.named_modules() if n and not any(True for _ in m.children())]
+    return ", ".join(leaves[:8]) + (" …" if len(leaves) > 8 else "")
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
+
+
+def _names(value: Sequence[Any]) -> bool:
+    return isinstance(value, tuple) and all(isinstance(item, str) for item in value)

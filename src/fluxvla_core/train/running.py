@@ -1,0 +1,168 @@
+"""What every train runner does the same way: the frame of a run, and what it knows of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.train.options import LoaderOptions, TrainOptions
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+    from fluxvla_core.hooks import HookCaller
+    from fluxvla_core.train.batches import StepPlan
+    from fluxvla_core.train.checkpoint import Checkpoint
+    from fluxvla_core.train.distributed import World
+    from fluxvla_core.train.ema import Ema
+    from fluxvla_core.train.flops import Meter
+    from fluxvla_core.train.forward import ForwardArguments
+    from fluxvla_core.train.loop import StepLoop
+    from fluxvla_core.train.lora import LoraOptions
+    from fluxvla_core.train.progress import Progress
+    from fluxvla_core.train.strategy import Strategy
+    from fluxvla_core.train.weights import LeftOut
+
+
+class TrainRun:
+    """The part of ``BaseTrainRunner`` that no strategy overrides."""
+
+    cfg: Mapping[str, Any]
+    context: RunContext
+    options: TrainOptions
+    loader_options: LoaderOptions
+    val_options: LoaderOptions | None
+    lora: LoraOptions | None
+    max_epochs: int | None
+    max_steps: int | None
+    metric: Any
+    hooks: HookCaller
+    plan: StepPlan
+    progress: Progress
+    needs_process_group: ClassVar[bool]
+    vla: Any = None
+    optimizer: Any = None
+    lr_scheduler: Any = None
+    dataset: Any = None
+    ema: Ema | None = None
+    left_out: LeftOut | None = None
+    flops: Meter | None = None
+    sample_losses: Tensor | None = None
+    _world: World | None = None
+    _checkpoint: Checkpoint | None = None
+    _arguments: ForwardArguments | None = None
+    _loop: StepLoop | None = None
+
+    if TYPE_CHECKING:
+
+        def _unwrap(self, vla: nn.Module) -> nn.Module: ...
+        def _run_epoch_based(self) -> int: ...
+        def _run_step_based(self) -> int: ...
+
+    def run(self, vla_dataset: Any) -> Path:
+        """Train on ``vla_dataset`` (``get_sample(index, epoch)``, ``__len__``) to the end.
+
+        Returns:
+            The work dir, with the last checkpoint in it.
+
+        Raises:
+            KeyboardInterrupt: after SIGINT, with everything saved.
+            RunFailed: after SIGTERM, with everything saved; a loss that is not finite; another
+                rank that was lost; a checkpoint that could not be written; memory that ran out.
+            CheckpointError, ConfigError, DataError: the inputs do not fit.
+        """
+        from fluxvla_core.train import distributed, memory
+        from fluxvla_core.train.loop import begin
+        from fluxvla_core.train.progress import Progress
+        from fluxvla_core.train.stop import StopRequest, stopped
+
+        self._prepare()
+        self.progress = Progress()
+        outcome = "failed"
+        try:
+            with StopRequest(self.world) as stop:
+                self._loop = begin(cast("Strategy", self), vla_dataset, stop)
+                steps = self.max_steps is not None
+                number = self._run_step_based() if steps else self._run_epoch_based()
+                self.loop.save()
+            outcome = "interrupted" if number else "ok"
+        except (RuntimeError, MemoryError) as error:
+            step = self.progress.step + 1
+            known = memory.explain(error, step) or distributed.explain(error, self.world, step)
+            if known is None:
+                raise
+            raise known from error
+        finally:
+            if self._loop is not None:
+                self._loop.close()
+            if self.world.first:
+                self.metric.finalize()
+            self.hooks.call("run_finished", outcome=outcome)
+            distributed.stop(self.world, failed=outcome == "failed")
+        if number:
+            raise stopped(number, f"step {self.progress.step} in {self.context.work_dir}")
+        return self.context.work_dir
+
+    @property
+    def world(self) -> World:
+        """This process among those that train; known from ``_build_vla`` on."""
+        if self._world is None:
+            raise RuntimeError("the world is known from _build_vla on")
+        return self._world
+
+    @property
+    def loop(self) -> StepLoop:
+        """The loop of the present ``run``."""
+        if self._loop is None:
+            raise RuntimeError("there is a loop only inside run()")
+        return self._loop
+
+    @property
+    def model(self) -> nn.Module:
+        """The model without what trains it around it."""
+        return self._unwrap(self.vla)
+
+    @property
+    def compute_dtype(self) -> torch.dtype | None:
+        """What the forward pass computes in; None for the weights' own fp32."""
+        from fluxvla_core.train.precision import compute_dtype
+
+        options = self.options
+        return compute_dtype(options.enable_mixed_precision_training, options.mixed_precision_dtype)
+
+    @property
+    def total_steps(self) -> int:
+        """Optimizer steps of the whole run."""
+        return self._total(self.plan)
+
+    def _prepare(self) -> None:
+        """Join the other ranks, see that checkpoints can be written, choose one to go on from."""
+        from fluxvla_core.train import distributed
+        from fluxvla_core.train.resuming import choose
+
+        if self._world is not None:
+            return
+        self._world = distributed.start(self.options.device, self.needs_process_group)
+        wanted = self.context.resume or self.options.resume_from
+        self._checkpoint = choose(self._world, self.context, wanted)
+
+    def _plan(self, samples: int) -> StepPlan:
+        from fluxvla_core.train.batches import StepPlan
+
+        return StepPlan(
+            samples,
+            self.loader_options.per_device_batch_size,
+            self.options.grad_accumulation_steps,
+            self.world.size,
+            self.options.seed,
+        )
+
+    def _total(self, plan: StepPlan) -> int:
+        return self.max_steps or plan.steps_per_epoch * (self.max_epochs or 0)
+
+    def _steps_due(self) -> bool:
+        every = self.options.save_steps
+        return every is not None and self.progress.step % every == 0

@@ -1,0 +1,108 @@
+"""Loss on samples that are not trained on, and what follows from it."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from fluxvla_core.build import build_dataset_from_cfg
+from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.train.distributed import total
+from fluxvla_core.train.forward import to_device
+from fluxvla_core.train.state import rng_state, set_rng_state
+
+if TYPE_CHECKING:
+    from fluxvla_core.train.strategy import Strategy
+
+
+class Validation:
+    """The ``val_dataloader`` of a run.
+
+    Its samples are those of epoch 0 in their order: the same ones, with the same noise, every
+    time. They are normalised by the statistics of the training data. The ranks share them; as in
+    training, the last batch is filled up with the first samples.
+    """
+
+    def __init__(self, run: Strategy) -> None:
+        options = run.val_options
+        assert options is not None
+        table = run.context.config["val_dataloader"]["dataset"]
+        self._dataset = build_dataset_from_cfg(table, run.context)
+        share_statistics(run.dataset, self._dataset)
+        world = run.world
+        sampler = EpochSampler(
+            len(self._dataset),
+            options.per_device_batch_size,
+            rank=world.rank,
+            world=world.size,
+            shuffle=False,
+        )
+        batches: Any = list(sampler.batches(0))
+        self._loader = make_loader(
+            self._dataset,
+            run.collator,
+            batches,
+            options.per_device_num_workers,
+            pin_memory=world.device.type == "cuda",
+        )
+
+    def loss(self, run: Strategy) -> float:
+        """Mean loss over the samples and all ranks, of the averaged weights if they are kept.
+
+        Leaves weights and random generators as they were.
+
+        Raises:
+            RunFailed: it is not finite.
+        """
+        drawn = rng_state()
+        run.vla.eval()
+        with run.ema.in_place() if run.ema is not None else nullcontext(), torch.no_grad():
+            losses = [
+                run._training_step(to_device(batch, run.world.device)) for batch in self._loader
+            ]
+            found = torch.stack(losses).double().cpu()
+            reshard(run.vla)
+        run.vla.train()
+        set_rng_state(drawn)
+        summed = total(run.world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
+        mean = float(summed[0] / summed[1])
+        if not torch.isfinite(summed).all():
+            raise RunFailed(
+                f"the validation loss is {mean} at step {run.progress.step}",
+                cause="a sample of val_dataloader with wrong or huge values, or a learning rate "
+                "that is too high",
+            )
+        return mean
+
+
+def reshard(model: nn.Module) -> None:
+    """Let go of weights that sharding has gathered for a forward pass without a backward pass."""
+    for module in model.modules():
+        again = getattr(module, "reshard", None)
+        if callable(again):
+            again()
+
+
+def share_statistics(train: Any, val: Any) -> None:
+    """Let the ``val`` dataset normalise as ``train`` does.
+
+    Raises:
+        ConfigError: it is of a robot for which the training data have no statistics.
+    """
+    parts = getattr(val, "datasets", None)
+    for dataset in parts if isinstance(parts, list) else [val]:
+        take = getattr(dataset, "use_statistics", None)
+        if take is None:
+            continue
+        name = dataset.statistic_name
+        if name not in train.statistics:
+            raise ConfigError(
+                f"val_dataloader: its statistic_name {name!r} is none of the training data's, "
+                f"{', '.join(train.statistics)}"
+            )
+        take(train.statistics[name])

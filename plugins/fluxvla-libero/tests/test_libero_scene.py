@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fluxvla_libero.drawing import Drawing
 from fluxvla_libero.embodiment import NO_OP, axis_angle
 from fluxvla_libero.require import quiet
-from fluxvla_libero.scene import ENV_SEED, LiberoScene
+from fluxvla_libero.scene import ENV_SEED, SHOWN_GROUPS, LiberoScene
 from fluxvla_libero.suites import can_be_done_in, choose_tasks, goal, init_states, suite_tasks
 
 from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.evaluate.drawing import Drawing
 
 
 def shake(scene, seed, steps=12):
@@ -63,11 +63,11 @@ def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
     robosuites = quat2axisangle(seen["robot0_eef_quat"].copy())
     np.testing.assert_allclose(scene.state[3:6], robosuites, atol=1e-12)
     # What robosuite shows, turned by 180 degrees as everybody does it.
-    drawing = Drawing(scene.model, "reference")
+    drawing = Drawing(scene.model, "reference", SHOWN_GROUPS)
     scene.model.vis.quality.shadowsize = env.sim.model.vis.quality.shadowsize
     scene.model.vis.quality.offsamples = env.sim.model.vis.quality.offsamples
     for camera in ("agentview", "robot0_eye_in_hand"):
-        picture = drawing.picture(scene._shown, camera, 64, 64)
+        picture = drawing.picture(scene._shown, camera, 64, 64)[:, ::-1]
         turned = seen[f"{camera}_image"][::-1, ::-1]
         assert picture.std() > 10, "something is seen"
         np.testing.assert_array_equal(picture, turned)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.evaluate.collecting import Recorded, collect_episodes
+from fluxvla_core.evaluate.drawing import check_render
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_libero.embodiment import CONTROL_HZ, SCENE_CAMERAS, libero_spec
 from fluxvla_libero.suites import SuiteTask, can_be_done_in, choose_tasks
@@ -41,6 +42,7 @@ class Collection:
         camera_names: of the scene's two.
         height, width: of the pictures.
         noise: see ``demonstrate``.
+        render: how pictures are drawn, see ``fluxvla_core.evaluate.drawing``.
 
     Raises:
         ConfigError: a value is impossible.
@@ -55,6 +57,7 @@ class Collection:
     height: int = 224
     width: int = 224
     noise: float = 0.0
+    render: str = "cheap"
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.camera_names if name not in SCENE_CAMERAS]
@@ -62,6 +65,7 @@ class Collection:
             raise ConfigError(
                 f"cameras must be of {', '.join(SCENE_CAMERAS)}, got {list(self.camera_names)}"
             )
+        check_render(self.render)
         if min(self.height, self.width) < 16:
             raise ConfigError(f"pictures of {self.height}x{self.width} are too small")
         if self.episodes < 1:
@@ -142,5 +146,5 @@ class _Demonstrator:
         if self._scene is None or self._scene.task != task:
             if self._scene is not None:
                 self._scene.close()
-            self._scene = LiberoScene(task)
+            self._scene = LiberoScene(task, self._collection.render)
         return self._scene

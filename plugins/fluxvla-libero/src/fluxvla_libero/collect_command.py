@@ -13,6 +13,8 @@ class CollectLiberoCommand:
     help: ClassVar[str] = "Record demonstrations of a scripted expert in LIBERO's scenes."
 
     def add_arguments(self, parser: Any) -> None:
+        from fluxvla_core.evaluate.drawing import RENDERS
+
         parser.add_argument("--out", required=True, metavar="DIR", help="the dataset to make")
         parser.add_argument("--episodes", type=int, default=100, metavar="N", help="default 100")
         parser.add_argument("--suite", default="libero_object", help="default libero_object")
@@ -31,6 +33,9 @@ class CollectLiberoCommand:
         parser.add_argument("--width", type=int, default=224, help="of the pictures")
         parser.add_argument(
             "--noise", type=float, default=0.0, metavar="SIZE", help="disturb the arm; 0 to 1"
+        )
+        parser.add_argument(
+            "--render", choices=RENDERS, default="cheap", help="how pictures are drawn"
         )
         parser.add_argument(
             "--resume", action="store_true", help="go on with an interrupted collection"
@@ -63,6 +68,7 @@ class CollectLiberoCommand:
             height=args.height,
             width=args.width,
             noise=args.noise,
+            render=args.render,
         )
         reporter = make_reporter(args.log_format)
         try:

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.evaluate import mcnemar, results
+from fluxvla_core.evaluate.drawing import RENDERS
 from fluxvla_core.evaluate.episodes import open_ledger, run_episodes
 from fluxvla_core.evaluate.ledger import EpisodeKey
 from fluxvla_core.evaluate.pool import run_jobs
@@ -69,7 +70,8 @@ class LiberoEvalRunner:
         instruction_swap: repeat every episode with the instruction of another task that could be
             done in the same scene, and test whether the right one does better.
         baseline: repeat every episode with the same model before training.
-        render: ``cheap`` pictures (no shadows, no multisampling), or LIBERO's own: ``reference``.
+        render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones (nor details),
+            or LIBERO's own: ``reference``.
         workers: processes; ``--nproc`` overrides it.
         record_videos: how many episodes to show: failures first, then successes.
         video_fps: must divide 20.
@@ -214,8 +216,8 @@ class LiberoEvalRunner:
         self._settings = replace(settings, max_steps=limit or max_steps(settings.suite))
         if settings.policy not in POLICIES:
             raise self._wrong("policy", f"{settings.policy!r} is none of {', '.join(POLICIES)}")
-        if settings.render not in ("cheap", "reference"):
-            raise self._wrong("render", f"{settings.render!r} is none of cheap, reference")
+        if settings.render not in RENDERS:
+            raise self._wrong("render", f"{settings.render!r} is none of {', '.join(RENDERS)}")
         if not 1 <= self.trials <= TRIALS:
             raise self._wrong("num_trials_per_task", f"must be 1 to {TRIALS}, got {self.trials}")
         if 20 % settings.video_fps:

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, UsageError
+from fluxvla_core.evaluate.drawing import check_render
 from fluxvla_core.evaluate.subject import chosen_checkpoint
 from fluxvla_core.infer.tasks import Task, check_descriptions, tasks
 from fluxvla_core.record.trace import EpisodeTrace, next_folder
-from fluxvla_libero.drawing import check_render
 from fluxvla_libero.embodiment import CONTROL_HZ, SCENE_CAMERAS, check_policy, libero_spec
 from fluxvla_libero.eval_runner import TRIALS
 from fluxvla_libero.policies import NEEDS_CHECKPOINT, POLICIES, Loading, make_policy

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib.util
 import io
 import logging
-import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
 
 from fluxvla_core.errors import MissingPlugin, RunFailed
+from fluxvla_core.evaluate.drawing import use_egl
 
 INSTALL = "pip install 'fluxvla-libero[libero]'"
-APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
 
 def is_installed() -> bool:
@@ -39,10 +36,7 @@ def require_libero() -> ModuleType:
             cause="fluxvla-libero alone brings no simulator: its scenes are 340 MB",
             next=INSTALL,
         )
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "egl")
-        if os.environ["MUJOCO_GL"].lower() == "egl" and "mujoco" not in sys.modules:
-            _check_egl()
+    use_egl()
     try:
         with quiet():
             import libero.libero
@@ -68,14 +62,3 @@ def quiet() -> Iterator[None]:
             yield
     finally:
         log.setLevel(before)
-
-
-def _check_egl() -> None:
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError as error:
-        raise RunFailed(
-            f"the simulator cannot draw: libEGL.so.1 cannot be loaded ({error})",
-            cause="Mesa's EGL is not installed",
-            next=APT,
-        ) from error

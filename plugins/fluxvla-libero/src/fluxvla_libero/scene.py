@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_libero.drawing import Drawing, check_render
+from fluxvla_core.evaluate.drawing import Drawing, check_render
 from fluxvla_libero.embodiment import ACTION_DIM, CONTROL_HZ, NO_OP, axis_angle
 from fluxvla_libero.require import quiet, require_libero
 from fluxvla_libero.suites import SuiteTask, goal
@@ -29,13 +29,16 @@ as well, but draws on from one episode to the next."""
 
 _MAX_TRIES = 20
 
+SHOWN_GROUPS = {0: 0, 1: 1}
+"""As robosuite shows a scene: visual shapes (group 1), no collision shapes (group 0)."""
+
 
 class LiberoScene:
     """The simulation of one task.
 
     Args:
         task: the task.
-        render: ``cheap`` or ``reference`` pictures.
+        render: how pictures are drawn, see ``fluxvla_core.evaluate.drawing``.
 
     Raises:
         MissingPlugin, RunFailed: see ``require_libero``.
@@ -141,11 +144,13 @@ class LiberoScene:
         return all(name in there for state in goal(task) for name in state[1:])
 
     def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
-        """``(height, width, 3)`` uint8 RGB of a camera of the scene, as the public datasets
-        show it: see ``Drawing.picture``."""
+        """``(height, width, 3)`` uint8 RGB of a camera of the scene, as the public datasets show
+        it: robosuite's pictures, which are upside down, turned by 180 degrees. That is upright,
+        with left and right exchanged."""
         if self._drawing is None:
-            self._drawing = Drawing(self.model, self._render)
-        return self._drawing.picture(self._shown, camera, height, width)
+            self._drawing = Drawing(self.model, self._render, SHOWN_GROUPS)
+        upright = self._drawing.picture(self._shown, camera, height, width)
+        return np.ascontiguousarray(upright[:, ::-1])
 
     def state_hash(self) -> str:
         """Of positions and velocities; equal for equal episodes."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 
 from fluxvla_core.contracts.check import check_class, is_train_runner, missing_operator_methods
+from fluxvla_core.contracts.optional import can_continue
 from fluxvla_core.errors import LoadFailed
 
 
@@ -52,3 +53,41 @@ def test_what_an_operator_of_the_specifications_shape_lacks():
 
     lacks = missing_operator_methods(Partial())
     assert lacks == ["embodiment", "connect()", "send_action()", "stop()", "close()"]
+
+
+@pytest.mark.parametrize(
+    ("registry", "required", "method", "problem"),
+    [
+        ("operators", "get_frame", "get_state", "get_state() must accept no argument"),
+        ("operators", "get_frame", "task_done", "task_done() must accept no argument"),
+        ("operators", "get_frame", "task_success", "task_success() must accept no argument"),
+        ("operators", "get_frame", "begin_episode", "begin_episode() must accept 2 arguments"),
+        ("action_filters", None, "bind", "bind() must accept 1 argument"),
+        ("action_filters", None, "reset", "reset() must accept 1 argument"),
+    ],
+)
+def test_what_a_class_may_have_besides_must_take_what_it_is_given(
+    registry, required, method, problem
+):
+    body = {"__call__": lambda self, action: action}
+    if required is not None:
+        body[required] = lambda self: None
+    check_class(registry, type("Plain", (), body), "here")
+    cls = type("Wrong", (), {**body, method: lambda self, a, b, c: None})
+    with pytest.raises(LoadFailed) as caught:
+        check_class(registry, cls, "here")
+    assert problem in str(caught.value)
+
+
+def test_an_action_filter_is_called_with_an_action():
+    with pytest.raises(LoadFailed, match=r"Lazy .*__call__\(\) must accept 1 argument"):
+        cls = type("Lazy", (), {"__call__": lambda self: None})
+        check_class("action_filters", cls, "here")
+
+
+def test_whether_a_policy_can_go_on_from_a_chunk():
+    able = type("Able", (), {"continue_action": lambda self, observation, rest: None})
+
+    assert can_continue(able())
+    assert not can_continue(type("Unable", (able,), {"continues": False})())
+    assert not can_continue(object())

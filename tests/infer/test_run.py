@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from fluxvla_core.control.filters import LowPass, SnapGripper
+from fluxvla_core.control.filters import LowPass
 from fluxvla_core.errors import ConfigError
 
 
@@ -166,16 +166,20 @@ def test_action_filters_come_in_their_order_before_the_limits(bench):
 
 
 def test_a_filter_is_told_where_an_episode_begins(bench):
-    bench.run(action_filters=[LowPass(0.1, columns=[0])], max_publish_step=5)
+    start = -0.5
+    low_pass = LowPass(0.1, joints=["shoulder"])
+    bench.run(action_filters=[low_pass], max_publish_step=5, prepare_pose=[start, 0.0, 0.5])
 
-    wanted = bench.trace()[1]["wanted"][0]
-    assert bench.arm.sent[0][0] == pytest.approx(0.1 * wanted)
+    (first, *_) = [row for row in bench.trace() if row.get("phase") == "run"]
+    # From the start pose, not from where the arm was before it went there.
+    smooth = start + 0.1 * (first["wanted"][0] - start)
+    assert first["command"][0] == pytest.approx(smooth, abs=1e-5)
 
 
 def test_filters_are_built_from_tables_in_the_config(bench):
     tables = [
         {"type": "LowPass", "share": 0.5},
-        {"type": "SnapGripper", "columns": [2], "threshold": 1.1},
+        {"type": "SnapGripper", "threshold": 1.1},
     ]
 
     bench.run(action_filters=tables)
@@ -183,15 +187,22 @@ def test_filters_are_built_from_tables_in_the_config(bench):
     assert bench.arm.sent[-1][2] == 0.0
 
 
-def test_snapping_closes_nearly_closed_grippers_only(bench):
-    (snap,) = SnapGripper.of(bench.arm.embodiment, 0.1)
+def test_nearly_closed_grippers_are_closed_if_asked_for(bench, make_arm):
+    def nearly(chunk):
+        chunk[:, 2] = 0.04
+        return chunk
 
-    np.testing.assert_array_equal(snap(np.array([0.05, 0.05, 0.05])), [0.05, 0.05, 0.0])
-    np.testing.assert_array_equal(snap(np.array([0.05, 0.05, 0.15])), [0.05, 0.05, 0.15])
-    with pytest.raises(ConfigError, match="threshold must not be negative"):
-        SnapGripper([0], threshold=-1)
-    with pytest.raises(ConfigError, match="share must be above 0 and at most 1, got 0"):
-        LowPass(0)
+    for threshold, ends_at in ((None, 0.04), (0.05, 0.0)):
+        bench.arm = make_arm()
+        bench.policy.faults = dict.fromkeys(range(1, 99), nearly)
+        bench.run(gripper_threshold=threshold)
+        assert bench.arm.sent[-1][2] == ends_at
+
+
+def test_a_filter_that_does_not_fit_the_robot_is_said_before_it_is_connected(bench):
+    with pytest.raises(ConfigError, match="LowPass: there is no joint 'jow'; did you mean 'jaw'?"):
+        bench.run(action_filters=[{"type": "LowPass", "share": 0.5, "joints": ["jow"]}])
+    assert bench.arm.calls == []
 
 
 def test_an_operator_that_wants_to_know_is_told_about_each_episode(bench):

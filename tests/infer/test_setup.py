@@ -111,7 +111,15 @@ def test_a_start_pose_that_cannot_be(bench, pose, message):
         ({"state_dim": 7}, "state_dim is 7; testarm has 3 state values"),
         ({"publish_rate": 100}, "publish_rate is 100 Hz; testarm takes up to 50 commands"),
         ({"publish_rate": 25}, "each command to this simulation lasts 1/50 s"),
-        ({"async_execution": True}, "async_execution needs a robot that lives in real time"),
+        ({"chunk_joining": "overlapp"}, "method 'overlapp'; did you mean 'overlap'?"),
+        (
+            {"chunk_joining": "synchronous", "async_execution": True},
+            "chunk_joining is 'synchronous', and async_execution is set",
+        ),
+        (
+            {"chunk_joining": "rtc"},
+            "chunk_joining is 'rtc', and Waver cannot go on from a chunk",
+        ),
         ({"execute_horizon": 0}, "execute_horizon must be at least 1, got 0"),
         ({"action_chunk": 0}, "action_chunk must be at least 1, got 0"),
         ({"max_publish_step": 0}, "max_publish_step must be at least 1, got 0"),

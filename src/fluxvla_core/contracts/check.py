@@ -27,6 +27,13 @@ _METHODS: Mapping[str, Mapping[str, int]] = {
     "environments": {"reset": 2, "step": 1, "observe": 1, "close": 0},
     "policies": {"reset": 1, "predict_action": 1},
     "commands": {"add_arguments": 1, "run": 1},
+    "action_filters": {"__call__": 1},
+}
+# What a class may have besides (contracts.optional); checked where it is there.
+_OPTIONAL: Mapping[str, Mapping[str, int]] = {
+    "operators": {"get_state": 0, "task_done": 0, "task_success": 0, "begin_episode": 2},
+    "policies": {"continue_action": 2},
+    "action_filters": {"bind": 1, "reset": 1},
 }
 _FULL_OPERATOR = {"connect": 0, "get_frame": 0, "send_action": 1, "stop": 0, "close": 0}
 
@@ -49,6 +56,8 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
         wanted = {"run": 1, "run_setup": 1}
     if registry == "transforms" and getattr(cls, "needs_rng", False):
         wanted = {"__call__": 2}
+    optional = _OPTIONAL.get(registry, {})
+    wanted |= {method: count for method, count in optional.items() if hasattr(cls, method)}
     problems = [p for m, n in wanted.items() if (p := _method_problem(cls, m, n))]
     if problems:
         raise LoadFailed(

@@ -71,6 +71,8 @@ class Joiner(ABC):
 
     streamed: ClassVar[bool] = True
     """Whether it is asked at every beat; otherwise a chunk's commands are played in one piece."""
+    continues: ClassVar[bool] = False
+    """Whether the policy is asked to go on from the chunk that is being played."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -89,7 +91,7 @@ class Joiner(ABC):
         """Whether the policy should be asked now, if it is free."""
 
     def ahead(self) -> Ahead | None:
-        """What a policy that can go on from a chunk is told; None for joiners that do not."""
+        """What the policy is told to go on from; None for nothing."""
         return None
 
 

@@ -6,8 +6,8 @@ policy never keeps a command from being sent: without a chunk the arm brakes and
 ``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still
 between commands, observing happens in the sending thread (renderers are bound to one).
 
-The answers to one chunk are played whole before the next is asked for (``Synchronous``), or the
-policy is asked again as soon as it is free while its last answer is being played (``LatestOnly``).
+A chunk is played whole before the next is asked for (``Synchronous``), or the policy is asked again
+while its last answer is being played (the joiners that are ``streamed``).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.protocols import Clock
 from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.joining import Chunk, Joiner
@@ -59,9 +60,10 @@ class Loop:
         path: started at the arm's pose; sends every command.
         joiner: makes one motion of the chunks.
         observe: makes an observation; given the ``(D,)`` command that the arm has.
-        think: asks the policy; ``(T, D)`` keyframes, those to be played.
+        think: asks the policy, which may have to go on from the motion under way; ``(T, D)``
+            keyframes, those to be played.
         admit: checks the keyframes of an answer, and takes note of it.
-        keyframe_hz: keyframes a second.
+        keyframe_hz, horizon: keyframes a second, and in each answer of the policy.
         clock: the operator's.
         lockstep: whether time stands still between commands.
         settings: ``starvation_s`` and ``first_chunk_s``.
@@ -72,21 +74,18 @@ class Loop:
     path: CommandPath
     joiner: Joiner
     observe: Callable[[Array], Seen]
-    think: Callable[[Seen], Any]
+    think: Callable[[Seen, Continuation | None], Any]
     admit: Callable[[Seen, Any], Array]
     keyframe_hz: float
+    horizon: int
     clock: Clock
     lockstep: bool
     settings: SafetySettings
     worker: Worker
     interrupts: Interrupts
 
-    def run(self, whole_chunks: bool) -> str:
+    def run(self) -> str:
         """Run until the beat says that the episode is over.
-
-        Args:
-            whole_chunks: hand a chunk's commands to the robot's loop in one piece, and ask for
-                the next chunk after the last of them.
 
         Returns:
             How it ended: the ``EpisodeOver``'s outcome.
@@ -99,10 +98,10 @@ class Loop:
         try:
             self._receive(*self._first())
             self.path.rate.reset()
-            if whole_chunks:
-                self._play_whole()
-            else:
+            if self.joiner.streamed:
                 self._play_streamed()
+            else:
+                self._play_whole()
         except EpisodeOver as over:
             return over.outcome
 
@@ -122,6 +121,10 @@ class Loop:
                 asked = None
             if asked is None and self.joiner.wants_chunk(now):
                 asked = self._ask()
+                if self.lockstep:
+                    # Time stands still until the answer is there.
+                    self._receive(*self._idle(*asked))
+                    asked = None
             target = self.joiner.target(now + period)
             if target is not None:
                 starved_since = None
@@ -145,15 +148,15 @@ class Loop:
         return np.array(rows)
 
     def _ask(self) -> tuple[Future[tuple[Seen, Any]], Array]:
-        last = self.path.limiter.last
+        last, ahead = self.path.limiter.last, self.joiner.ahead()
+
+        def think(seen: Seen) -> tuple[Seen, Any]:
+            return seen, self.think(seen, ahead and ahead.seen_at(seen.at, self.horizon))
+
         if self.lockstep:
             seen = self.observe(last)
-            return self.worker.submit(lambda: (seen, self.think(seen))), last
-        return self.worker.submit(lambda: self._observe_and_think(last)), last
-
-    def _observe_and_think(self, last: Array) -> tuple[Seen, Any]:
-        seen = self.observe(last)
-        return seen, self.think(seen)
+            return self.worker.submit(lambda: think(seen)), last
+        return self.worker.submit(lambda: think(self.observe(last))), last
 
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
         """The first answer: nothing moves yet, and the policy may have to warm up.

@@ -21,6 +21,7 @@ import difflib
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +100,8 @@ class RealTime(Streamed):
         schedule: see ``soft_mask``.
         window: how many measured latencies are remembered; the longest of them is expected.
     """
+
+    continues: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -21,8 +21,11 @@ from fluxvla_core.build import (
     build_policy_from_cfg,
 )
 from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.optional import can_continue
+from fluxvla_core.control.filters import SnapGripper, bind_filters
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.control.joining import LatestOnly, Synchronous
+from fluxvla_core.control.joiners import make_joiner
+from fluxvla_core.control.joining import Joiner
 from fluxvla_core.control.worker import Worker
 from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.hooks import build_hooks
@@ -60,9 +63,14 @@ class BaseInferenceRunner:
         operator: table or object.
         prepare_pose: where the arm goes before an episode, in the embodiment's units.
         embodiment: of an operator that has none, or narrower limits for one that has.
-        execute_horizon: how many actions of a chunk are executed before the next is asked for;
-            without a meaning, and ignored, where ``async_execution`` asks all the time.
-        async_execution: think while moving; the newest chunk replaces the one before.
+        execute_horizon: how many actions of a chunk are executed before the next is asked for.
+            By default all of them; while chunks are joined in motion, as few as the policy is
+            quick enough for (one, in a simulation whose time stands still meanwhile).
+        async_execution: think while moving: short for ``chunk_joining="latest_only"``.
+        chunk_joining: how chunks become one motion: a name of ``control.joiners.METHODS``, or a
+            table with ``method = '<name>'`` and its parameters. ``synchronous`` by default.
+        gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
+            that it presses on what it holds; in the gripper's unit. None leaves them as they are.
         action_filters: tables or callables that may alter an action, in order, before the limits.
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
@@ -100,6 +108,8 @@ class BaseInferenceRunner:
         embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
         execute_horizon: int | None = None,
         async_execution: bool = False,
+        chunk_joining: str | Mapping[str, Any] | None = None,
+        gripper_threshold: float | None = None,
         action_filters: Sequence[Any] = (),
         safety: Mapping[str, Any] | None = None,
         mixed_precision_dtype: str = "float32",
@@ -122,6 +132,8 @@ class BaseInferenceRunner:
         self.camera_names = None if camera_names is None else tuple(camera_names)
         self.prepare_pose = prepare_pose
         self.async_execution = async_execution
+        self.chunk_joining = self._checked_joining(chunk_joining)
+        self.gripper_threshold = gripper_threshold
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
         self.record = record
@@ -153,13 +165,11 @@ class BaseInferenceRunner:
                 f"is {state_dim}; {self.embodiment.name} has "
                 f"{self.embodiment.state_dim} state values",
             )
-        if async_execution and self.robot.lockstep:
-            raise self._wrong(
-                "async_execution",
-                "needs a robot that lives in real time: this simulation "
-                "waits while the policy thinks (its operator may have realtime=True)",
-            )
         self.action_filters = [build_action_filter_from_cfg(f, context) for f in action_filters]
+        if gripper_threshold is not None:
+            # After the config's own filters, right before the limits.
+            self.action_filters.append(SnapGripper(gripper_threshold))
+        bind_filters(self.action_filters, self.embodiment)
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
         self._episodes = 0
@@ -187,6 +197,12 @@ class BaseInferenceRunner:
                 self.dataset,
                 self.denormalize_action,
                 self.mixed_precision_dtype,
+            )
+        if self._joiner().continues and not can_continue(self.policy):
+            raise self._wrong(
+                "chunk_joining",
+                f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot go on from a "
+                "chunk: neither it nor its model takes what is left of the last one",
             )
         looks_at = tuple(getattr(self.policy, "cameras", self.policy.embodiment.camera_names))
         self._cameras = self.camera_names or looks_at
@@ -274,8 +290,9 @@ class BaseInferenceRunner:
         root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
         folder = next_folder(root, task.name)
         reporter.info(f"task: {task.instruction}")
-        # While it moves and thinks, a chunk is left when the next is there, not before.
-        horizon = None if self.async_execution else self.execute_horizon
+        joiner = self._joiner()
+        # Played in motion, a chunk is left when the next is there, not before.
+        horizon = None if joiner.streamed else self.execute_horizon
         horizons = [n for n in (self.action_chunk, horizon) if n is not None]
         plan = Plan(
             robot=self.robot,
@@ -286,8 +303,7 @@ class BaseInferenceRunner:
             settings=self.safety,
             latch=self.latch,
             filters=self.action_filters,
-            joiner=LatestOnly() if self.async_execution else Synchronous(),
-            whole_chunks=not self.async_execution,
+            joiner=joiner,
             keyframes=min(horizons) if horizons else None,
             most_steps=self.max_publish_step,
             start_pose=self.prepare_pose,
@@ -337,6 +353,24 @@ class BaseInferenceRunner:
                     next="set the camera to the size, or at least the aspect, of the recordings",
                 )
             self.context.reporter.warn(f"{sizes}; they are scaled")
+
+    def _checked_joining(self, value: Any) -> Any:
+        if value is None:
+            return "latest_only" if self.async_execution else "synchronous"
+        try:
+            joiner = make_joiner(value)
+        except ConfigError as error:
+            where = self.context.where(f"{self.context.section}.chunk_joining")
+            raise ConfigError(error.what, where=where) from error
+        if self.async_execution and not joiner.streamed:
+            raise self._wrong("chunk_joining", f"is {value!r}, and async_execution is set")
+        return value
+
+    def _joiner(self) -> Joiner:
+        """A fresh one, that asks as often as ``execute_horizon`` says."""
+        assert self.policy is not None, "run_setup() comes before run()"
+        least = self.execute_horizon or (1 if self.robot.lockstep else 0)
+        return make_joiner(self.chunk_joining, least / self.policy.action_rate_hz)
 
     def _checked_rate(self, publish_rate: float | None) -> float:
         most = self.embodiment.rate_hz

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.control.interrupt import Interrupted
 from fluxvla_core.control.loop import EpisodeOver, Loop, Seen
@@ -87,7 +88,7 @@ class Episode:
             plan.latch.check()
             plan.hooks.call("episode_started", task=self._task.instruction)
             self._begin()
-            outcome = self._loop().run(plan.whole_chunks)
+            outcome = self._loop().run()
             self._phase = "hold"
             self._path.brake(self._most_braking())
         except Interrupted as error:
@@ -112,11 +113,6 @@ class Episode:
         state = self._checked(window, frame)
         self._record.seen(state, window["images"], frame, {})
         self._limiter.start(state[self._columns])
-        pose = self._limiter.last
-        for each in plan.filters:
-            reset = getattr(each, "reset", None)
-            if reset is not None:
-                reset(pose)
         plan.policy.reset(self._seed)
         if plan.start_pose is not None:
             self._phase = "ramp"
@@ -124,6 +120,10 @@ class Episode:
             seconds = len(targets) / plan.rate_hz
             plan.context.reporter.info(f"moving to the start pose, {seconds:.1f} s")
             self._path.play(targets, filtered=False)
+        for each in plan.filters:
+            reset = getattr(each, "reset", None)
+            if reset is not None:
+                reset(self._limiter.last)
         self._rate.reset()
         self._tracking.reset()
         self._phase = "run"
@@ -137,6 +137,7 @@ class Episode:
             think=self._think,
             admit=self._admit,
             keyframe_hz=plan.policy.action_rate_hz,
+            horizon=plan.policy.horizon,
             clock=plan.robot.clock,
             lockstep=plan.robot.lockstep,
             settings=plan.settings,
@@ -203,10 +204,14 @@ class Episode:
         observation = {**window, "task_description": self._task.instruction}
         return Seen(observation, now - age)
 
-    def _think(self, seen: Seen) -> Answer:
+    def _think(self, seen: Seen, rest: Continuation | None) -> Answer:
+        policy: Any = self._plan.policy
         began = time.perf_counter()
         try:
-            chunk = self._plan.policy.predict_action(seen.observation)
+            if rest is None:
+                chunk = policy.predict_action(seen.observation)
+            else:
+                chunk = policy.continue_action(seen.observation, rest)
         except FluxError:
             raise
         except Exception as error:
@@ -240,15 +245,23 @@ class Episode:
     def _on_sent(self, sent: Sent | None) -> None:
         """The beat after each command: recorded always, supervised while it may still stop."""
         plan, record = self._plan, self._record
-        state = plan.robot.state()
+        supervised = self._phase in ("ramp", "run")
+        try:
+            state, problem = plan.robot.state(), None
+        except OperatorError as error:
+            # What was sent is recorded all the same; and a stream that fell silent stops an arm,
+            # it does not keep it from braking.
+            state, problem = None, error
         if sent is not None:
             record.command(sent, self._phase, state)
             if plan.hooks:
                 action = sent.command.copy()
                 action.flags.writeable = False
                 plan.hooks.call("action_sent", action=action, stamp=plan.robot.clock.now())
-        if self._phase not in ("ramp", "run"):
+        if not supervised:
             return
+        if problem is not None:
+            raise problem
         plan.interrupts.check()
         if state is not None and sent is not None and plan.robot.follows:
             self._tracking.check(sent.command, state, plan.robot.clock.now())

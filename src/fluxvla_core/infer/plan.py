@@ -47,7 +47,6 @@ class Plan:
         latch: of the run; an episode does not begin while it is tripped.
         filters: the config's ``action_filters``.
         joiner: how chunks become one motion.
-        whole_chunks: hand a chunk to ``execute`` in one piece.
         keyframes: how many of a chunk's keyframes are played; None plays all.
         most_steps: commands after which the episode ends.
         start_pose: ``(D,)``, where the arm goes first; None stays.
@@ -68,7 +67,6 @@ class Plan:
     latch: Latch
     filters: Sequence[Filter]
     joiner: Joiner
-    whole_chunks: bool
     keyframes: int | None
     most_steps: int
     start_pose: Sequence[float] | None

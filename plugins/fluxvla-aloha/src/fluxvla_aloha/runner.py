@@ -1,10 +1,10 @@
-"""``AlohaInferenceRunner``: a policy on two arms with grippers."""
+"""``AlohaInferenceRunner``: a policy on two arms with grippers, and the same in real time."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from fluxvla_core.control.filters import SnapGripper
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 
 
@@ -12,19 +12,23 @@ class AlohaInferenceRunner(BaseInferenceRunner):
     """Runs a policy on an ALOHA, or on any operator whose embodiment the policy was trained for.
 
     Everything is ``BaseInferenceRunner``'s: ``prepare_pose`` (``fluxvla_aloha.embodiment`` has
-    ``START_POSE``), ``execute_horizon``, ``async_execution`` and the rest.
+    ``START_POSE``), ``execute_horizon``, ``gripper_threshold`` and the rest.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+
+class AlohaRTCInferenceRunner(AlohaInferenceRunner):
+    """``AlohaInferenceRunner`` with real-time chunking, for policies that can go on from a chunk.
 
     Args:
-        gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
-            that it presses on what it holds; in the gripper's unit. None leaves them as they are.
+        chunk_joining: as ``BaseInferenceRunner`` takes it.
         **kwargs: as ``BaseInferenceRunner`` takes them.
     """
 
     api: ClassVar[str] = "1.0"
 
-    def __init__(self, gripper_threshold: float | None = None, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.gripper_threshold = gripper_threshold
-        if gripper_threshold is not None:
-            # After the config's own filters, right before the limits.
-            self.action_filters += SnapGripper.of(self.embodiment, gripper_threshold)
+    def __init__(
+        self, chunk_joining: str | Mapping[str, Any] | None = "rtc", **kwargs: Any
+    ) -> None:
+        super().__init__(chunk_joining=chunk_joining, **kwargs)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from fluxvla_core.control.filters import SnapGripper
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 
 
@@ -12,19 +11,7 @@ class URInferenceRunner(BaseInferenceRunner):
     """Runs a policy on a UR arm, or on any operator whose embodiment the policy was trained for.
 
     Everything is ``BaseInferenceRunner``'s: ``prepare_pose``, ``execute_horizon``,
-    ``async_execution`` and the rest. No pose is built in.
-
-    Args:
-        gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
-            that it presses on what it holds; in the gripper's unit. None leaves them as they are.
-        **kwargs: as ``BaseInferenceRunner`` takes them.
+    ``gripper_threshold`` and the rest. No pose is built in.
     """
 
     api: ClassVar[str] = "1.0"
-
-    def __init__(self, gripper_threshold: float | None = None, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.gripper_threshold = gripper_threshold
-        if gripper_threshold is not None:
-            # After the config's own filters, right before the limits.
-            self.action_filters += SnapGripper.of(self.embodiment, gripper_threshold)

@@ -19,6 +19,10 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "commands": ("collect-libero",),
         "runners": ("LiberoEvalRunner", "LiberoInferenceRunner"),
     },
+    "fluxvla-metaworld": {
+        "environments": ("MetaWorldEnvironment",),
+        "policies": ("MetaWorldExpert",),
+    },
     "fluxvla-models": {
         "heads": ("FlowMatchingHead",),
         "llm_backbones": ("SentenceEncoder",),

@@ -34,14 +34,15 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
-from fluxvla_sim.aloha.demonstrations import demonstrate
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.policies import ExpertPolicy
-from fluxvla_sim.aloha.rollout import rollout
 from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS
+from fluxvla_sim.aloha.tasks import MAX_STEPS
+from fluxvla_sim.aloha.world import ALOHA, CUBE
+from fluxvla_sim.demonstrations import demonstrate
 from fluxvla_sim.eval_runner import AlohaSimEvalRunner
-from fluxvla_sim.eval_worker import AlohaEvalWorker
+from fluxvla_sim.eval_worker import SimEvalWorker
+from fluxvla_sim.policies import ExpertPolicy
+from fluxvla_sim.rollout import rollout
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
@@ -52,6 +53,7 @@ from fluxvla_core.spec.embodiment import Camera
 RESULTS = Path(__file__).with_name("results") / "collection.json"
 CAMERA = Camera("top", 144, 192)
 PICTURES = 10
+TASKS = {task.name: task for task in CUBE.tasks}
 
 
 def pictures() -> dict[str, Callable[[], tuple[float, float]]]:
@@ -81,7 +83,7 @@ class Demonstrate:
         scene = AlohaScene()
         expert, tasks = Expert(scene.model), list(TASKS.values())
         return lambda seed: demonstrate(
-            scene, expert, tasks[seed % len(tasks)], seed, [CAMERA], fps=10
+            CUBE, scene, expert, tasks[seed % len(tasks)], seed, [CAMERA], fps=10
         )
 
 
@@ -117,7 +119,7 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     settings = AlohaSimEvalRunner(policy="expert")._settings
     keys = [EpisodeKey("policy", "lift_hold", seed) for seed in range(episodes)]
     folder = Path(tempfile.mkdtemp())
-    with WorkerPool(partial(AlohaEvalWorker, settings), workers) as pool:
+    with WorkerPool(partial(SimEvalWorker, settings), workers) as pool:
         for _ in pool.run([EpisodeKey("policy", "lift_hold", 10**6)] * workers):
             continue
         ledger = open_ledger(folder / "episodes.jsonl", {}, SilentReporter())
@@ -126,11 +128,13 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
         engine = time.perf_counter() - began
     shutil.rmtree(folder)
     scene, task = AlohaScene(), TASKS["lift_hold"]
-    policy = ExpertPolicy(scene)
-    rollout(scene, policy, task, task.instruction, 10**6, (), settings.replan_every)
+    policy = ExpertPolicy(ALOHA, CUBE, scene)
+    rollout(ALOHA, CUBE, scene, policy, task, task.instruction, 10**6, (), settings.replan_every)
     began = time.perf_counter()
     for key in keys:
-        rollout(scene, policy, task, task.instruction, key.seed, (), settings.replan_every)
+        rollout(
+            ALOHA, CUBE, scene, policy, task, task.instruction, key.seed, (), settings.replan_every
+        )
     bare = time.perf_counter() - began
     return 60 * episodes / engine, 60 * episodes / bare
 

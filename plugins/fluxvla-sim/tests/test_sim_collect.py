@@ -13,13 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fluxvla_sim.aloha import demonstrations
-from fluxvla_sim.aloha.demonstrations import demonstrate, frame_stride, smooth_noise
+from fluxvla_sim import demonstrations
+from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import HOME, AlohaScene
-from fluxvla_sim.aloha.tasks import TASKS
+from fluxvla_sim.aloha.noise import smooth_noise
+from fluxvla_sim.aloha.scene import AlohaScene
+from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.collect import SPARE_STRIDE, Collection, _Demonstrator, collect
 from fluxvla_sim.collect_command import CollectCommand
+from fluxvla_sim.demonstrations import demonstrate, frame_stride
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
@@ -27,6 +29,7 @@ from fluxvla_core.data.writer import staging_of
 from fluxvla_core.errors import ConfigError, RunFailed, UsageError
 from fluxvla_core.spec.embodiment import Camera
 
+TASKS = {task.name: task for task in CUBE.tasks}
 SMALL = Collection(episodes=4, height=48, width=64)
 CAMERA = Camera("top", 48, 64)
 
@@ -52,12 +55,12 @@ def files(root):
 
 def test_frames_are_before_steps_and_actions_one_frame_ahead(scene, expert):
     task = TASKS["transfer_cube"]
-    found = demonstrate(scene, expert, task, 3, [CAMERA], fps=10)
+    found = demonstrate(CUBE, scene, expert, task, 3, [CAMERA], fps=10)
     assert found.images["top"].shape == (50, 48, 64, 3)
     assert found.states.shape == found.actions.shape == (50, 14)
     np.testing.assert_array_equal(found.states[0], HOME)
     scene.reset(3)
-    plan = expert.plan(task.name, scene.cube)
+    plan = expert.plan(task.name, scene.objects)
     # The frame at step 5k goes with the target of step 5k + 4, reached when frame k + 1 is taken.
     np.testing.assert_array_equal(found.actions, plan[4:250:5])
     for command in plan[:10]:
@@ -68,12 +71,12 @@ def test_frames_are_before_steps_and_actions_one_frame_ahead(scene, expert):
 
 def test_noise_disturbs_what_is_done_and_not_what_is_recorded(scene, expert):
     task = TASKS["lift_hold"]
-    clean = demonstrate(scene, expert, task, 3, [], fps=10)
-    noisy = demonstrate(scene, expert, task, 3, [], fps=10, noise=0.02)
+    clean = demonstrate(CUBE, scene, expert, task, 3, [], fps=10)
+    noisy = demonstrate(CUBE, scene, expert, task, 3, [], fps=10, noise=0.02)
     np.testing.assert_array_equal(noisy.actions, clean.actions)
     apart = np.abs(noisy.states - clean.states)
     assert 0.01 < apart[:, :6].max() < 0.15
-    again = demonstrate(scene, expert, task, 3, [], fps=10, noise=0.02)
+    again = demonstrate(CUBE, scene, expert, task, 3, [], fps=10, noise=0.02)
     np.testing.assert_array_equal(again.states, noisy.states)
 
 
@@ -87,7 +90,9 @@ def test_noise_is_slow_smaller_where_it_is_delicate_and_spares_the_grippers():
 
 
 def test_a_failed_demonstration_is_none(scene, expert):
-    assert demonstrate(scene, expert, TASKS["transfer_cube"], 3, [], fps=10, noise=3.0) is None
+    assert (
+        demonstrate(CUBE, scene, expert, TASKS["transfer_cube"], 3, [], fps=10, noise=3.0) is None
+    )
 
 
 @pytest.mark.parametrize("fps", [0.0, 15.0, 60.0])
@@ -112,9 +117,9 @@ def test_where_the_expert_fails_the_episodes_spare_seed_is_taken(monkeypatch):
     tried = []
     real = demonstrations.demonstrate
 
-    def fails_at_first(scene, expert, task, seed, *rest):
+    def fails_at_first(world, scene, expert, task, seed, *rest):
         tried.append(seed)
-        return None if seed < SPARE_STRIDE else real(scene, expert, task, seed, *rest)
+        return None if seed < SPARE_STRIDE else real(world, scene, expert, task, seed, *rest)
 
     monkeypatch.setattr(demonstrations, "demonstrate", fails_at_first)
     found = _Demonstrator(SMALL, [])(2)

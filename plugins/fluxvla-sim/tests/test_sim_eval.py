@@ -9,19 +9,22 @@ import av
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
-from fluxvla_sim.aloha.policies import ExpertPolicy
-from fluxvla_sim.aloha.rollout import rollout
-from fluxvla_sim.aloha.scene import HOME, AlohaScene
-from fluxvla_sim.aloha.tasks import TASKS
+from fluxvla_sim.aloha.arms import HOME
+from fluxvla_sim.aloha.scene import AlohaScene
+from fluxvla_sim.aloha.world import ALOHA, CUBE
 from fluxvla_sim.eval_runner import AlohaSimEvalRunner, count_behaviours
 from fluxvla_sim.eval_worker import policy_cameras
 from fluxvla_sim.operators import AlohaSimOperator
+from fluxvla_sim.policies import ExpertPolicy
+from fluxvla_sim.rollout import rollout
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera
+
+TASKS = {task.name: task for task in CUBE.tasks}
 
 
 class Listener(SilentReporter):
@@ -114,13 +117,23 @@ def watched(scene):
 def test_an_inference_run_sends_the_commands_that_were_evaluated(tmp_path):
     scene, task = AlohaScene(), TASKS["transfer_cube"]
     evaluated = watched(scene)
-    found = rollout(scene, ExpertPolicy(scene), task, task.instruction, 31, (), replan_every=5)
+    found = rollout(
+        ALOHA,
+        CUBE,
+        scene,
+        ExpertPolicy(ALOHA, CUBE, scene),
+        task,
+        task.instruction,
+        31,
+        (),
+        replan_every=5,
+    )
     operator = AlohaSimOperator(camera_names=(), seed=31)
     operator.connect()
     sent = watched(operator._scene)
     inference = BaseInferenceRunner(
         context=RunContext(work_dir=tmp_path, section="inference", task=task.instruction),
-        policy=ExpertPolicy(operator._scene),
+        policy=ExpertPolicy(ALOHA, CUBE, operator._scene),
         operator=operator,
         execute_horizon=5,
         max_publish_step=300,
@@ -154,7 +167,7 @@ class Fixed:
 def test_a_policy_that_does_nothing_fails_both_tasks():
     scene, policy = AlohaScene(), Fixed(np.tile(HOME, (5, 1)))
     camera = Camera("top", 48, 64)
-    found = rollout(scene, policy, TASKS["lift_hold"], "say this", 9, [camera], 5)
+    found = rollout(ALOHA, CUBE, scene, policy, TASKS["lift_hold"], "say this", 9, [camera], 5)
     assert (found.success, found.steps, found.calls) == (False, 300, 12)
     assert found.behaviours == {"transfer_cube": False, "lift_hold": False}
     assert policy.seeds == [9]
@@ -167,7 +180,7 @@ def test_a_policy_that_does_nothing_fails_both_tasks():
 def test_wild_commands_are_kept_within_the_limits():
     scene = AlohaScene()
     wild = np.tile(np.where(np.arange(14) % 2, 1e3, -1e3), (5, 1))
-    found = rollout(scene, Fixed(wild), TASKS["lift_hold"], "x", 9, (), 5, 300)
+    found = rollout(ALOHA, CUBE, scene, Fixed(wild), TASKS["lift_hold"], "x", 9, (), 5, 300)
     assert found.clamped == 300
     joints = aloha_spec(()).joints
     assert (scene.data.ctrl[:6] >= [j.lower for j in joints[:6]]).all()
@@ -184,20 +197,19 @@ def test_wild_commands_are_kept_within_the_limits():
 )
 def test_a_chunk_that_is_none_is_an_error_and_not_a_failure(chunk, message):
     with pytest.raises(RunFailed, match=message):
-        rollout(AlohaScene(), Fixed(chunk), TASKS["lift_hold"], "x", 9, (), 5)
+        rollout(ALOHA, CUBE, AlohaScene(), Fixed(chunk), TASKS["lift_hold"], "x", 9, (), 5)
 
 
 def test_the_expert_refuses_words_that_it_does_not_know():
     scene = AlohaScene()
+    expert = ExpertPolicy(ALOHA, CUBE, scene)
     with pytest.raises(ConfigError, match="does not know 'dance'"):
-        rollout(
-            *(scene := AlohaScene(),), ExpertPolicy(scene), TASKS["lift_hold"], "dance", 9, (), 5
-        )
+        rollout(ALOHA, CUBE, scene, expert, TASKS["lift_hold"], "dance", 9, (), 5)
 
 
 def test_an_expert_at_a_rate_that_does_not_fit_is_refused():
     with pytest.raises(ConfigError, match="15 keyframes a second do not divide 50 steps"):
-        ExpertPolicy(AlohaScene(), action_rate_hz=15.0)
+        ExpertPolicy(ALOHA, CUBE, AlohaScene(), action_rate_hz=15.0)
 
 
 def test_a_policy_for_another_robot_is_refused(tmp_path):
@@ -205,14 +217,14 @@ def test_a_policy_for_another_robot_is_refused(tmp_path):
     policy = Fixed(None)
     policy.embodiment = aloha_spec([Camera("top", 48, 64)])
     policy.cameras = ("top",)
-    assert policy_cameras(policy, settings) == (Camera("top", 48, 64),)
-    assert policy_cameras(policy, replace(settings, height=10, width=20))[0].width == 20
+    assert policy_cameras(ALOHA, policy, settings) == (Camera("top", 48, 64),)
+    assert policy_cameras(ALOHA, policy, replace(settings, height=10, width=20))[0].width == 20
     policy.cameras = ("cam_high",)
     with pytest.raises(SpecMismatch, match="cameras: cam_high missing"):
-        policy_cameras(policy, settings)
+        policy_cameras(ALOHA, policy, settings)
     policy.embodiment = replace(policy.embodiment, joints=policy.embodiment.joints[::-1])
     with pytest.raises(SpecMismatch, match=r"the policy .* and the simulated ALOHA"):
-        policy_cameras(policy, settings)
+        policy_cameras(ALOHA, policy, settings)
 
 
 def test_without_a_checkpoint_the_message_says_what_to_do(tmp_path):
@@ -230,7 +242,7 @@ def test_without_a_checkpoint_the_message_says_what_to_do(tmp_path):
         ({"episodes": 0}, "episodes must be at least 1, got 0"),
         ({"workers": 0}, "workers must be at least 1, got 0"),
         ({"replan_every": 0}, "replan_every must be at least 1, got 0"),
-        ({"max_steps": 200}, "max_steps must be at least 300, when lift_hold is judged; got 200"),
+        ({"max_steps": 200}, "max_steps must be at least 300 for lift_hold; got 200"),
         ({"quality": "best"}, "quality 'best' is none of cheap, reference"),
         ({"video_camera": "head"}, "video_camera 'head' is none of top"),
     ],

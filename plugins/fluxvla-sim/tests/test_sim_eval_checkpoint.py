@@ -118,16 +118,20 @@ def test_a_checkpoint_for_other_cameras_is_refused_before_it_counts(tmp_path, tr
 
 
 def test_the_policys_pictures_have_the_size_of_its_training_data(tmp_path, trembling):
-    from fluxvla_sim.aloha.policies import make_policy
     from fluxvla_sim.aloha.scene import AlohaScene
+    from fluxvla_sim.aloha.world import ALOHA, CUBE
     from fluxvla_sim.eval_worker import policy_cameras
+    from fluxvla_sim.policies import make_policy
 
     path = save(tmp_path)
     settings = AlohaSimEvalRunner(policy="expert")._settings
-    policy = make_policy("checkpoint", AlohaScene(), str(path), "cpu")
-    assert policy_cameras(policy, settings) == (Camera("top", 48, 64),)
+    policy = make_policy("checkpoint", ALOHA, CUBE, AlohaScene(), str(path), "cpu")
+    assert policy_cameras(ALOHA, policy, settings) == (Camera("top", 48, 64),)
     trained = policy.model.gain.item()
-    fresh = [make_policy("untrained", AlohaScene(), str(path), "cpu").model for _ in range(2)]
+    fresh = [
+        make_policy("untrained", ALOHA, CUBE, AlohaScene(), str(path), "cpu").model
+        for _ in range(2)
+    ]
     assert trained == 1.0
     assert fresh[0].gain.item() == fresh[1].gain.item() != 1.0
     assert not np.isnan(fresh[0].gain.item())

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
+from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert, arm_ik
-from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, HOME, AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS, Facts
+from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, AlohaScene
+from fluxvla_sim.aloha.tasks import MAX_STEPS, Facts
+from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
 
+TASKS = {task.name: task for task in CUBE.tasks}
 CORNERS = [
     np.array([x, y, 0.05, 1, 0, 0, 0])
     for x in (CUBE_LOW[0], CUBE_HIGH[0])

@@ -10,9 +10,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
+from fluxvla_sim.aloha.arms import HOME, load_model
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import HOME, load_model, sample_cube
-from fluxvla_sim.operators import ALOHA_CAMERAS, AlohaSimOperator, URSimOperator
+from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
+from fluxvla_sim.aloha.world import ALOHA
+from fluxvla_sim.operators import AlohaSimOperator, URSimOperator
 from fluxvla_sim.ur.expert import URExpert
 
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
@@ -109,7 +111,7 @@ def test_the_state_alone_is_that_of_the_frame(aloha):
 def test_the_expert_does_its_task_through_the_operator(task):
     operator = AlohaSimOperator(task=task, seed=11, **SMALL)
     operator.connect()
-    expert = Expert(load_model())
+    expert = Expert(load_model(AlohaScene.file))
     for seed in (11, 12):
         operator.reset(seed)
         commands = expert.plan(task, operator._scene.cube)
@@ -130,11 +132,14 @@ def test_ur_picks_the_cube_up_through_the_operator():
     operator.connect()
     expert = URExpert(operator._scene.model)
     joints = operator.embodiment.joints
+    speed_limit = np.array([j.velocity for j in joints])
+    acceleration_limit = np.array([j.acceleration for j in joints])
     for seed in (5, 6, 7):
         operator.reset(seed)
-        plan = expert.plan(operator._scene.cube)
-        speed = np.diff(np.vstack([operator.get_frame().state, plan]), axis=0)[1:] * 50
-        assert (np.abs(speed[:, :6]).max(0) <= [j.velocity for j in joints[:6]]).all()
+        plan = expert.plan("lift_cube", operator._scene.objects)
+        speed = np.diff(np.vstack([operator.get_state(), plan]), axis=0)[1:] * 50
+        assert (np.abs(speed).max(0) <= 0.95 * speed_limit).all()
+        assert (np.abs(np.diff(speed, axis=0) * 50).max(0) <= 0.95 * acceleration_limit).all()
         for command in plan:
             operator.send_action(command)
         assert operator.task_success(), seed
@@ -150,9 +155,9 @@ def test_the_embodiment_is_that_of_the_real_robot():
 
 
 def test_the_cameras_are_those_of_the_scene():
-    model = load_model()
+    model = load_model(AlohaScene.file)
     names = {model.camera(index).name for index in range(model.ncam)}
-    assert set(ALOHA_CAMERAS) == names
+    assert set(ALOHA.cameras) == names
 
 
 @pytest.mark.parametrize(

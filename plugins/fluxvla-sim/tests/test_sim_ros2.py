@@ -14,7 +14,7 @@ import pytest
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
 from fluxvla_aloha.runner import AlohaInferenceRunner
-from fluxvla_sim.aloha.scene import HOME
+from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
 from fluxvla_sim.ros2.command import timed_fault
 from fluxvla_sim.ur.scene import HOME as UR_HOME
@@ -135,7 +135,7 @@ class TestAloha:
         drive(operator, target, lambda state: np.allclose(state, target, atol=0.06))
         facts = topics.facts()
         assert facts["steps"] > 50
-        assert (facts["transfer_cube"], facts["lift_hold"]) == (False, False)
+        assert [task["success"] for task in facts["tasks"].values()] == [False, False]
 
         topics.tell("/sim/reset", 3)
         wait_for(lambda: np.allclose(operator.get_state(), HOME, atol=0.02))
@@ -245,7 +245,7 @@ class TestUR5e:
         target[[0, 6]] = target[0] + 0.3, 0.5
         allowed = np.array([0.04] * 6 + [0.15])
         drive(operator, target, lambda state: (abs(state - target) < allowed).all())
-        assert topics.facts()["lifted"] is False
+        assert topics.facts()["tasks"]["lift_cube"]["success"] is False
 
 
 class TestBodies:

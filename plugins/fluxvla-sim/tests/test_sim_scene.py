@@ -8,18 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
-from fluxvla_sim.aloha import scene as scene_module
+from fluxvla_sim.aloha import arms
+from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, load_model, to_metres, to_normalized
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import (
-    ARM_JOINTS,
-    ARMS,
-    AlohaScene,
-    load_model,
-    to_metres,
-    to_normalized,
-)
-from fluxvla_sim.aloha.tasks import TASKS, Facts, get_task, task_of
+from fluxvla_sim.aloha.scene import AlohaScene
+from fluxvla_sim.aloha.tasks import Facts
+from fluxvla_sim.aloha.world import ALOHA, CUBE
 from fluxvla_sim.render import import_mujoco
+from fluxvla_sim.world import CONTROL_HZ, task_of
 
 from fluxvla_core.errors import ConfigError, RunFailed
 
@@ -74,16 +70,16 @@ def test_is_bit_identical_to_gym_aloha(scene, stock, seed):
 
 def test_constants_are_gym_alohas():
     constants = pytest.importorskip("gym_aloha.constants")
-    assert constants.PUPPET_GRIPPER_POSITION_CLOSE == scene_module.FINGER_CLOSED
-    assert constants.PUPPET_GRIPPER_POSITION_OPEN == scene_module.FINGER_OPEN
-    assert constants.DT * scene_module.CONTROL_HZ == 1.0
-    assert constants.START_ARM_POSE[:7] == [*scene_module.HOME_ARM, scene_module.HOME_FINGER]
+    assert constants.PUPPET_GRIPPER_POSITION_CLOSE == arms.FINGER_CLOSED
+    assert constants.PUPPET_GRIPPER_POSITION_OPEN == arms.FINGER_OPEN
+    assert constants.DT * CONTROL_HZ == 1.0
+    assert constants.START_ARM_POSE[:7] == [*arms.HOME_ARM, arms.HOME_FINGER]
 
 
 def test_gripper_scale_is_its_own_inverse():
     assert to_normalized(to_metres(0.25)) == pytest.approx(0.25)
-    assert to_normalized(scene_module.FINGER_CLOSED) == 0.0
-    assert to_normalized(scene_module.FINGER_OPEN) == 1.0
+    assert to_normalized(arms.FINGER_CLOSED) == 0.0
+    assert to_normalized(arms.FINGER_OPEN) == 1.0
 
 
 def test_limits_of_the_embodiment_are_within_the_models(scene):
@@ -126,7 +122,10 @@ def test_an_unknown_camera_is_named_with_those_that_exist(scene):
 
 
 def test_cheap_pictures_leave_out_shadows_and_multisampling():
-    cheap, reference = load_model("cheap"), load_model("reference", 600, 900)
+    cheap, reference = (
+        load_model(AlohaScene.file),
+        load_model(AlohaScene.file, "reference", 600, 900),
+    )
     quality = cheap.vis.quality
     assert (quality.shadowsize, quality.offsamples) == (0, 0)
     quality = reference.vis.quality
@@ -134,7 +133,7 @@ def test_cheap_pictures_leave_out_shadows_and_multisampling():
     buffer = reference.vis.global_
     assert (buffer.offheight, buffer.offwidth) == (600, 900)
     with pytest.raises(ValueError, match="quality 'best' is none of"):
-        load_model("best")
+        load_model(AlohaScene.file, "best")
 
 
 def test_cheap_pictures_show_the_same_scene():
@@ -149,9 +148,9 @@ def test_cheap_pictures_show_the_same_scene():
 
 
 def test_a_missing_gym_aloha_is_named_with_its_install_command(monkeypatch):
-    monkeypatch.setattr(scene_module.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(arms.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(RunFailed, match="not installed") as caught:
-        scene_module.load_model()
+        arms.load_model(AlohaScene.file)
     assert "pip install --no-deps gym-aloha" in str(caught.value)
 
 
@@ -159,7 +158,7 @@ def test_loading_the_model_leaves_gymnasium_alone():
     import subprocess
 
     code = (
-        "import sys; from fluxvla_sim.aloha.scene import load_model; load_model();"
+        "import sys; from fluxvla_sim.aloha.scene import AlohaScene; AlohaScene();"
         "print(sorted({'gymnasium', 'dm_control', 'torch'} & set(sys.modules)))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -167,7 +166,7 @@ def test_loading_the_model_leaves_gymnasium_alone():
 
 
 def test_tasks_judge_facts():
-    transfer, lift = TASKS["transfer_cube"], TASKS["lift_hold"]
+    transfer, lift = CUBE.tasks
     held = Facts(steps=300, best_reward=2, right_touches=True, height=0.2)
     handed = Facts(steps=190, best_reward=4, left_touched=True, right_touches=True, height=0.2)
     assert lift.success(held)
@@ -183,10 +182,10 @@ def test_tasks_judge_facts():
 
 
 def test_an_instruction_finds_its_task():
-    assert task_of("Hand the cube  over to the left arm").name == "transfer_cube"
-    assert task_of("dance") is None
+    assert task_of(CUBE, "Hand the cube  over to the left arm").name == "transfer_cube"
+    assert task_of(CUBE, "dance") is None
 
 
 def test_an_unknown_task_is_refused_with_those_that_exist():
     with pytest.raises(ConfigError, match="no task 'juggle'; there are transfer_cube, lift_hold"):
-        get_task("juggle")
+        ALOHA.find("juggle")

@@ -30,7 +30,8 @@ class Collection:
 
     Args:
         episodes: how many demonstrations; tasks take turns.
-        tasks: names of the tasks.
+        robot: ``aloha`` or ``ur5e``.
+        tasks: names of the robot's tasks.
         seed: of the first episode.
         fps: frames a second; must divide 50.
         camera_names, height, width: of the pictures.
@@ -42,6 +43,7 @@ class Collection:
     """
 
     episodes: int
+    robot: str = "aloha"
     tasks: tuple[str, ...] = ("lift_hold", "transfer_cube")
     seed: int = 10_000
     fps: float = 10.0
@@ -52,15 +54,17 @@ class Collection:
     quality: str = "cheap"
 
     def __post_init__(self) -> None:
-        from fluxvla_sim.aloha.demonstrations import frame_stride
-        from fluxvla_sim.aloha.tasks import get_task
-        from fluxvla_sim.operators import AlohaSimOperator
+        from fluxvla_sim.demonstrations import frame_stride
+        from fluxvla_sim.operators import check_quality, sim_cameras
+        from fluxvla_sim.robots import ROBOTS
 
+        if self.robot not in ROBOTS:
+            raise ConfigError(f"there is no robot {self.robot!r}; there are {', '.join(ROBOTS)}")
+        robot = ROBOTS[self.robot]
         for task in self.tasks:
-            get_task(task)
-        # The operator's constructor has the checks of cameras, sizes and quality.
-        size = self.height, self.width
-        AlohaSimOperator("transfer_cube", 0, self.camera_names, *size, quality=self.quality)
+            robot.find(task)
+        sim_cameras(robot, self.camera_names, self.height, self.width)
+        check_quality(self.quality)
         try:
             frame_stride(self.fps)
         except ValueError as error:
@@ -96,19 +100,16 @@ def collect(
         UsageError: there is an interrupted collection, or it had other settings.
         RunFailed: the expert fails too often, workers cannot be started, or the disk is full.
     """
-    from fluxvla_aloha.embodiment import aloha_spec
-
     from fluxvla_core.evaluate.collecting import collect_episodes
-    from fluxvla_core.spec.embodiment import Camera
-    from fluxvla_sim.aloha.scene import CONTROL_HZ
-    from fluxvla_sim.aloha.tasks import MAX_STEPS
+    from fluxvla_sim.operators import sim_cameras
+    from fluxvla_sim.robots import ROBOTS
 
-    size = collection.height, collection.width
-    cameras = tuple(Camera(name, *size) for name in collection.camera_names)
+    robot = ROBOTS[collection.robot]
+    cameras = sim_cameras(robot, collection.camera_names, collection.height, collection.width)
     found = collect_episodes(
         Path(out),
         collection.fps,
-        aloha_spec(cameras, CONTROL_HZ),
+        robot.embodiment(cameras),
         partial(_Demonstrator, collection, cameras),
         collection.episodes,
         asdict(collection),
@@ -117,7 +118,8 @@ def collect(
         reporter or SilentReporter(),
     )
     # Each demonstration, also one that failed, is simulated to its end.
-    simulated = (found["collected"] + found["retried"]) * MAX_STEPS
+    most = max(robot.find(task)[0].max_steps for task in collection.tasks)
+    simulated = (found["collected"] + found["retried"]) * most
     return {**found, "steps_per_s": simulated / max(found["seconds"], 1e-9)}
 
 
@@ -130,38 +132,53 @@ class _Demonstrator:
     """A worker: acts out one episode, with spare seeds where the expert fails."""
 
     def __init__(self, collection: Collection, cameras: Sequence[Any]) -> None:
-        from fluxvla_sim.aloha.expert import Expert
-        from fluxvla_sim.aloha.scene import AlohaScene
-
         self._collection = collection
         self._cameras = cameras
-        size = max(480, collection.height), max(640, collection.width)
-        self._scene = AlohaScene(collection.quality, *size)
-        self._expert = Expert(self._scene.model)
+        # Task -> world, task, scene and expert; tasks of one world share the latter two.
+        self._stages: dict[str, Any] = {}
 
     def __call__(self, episode: int) -> Recorded:
         from fluxvla_core.evaluate.collecting import Recorded
-        from fluxvla_sim.aloha.demonstrations import demonstrate
-        from fluxvla_sim.aloha.tasks import get_task
+        from fluxvla_sim.demonstrations import demonstrate
 
-        task = get_task(task_name(self._collection, episode))
-        first = self._collection.seed + episode
+        collection = self._collection
+        name = task_name(collection, episode)
+        world, task, scene, expert = self._stage(name)
+        first = collection.seed + episode
         for spare in range(SPARE_SEEDS):
             found = demonstrate(
-                self._scene,
-                self._expert,
+                world,
+                scene,
+                expert,
                 task,
                 first + spare * SPARE_STRIDE,
                 self._cameras,
-                self._collection.fps,
-                self._collection.noise,
+                collection.fps,
+                collection.noise,
             )
             if found is not None:
                 return Recorded(
                     found.images, found.states, found.actions, task.instruction, retried=spare
                 )
+        noisy = f"noise = {collection.noise:g} rad is too much for it"
         raise RunFailed(
-            f"the expert failed {task.name} with {SPARE_SEEDS} seeds in a row, from {first} on",
-            cause=f"noise = {self._collection.noise:g} rad is too much for it",
-            next="collect with less noise",
+            f"the expert failed {name} with {SPARE_SEEDS} seeds in a row, from {first} on",
+            cause=noisy if collection.noise else None,
+            next="collect with less noise" if collection.noise else "collect with another --seed",
         )
+
+    def _stage(self, name: str) -> Any:
+        from fluxvla_sim.robots import ROBOTS
+
+        if name not in self._stages:
+            collection = self._collection
+            world, task = ROBOTS[collection.robot].find(name)
+            known = next((s for s in self._stages.values() if s[0] is world), None)
+            if known is not None:
+                scene, expert = known[2:]
+            else:
+                size = max(480, collection.height), max(640, collection.width)
+                scene = world.open_scene(collection.quality, *size)
+                expert = world.open_expert(scene.model)
+            self._stages[name] = world, task, scene, expert
+        return self._stages[name]

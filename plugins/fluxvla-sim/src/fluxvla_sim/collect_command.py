@@ -13,20 +13,22 @@ class CollectCommand:
     help: ClassVar[str] = "Record demonstrations of a scripted expert as a LeRobot v3.0 dataset."
 
     def add_arguments(self, parser: Any) -> None:
-        parser.add_argument("robot", choices=("aloha",), help="whose scene")
+        parser.add_argument("robot", choices=("aloha", "ur5e"), help="whose scene")
         parser.add_argument("--out", required=True, metavar="DIR", help="the dataset to make")
         parser.add_argument("--episodes", type=int, default=240, metavar="N", help="default 240")
         parser.add_argument("--workers", type=int, default=2, metavar="N", help="default 2")
         parser.add_argument(
             "--tasks",
             nargs="+",
-            default=("lift_hold", "transfer_cube"),
             metavar="NAME",
-            help="lift_hold, transfer_cube; both by default, in turn",
+            help="aloha: lift_hold, transfer_cube (both by default, in turn), insertion; "
+            "ur5e: lift_cube",
         )
         parser.add_argument("--seed", type=int, default=10_000, help="of the first episode")
         parser.add_argument("--fps", type=float, default=10.0, help="frames a second, default 10")
-        parser.add_argument("--cameras", nargs="+", default=("top",), metavar="NAME")
+        parser.add_argument(
+            "--cameras", nargs="+", metavar="NAME", help="default: the first of the scene"
+        )
         parser.add_argument("--height", type=int, default=144, help="of the pictures")
         parser.add_argument("--width", type=int, default=192, help="of the pictures")
         parser.add_argument(
@@ -50,15 +52,18 @@ class CollectCommand:
         from fluxvla_core.cli.reporters import make_reporter
         from fluxvla_core.errors import UsageError
         from fluxvla_sim.collect import Collection, collect
+        from fluxvla_sim.robots import ROBOTS
 
         if args.workers < 1:
             raise UsageError(f"--workers must be at least 1, got {args.workers}")
+        robot = ROBOTS[args.robot]
         collection = Collection(
             episodes=args.episodes,
-            tasks=tuple(args.tasks),
+            robot=args.robot,
+            tasks=tuple(args.tasks or robot.default_tasks),
             seed=args.seed,
             fps=args.fps,
-            camera_names=tuple(args.cameras),
+            camera_names=tuple(args.cameras or robot.cameras[:1]),
             height=args.height,
             width=args.width,
             noise=args.noise,

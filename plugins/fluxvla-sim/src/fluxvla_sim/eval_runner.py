@@ -1,4 +1,4 @@
-"""``AlohaSimEvalRunner``: how often a policy does what it is told, over seeds it has not seen."""
+"""How often a policy does what it is told in simulation, over seeds it has not seen."""
 
 from __future__ import annotations
 
@@ -19,13 +19,21 @@ from fluxvla_core.evaluate.results import FORMAT, check_any_done, tell, timing, 
 from fluxvla_core.evaluate.showing import choose_episodes, record_videos
 from fluxvla_core.evaluate.subject import chosen_checkpoint
 from fluxvla_core.evaluate.summary import summarise
-from fluxvla_sim.eval_worker import POLICY, SWAPPED, UNTRAINED, AlohaEvalWorker, Job, Settings
+from fluxvla_sim.eval_worker import (
+    POLICY,
+    SWAPPED,
+    UNTRAINED,
+    Job,
+    Settings,
+    SimEvalWorker,
+    other_task,
+)
 
 FOLDER = "eval"
 
 
-class AlohaSimEvalRunner:
-    """Evaluates a policy on gym-aloha's cube scene with the instructions of its two tasks.
+class SimEvalRunner:
+    """Evaluates a policy on tasks of the simulated robot that a subclass names.
 
     Every episode's outcome follows from the policy, its task and its seed; the number of workers
     changes nothing but the time. An evaluation that was interrupted goes on where it was when it
@@ -40,15 +48,16 @@ class AlohaSimEvalRunner:
         policy: ``checkpoint``, or ``expert`` or ``untrained`` for comparison.
         episodes: for each task.
         seed: of each task's first episode; the others count up from it.
-        tasks: names of the tasks.
+        tasks: names of the tasks; the robot's usual ones by default.
         replan_every: how many keyframes of a chunk are used before the policy is asked again.
-        max_steps: control steps (20 ms) after which an episode ends.
+        max_steps: control steps (20 ms) after which an episode ends; the task's own by default.
         instruction_swap: also tell the policy the other task's instruction, on seeds of its own,
             and count which of the two it does.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
         workers: processes; ``--nproc`` overrides it.
         record_videos: how many episodes to show: failures first, then successes.
-        video_camera, video_height, video_width, video_fps: of the videos.
+        video_camera, video_height, video_width, video_fps: of the videos; by default the robot's
+            first camera.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         height, width: of the policy's pictures; as in its training data by default.
         quality: ``cheap`` or ``reference`` pictures, see ``fluxvla_sim.render``.
@@ -60,6 +69,7 @@ class AlohaSimEvalRunner:
     """
 
     api: ClassVar[str] = "1.0"
+    robot: ClassVar[str]
 
     def __init__(
         self,
@@ -69,14 +79,14 @@ class AlohaSimEvalRunner:
         policy: str = "checkpoint",
         episodes: int = 50,
         seed: int = 500,
-        tasks: Sequence[str] = ("lift_hold", "transfer_cube"),
+        tasks: Sequence[str] | None = None,
         replan_every: int = 5,
-        max_steps: int = 300,
+        max_steps: int | None = None,
         instruction_swap: bool = False,
         baseline: bool = False,
         workers: int = 2,
         record_videos: int = 4,
-        video_camera: str = "top",
+        video_camera: str | None = None,
         video_height: int = 240,
         video_width: int = 320,
         video_fps: float = 25.0,
@@ -89,12 +99,15 @@ class AlohaSimEvalRunner:
         mixed_precision_dtype: str = "float32",
         episode_timeout_s: float = 600.0,
     ) -> None:
+        from fluxvla_sim.robots import ROBOTS
+
+        self._robot = ROBOTS[self.robot]
         self.context = context or RunContext(config=cfg or {})
         self.ckpt_path = ckpt_path
         self.policy = policy
         self.episodes = episodes
         self.seed = seed
-        self.tasks = tuple(tasks)
+        self.tasks = tuple(self._robot.default_tasks if tasks is None else tasks)
         self.instruction_swap = instruction_swap
         self.baseline = baseline
         self.workers = self.context.nproc if self.context.nproc > 1 else workers
@@ -102,6 +115,7 @@ class AlohaSimEvalRunner:
         self.episode_timeout_s = episode_timeout_s
         self.folder = Path(self.context.work_dir) / FOLDER
         self._settings = Settings(
+            robot=self.robot,
             policy=policy,
             ckpt_path=None,
             replan_every=replan_every,
@@ -113,7 +127,7 @@ class AlohaSimEvalRunner:
             denormalize_action=denormalize_action,
             height=height,
             width=width,
-            video_camera=video_camera,
+            video_camera=video_camera or self._robot.cameras[0],
             video_size=(video_height, video_width),
             video_fps=video_fps,
         )
@@ -126,7 +140,7 @@ class AlohaSimEvalRunner:
         Raises:
             CheckpointError: there is none, or the one that is named is damaged.
         """
-        from fluxvla_sim.aloha.policies import NEEDS_CHECKPOINT
+        from fluxvla_sim.policies import NEEDS_CHECKPOINT
 
         if self.policy not in NEEDS_CHECKPOINT and not self.baseline:
             return
@@ -143,7 +157,7 @@ class AlohaSimEvalRunner:
         reporter, keys = self.context.reporter, self._keys()
         ledger = open_ledger(self.folder / "episodes.jsonl", self._what(), reporter)
         new = sum(key not in ledger for key in keys)
-        factory = partial(AlohaEvalWorker, self._worker_settings())
+        factory = partial(SimEvalWorker, self._worker_settings())
         with WorkerPool(factory, self.workers, timeout_s=self.episode_timeout_s) as pool:
             began = time.monotonic()
             records = run_in_pool(pool, keys, ledger, reporter)
@@ -167,22 +181,20 @@ class AlohaSimEvalRunner:
         return results
 
     def _check(self) -> None:
-        from fluxvla_sim.aloha.policies import POLICIES
-        from fluxvla_sim.aloha.tasks import MAX_STEPS, get_task
-        from fluxvla_sim.operators import ALOHA_CAMERAS
+        from fluxvla_sim.policies import POLICIES
         from fluxvla_sim.render import QUALITIES
 
-        settings = self._settings
+        settings, robot = self._settings, self._robot
         if self.policy not in POLICIES:
             raise self._wrong("policy", f"{self.policy!r} is none of {', '.join(POLICIES)}")
         for task in self.tasks:
-            get_task(task)
+            robot.find(task)
         if not self.tasks or len(set(self.tasks)) != len(self.tasks):
             raise self._wrong("tasks", f"must name each task once, got {list(self.tasks)}")
         if settings.quality not in QUALITIES:
             raise self._wrong("quality", f"{settings.quality!r} is none of {', '.join(QUALITIES)}")
-        if settings.video_camera not in ALOHA_CAMERAS:
-            known = ", ".join(ALOHA_CAMERAS)
+        if settings.video_camera not in robot.cameras:
+            known = ", ".join(robot.cameras)
             raise self._wrong("video_camera", f"{settings.video_camera!r} is none of {known}")
         for name, value in (
             ("episodes", self.episodes),
@@ -191,11 +203,17 @@ class AlohaSimEvalRunner:
         ):
             if value < 1:
                 raise self._wrong(name, f"must be at least 1, got {value}")
-        if settings.max_steps < MAX_STEPS:
-            raise self._wrong(
-                "max_steps",
-                f"must be at least {MAX_STEPS}, when lift_hold is judged; got {settings.max_steps}",
-            )
+        for task in self.tasks:
+            least = robot.find(task)[0].max_steps
+            if settings.max_steps is not None and settings.max_steps < least:
+                raise self._wrong(
+                    "max_steps", f"must be at least {least} for {task}; got {settings.max_steps}"
+                )
+            if self.instruction_swap and other_task(robot, task) == task:
+                raise self._wrong(
+                    "instruction_swap",
+                    f"is impossible: nothing else can be asked for where {task} is",
+                )
 
     def _wrong(self, name: str, what: str) -> ConfigError:
         return ConfigError(
@@ -238,6 +256,18 @@ class AlohaSimEvalRunner:
                 "denormalize_action": _plain(settings.denormalize_action),
             },
         }
+
+
+class AlohaSimEvalRunner(SimEvalRunner):
+    """On gym-aloha's scenes: ``lift_hold``, ``transfer_cube`` and ``insertion``."""
+
+    robot: ClassVar[str] = "aloha"
+
+
+class URSimEvalRunner(SimEvalRunner):
+    """On the UR5e at its table: ``lift_cube``."""
+
+    robot: ClassVar[str] = "ur5e"
 
 
 def count_behaviours(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.evaluate.ledger import EpisodeKey
 
 if TYPE_CHECKING:
-    from fluxvla_sim.aloha.scene import AlohaScene
+    from fluxvla_sim.world import Scene, SimRobot, World
 
 POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
 """Groups of episodes: the policy, the policy told the other task, its untrained twin."""
@@ -29,16 +29,18 @@ class Settings:
     """What workers need to know; every outcome follows from it and the episode's key.
 
     Args:
-        policy: one of ``fluxvla_sim.aloha.policies.POLICIES``.
+        robot: one of ``fluxvla_sim.robots.ROBOTS``.
+        policy: one of ``fluxvla_sim.policies.POLICIES``.
         ckpt_path: the checkpoint's folder, where the policy needs one.
         dataset, denormalize_action: see ``load_policy``.
         height, width: of the policy's pictures; as in the checkpoint by default.
     """
 
+    robot: str
     policy: str
     ckpt_path: str | None
     replan_every: int
-    max_steps: int
+    max_steps: int | None
     quality: str
     device: str
     mixed_precision_dtype: str
@@ -51,7 +53,7 @@ class Settings:
     video_fps: float
 
 
-class AlohaEvalWorker:
+class SimEvalWorker:
     """Runs episodes in one process; the policies are loaded when first needed and kept.
 
     Raises:
@@ -60,25 +62,32 @@ class AlohaEvalWorker:
     """
 
     def __init__(self, settings: Settings) -> None:
+        from fluxvla_sim.robots import ROBOTS
+
         self._settings = settings
-        self._scene: AlohaScene | None = None
-        self._policies: dict[str, Any] = {}
+        self._robot = ROBOTS[settings.robot]
+        self._scenes: dict[int, Scene] = {}
+        self._policies: dict[tuple[str, int], Any] = {}
 
     def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
         """The record of an episode: JSON values."""
-        from fluxvla_sim.aloha.rollout import rollout
-        from fluxvla_sim.aloha.tasks import get_task
+        from fluxvla_sim.rollout import rollout
 
         if isinstance(job, EpisodeKey):
             job = Job(job)
         settings, key = self._settings, job.key
         name = "untrained" if key.group == UNTRAINED else settings.policy
-        policy, cameras = self._policy(name)
-        asked = get_task(key.task if key.group != SWAPPED else other_task(key.task))
-        watch, finish = self._video(job.video)
+        world, asked = self._robot.find(key.task)
+        if key.group == SWAPPED:
+            _, asked = self._robot.find(other_task(self._robot, key.task))
+        scene = self._open(world)
+        policy, cameras = self._policy(name, world)
+        watch, finish = self._video(job.video, scene)
         try:
             found = rollout(
-                self._open_scene(),
+                self._robot,
+                world,
+                scene,
                 policy,
                 asked,
                 asked.instruction,
@@ -95,40 +104,44 @@ class AlohaEvalWorker:
         success = found.behaviours[key.task]
         return {**values, "success": success, "instruction": asked.instruction, "timing": timing}
 
-    def _open_scene(self) -> AlohaScene:
-        from fluxvla_sim.aloha.scene import AlohaScene
-
-        if self._scene is None:
+    def _open(self, world: World) -> Scene:
+        if id(world) not in self._scenes:
             settings = self._settings
             height = max(480, settings.height or 0, settings.video_size[0])
             width = max(640, settings.width or 0, settings.video_size[1])
-            self._scene = AlohaScene(settings.quality, height, width)
-        return self._scene
+            self._scenes[id(world)] = world.open_scene(settings.quality, height, width)
+        return self._scenes[id(world)]
 
-    def _policy(self, name: str) -> Any:
-        if name not in self._policies:
-            from fluxvla_sim.aloha.policies import make_policy
+    def _policy(self, name: str, world: World) -> Any:
+        from fluxvla_sim.policies import NEEDS_CHECKPOINT, make_policy
 
+        # Only an expert belongs to one world; a model is loaded once.
+        known = (name, 0 if name in NEEDS_CHECKPOINT else id(world))
+        if known not in self._policies:
             settings = self._settings
             policy = make_policy(
                 name,
-                self._open_scene(),
+                self._robot,
+                world,
+                self._open(world),
                 settings.ckpt_path,
                 settings.device,
                 settings.dataset,
                 settings.denormalize_action,
                 settings.mixed_precision_dtype,
             )
-            self._policies[name] = policy, policy_cameras(policy, settings)
-        return self._policies[name]
+            self._policies[known] = policy, policy_cameras(self._robot, policy, settings)
+        return self._policies[known]
 
-    def _video(self, path: str | None) -> tuple[Callable[[], None] | None, Callable[[], None]]:
+    def _video(
+        self, path: str | None, scene: Scene
+    ) -> tuple[Callable[[], None] | None, Callable[[], None]]:
         if path is None:
             return None, lambda: None
         from fluxvla_core.record.video import VideoWriter
-        from fluxvla_sim.aloha.scene import CONTROL_HZ
+        from fluxvla_sim.world import CONTROL_HZ
 
-        settings, scene = self._settings, self._open_scene()
+        settings = self._settings
         stride = round(CONTROL_HZ / settings.video_fps)
         writer = VideoWriter(Path(path), CONTROL_HZ / stride, *settings.video_size)
 
@@ -139,21 +152,20 @@ class AlohaEvalWorker:
         return watch, writer.close
 
 
-def policy_cameras(policy: Any, settings: Settings) -> Any:
+def policy_cameras(robot: SimRobot, policy: Any, settings: Settings) -> Any:
     """The cameras that ``policy`` looks at, in the sizes that it was trained with.
 
     Raises:
         SpecMismatch: the policy is not for this robot or these cameras.
     """
-    from fluxvla_aloha.embodiment import aloha_spec
-
     from fluxvla_core.spec.embodiment import Camera, check_match
-    from fluxvla_sim.operators import ALOHA_CAMERAS
 
     known = {camera.name: camera for camera in policy.embodiment.cameras}
-    scene = aloha_spec([Camera(name, 480, 640) for name in ALOHA_CAMERAS])
+    scene = robot.embodiment([Camera(name, 480, 640) for name in robot.cameras])
     names = policy.cameras
-    check_match(policy.embodiment, scene, "the policy", "the simulated ALOHA", cameras=names)
+    check_match(
+        policy.embodiment, scene, "the policy", f"the simulated {robot.title}", cameras=names
+    )
     cameras = []
     for name in names:
         trained = known.get(name, Camera(name, 480, 640))
@@ -163,9 +175,7 @@ def policy_cameras(policy: Any, settings: Settings) -> Any:
     return tuple(cameras)
 
 
-def other_task(name: str) -> str:
-    """The task whose instruction is the wrong one for ``name``."""
-    from fluxvla_sim.aloha.tasks import TASKS
-
-    names = list(TASKS)
+def other_task(robot: SimRobot, name: str) -> str:
+    """The task of the same world whose instruction is the wrong one for ``name``."""
+    names = [task.name for task in robot.find(name)[0].tasks]
     return names[(names.index(name) + 1) % len(names)]

@@ -2,7 +2,7 @@
 
 Commands are formed as an inference runner forms them in simulated time: the keyframes are joined
 linearly from the last command on, and pass the same limits. A policy that was evaluated here does
-the same thing, command for command, through ``AlohaSimOperator``.
+the same thing, command for command, through the robot's simulated operator.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from fluxvla_aloha.embodiment import aloha_spec
 
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.control.keyframes import interpolate
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.safety.limits import Limiter
-from fluxvla_sim.aloha.scene import CONTROL_HZ, AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS, TASKS, Facts, Task
+from fluxvla_sim.world import CONTROL_HZ, Scene, SimRobot, Task, World
 
 if TYPE_CHECKING:
     from fluxvla_core.contracts.protocols import Policy
@@ -34,9 +32,9 @@ class Rollout:
 
     Args:
         success: of the task that was asked for.
-        behaviours: success of every task, by name.
+        behaviours: success of every task of the world, by name.
         steps: control steps taken.
-        best_reward: the highest gym-aloha reward.
+        best_reward: the highest reward of any step.
         clamped: commands that the limits changed.
         calls: how often the policy was asked.
         state_hash: of the simulation's final state; equal for equal episodes.
@@ -55,26 +53,29 @@ class Rollout:
 
 
 def rollout(
-    scene: AlohaScene,
+    robot: SimRobot,
+    world: World,
+    scene: Scene,
     policy: Policy,
     task: Task,
     instruction: str,
     seed: int,
     cameras: Sequence[Camera],
     replan_every: int,
-    max_steps: int = MAX_STEPS,
+    max_steps: int | None = None,
     watch: Callable[[], None] | None = None,
 ) -> Rollout:
     """Run one episode; its course follows from the arguments alone.
 
     Args:
-        scene: is reset to ``seed``.
+        robot, world: what acts, and where.
+        scene: of ``world``; is reset to ``seed``.
         policy: is reset to ``seed`` too.
         task: whose end ends the episode: that of ``instruction``, whatever is being measured.
         instruction: what the policy is told.
         cameras: the pictures that the policy gets.
         replan_every: how many keyframes of a chunk are used before the policy is asked again.
-        max_steps: control steps after which the episode ends.
+        max_steps: control steps after which the episode ends; the world's by default.
         watch: called before the first step and after each, for a video.
 
     Raises:
@@ -83,12 +84,13 @@ def rollout(
     began, policy_seconds = time.perf_counter(), 0.0
     scene.reset(seed)
     policy.reset(seed)
-    limiter = Limiter(aloha_spec((), CONTROL_HZ), 1.0 / CONTROL_HZ)
+    limiter = Limiter(robot.embodiment(()), 1.0 / CONTROL_HZ)
     limiter.start(scene.state)
-    facts, clamped, calls = Facts(), 0, 0
+    facts, clamped, calls = world.begin(), 0, 0
+    most = world.max_steps if max_steps is None else max_steps
     if watch is not None:
         watch()
-    while not task.done(facts) and facts.steps < max_steps:
+    while not task.done(facts) and facts.steps < most:
         observation = _observe(scene, cameras, instruction)
         asked = time.perf_counter()
         chunk = _checked(policy.predict_action(observation), limiter.last.shape[0])
@@ -102,11 +104,11 @@ def rollout(
             facts = facts.after(scene)
             if watch is not None:
                 watch()
-            if task.done(facts) or facts.steps >= max_steps:
+            if task.done(facts) or facts.steps >= most:
                 break
     return Rollout(
         success=task.success(facts),
-        behaviours={name: each.success(facts) for name, each in TASKS.items()},
+        behaviours={each.name: each.success(facts) for each in world.tasks},
         steps=facts.steps,
         best_reward=facts.best_reward,
         clamped=clamped,
@@ -117,7 +119,7 @@ def rollout(
     )
 
 
-def _observe(scene: AlohaScene, cameras: Sequence[Camera], instruction: str) -> Observation:
+def _observe(scene: Scene, cameras: Sequence[Camera], instruction: str) -> Observation:
     return {
         "qpos": scene.state.astype(np.float32),
         "images": {c.name: scene.render(c.name, c.height, c.width) for c in cameras},

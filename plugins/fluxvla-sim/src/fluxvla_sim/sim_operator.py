@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
 from fluxvla_core.errors import NotReady, Rejected
+from fluxvla_sim.world import SimRobot, task_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
-
-
-class Scene(Protocol):
-    """A simulated robot in its surroundings; one :meth:`step` is one control period."""
-
-    def reset(self, seed: int) -> None: ...
-    def step(self, action: npt.NDArray[np.float64]) -> None: ...
-    @property
-    def state(self) -> npt.NDArray[np.float64]: ...
-    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]: ...
-    def close(self) -> None: ...
+    from fluxvla_core.spec.embodiment import Camera
 
 
 class SimOperator:
@@ -37,37 +27,49 @@ class SimOperator:
     only in multiples of the control period, in the calling thread.
 
     Args:
-        embodiment: joints, limits, cameras and rate.
+        robot: which.
+        task: which of its worlds, and what :meth:`task_success` judges.
+        cameras: in the order of the images.
         seed: of the first episode; :meth:`connect` resets to it.
         realtime: follow the wall clock.
+        quality: of the pictures.
+
+    Raises:
+        ConfigError: the robot has no such task.
     """
 
     api: ClassVar[str] = "1.0"
 
-    def __init__(self, embodiment: EmbodimentSpec, seed: int, realtime: bool) -> None:
-        self.embodiment = embodiment
+    def __init__(
+        self,
+        robot: SimRobot,
+        task: str,
+        cameras: tuple[Camera, ...],
+        seed: int,
+        realtime: bool,
+        quality: str,
+    ) -> None:
+        self.world, self.task = robot.find(task)
+        self.embodiment = robot.embodiment(cameras)
         self.seed = seed
         self.realtime = realtime
         self.clock = MonotonicClock() if realtime else SimulatedClock()
-        self._period = 1.0 / embodiment.rate_hz
+        self._quality = quality
+        self._period = 1.0 / self.embodiment.rate_hz
         self._periods = 0
         self._started = 0.0
         self._lock = threading.RLock()
         self._scene: Any = None
-        self._target: npt.NDArray[np.float64] = np.zeros(embodiment.dim)
-
-    def _make_scene(self) -> Scene:
-        """The scene of this robot; heavy imports belong here."""
-        raise TypeError(f"{type(self).__name__} must say which scene it lives in")
-
-    def _after_step(self) -> None:
-        """Called after each control period."""
+        self._target: npt.NDArray[np.float64] = np.zeros(self.embodiment.dim)
+        self._facts = self.world.begin()
 
     def connect(self) -> None:
         """Build the scene and reset it to ``seed``; again after :meth:`close` if wanted."""
         with self._lock:
             if self._scene is None:
-                self._scene = self._make_scene()
+                sizes = [(c.height, c.width) for c in self.embodiment.cameras] or [(1, 1)]
+                height, width = (max(of) for of in zip(*sizes, strict=True))
+                self._scene = self.world.open_scene(self._quality, height, width)
                 self._periods, self._started = 0, self.clock.now()
                 self.reset(self.seed)
 
@@ -80,13 +82,17 @@ class SimOperator:
         with self._lock:
             self._connected().reset(seed)
             self._target = self._measured()
+            self._facts = self.world.begin()
 
     def begin_episode(self, instruction: str, episode: int) -> None:
         """Reset for episode number ``episode``, counted from 0; runners call this before each.
 
-        Objects go where ``seed + episode`` puts them.
+        Objects go where ``seed + episode`` puts them; the task that ``instruction`` asks for, if
+        any, is the one that is judged.
         """
-        self.reset(self.seed + episode)
+        with self._lock:
+            self.task = task_of(self.world, instruction) or self.task
+            self.reset(self.seed + episode)
 
     def get_state(self) -> npt.NDArray[np.float64]:
         """``(dim,)`` the state alone, without drawing anything.
@@ -114,6 +120,16 @@ class SimOperator:
             }
             stamps = dict.fromkeys((STATE, *images), now)
             return Frame(state=np.array(scene.state), images=images, stamps=stamps)
+
+    def task_success(self) -> bool:
+        """Whether ``task`` is done, judged now, over everything since :meth:`reset`."""
+        with self._lock:
+            return self.task.success(self._facts)
+
+    def task_done(self) -> bool:
+        """Whether the episode can end: nothing that comes could change :meth:`task_success`."""
+        with self._lock:
+            return self.task.done(self._facts)
 
     def send_action(self, action: npt.NDArray[np.float64]) -> None:
         """Command joint targets; in simulated time one control period passes.
@@ -153,7 +169,7 @@ class SimOperator:
         self._periods += 1
         if isinstance(self.clock, SimulatedClock):
             self.clock.advance(self._period)
-        self._after_step()
+        self._facts = self._facts.after(self._scene)
 
     def _catch_up(self) -> None:
         if self.realtime:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluxvla_sim.aloha.scene import ARM_JOINTS, ARMS, HOME, load_model
-from fluxvla_sim.aloha.tasks import MAX_STEPS, get_task
+from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, HOME, load_model
+from fluxvla_sim.aloha.scene import AlohaScene
+from fluxvla_sim.aloha.tasks import MAX_STEPS
 from fluxvla_sim.ik import ArmIK
 from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
 
@@ -128,22 +129,21 @@ class Expert:
     """Plans for the tasks of :mod:`fluxvla_sim.aloha.tasks`; knows the cube's true pose."""
 
     def __init__(self, model: Any = None) -> None:
-        model = load_model() if model is None else model
+        model = load_model(AlohaScene.file) if model is None else model
         self._ik = {arm: arm_ik(model, arm) for arm in ARMS}
         self._base = {arm: model.body(f"vx300s_{arm}").pos.copy() for arm in ARMS}
 
-    def plan(self, task: str, cube: Vector) -> Vector:
+    def plan(self, task: str, objects: Vector) -> Vector:
         """Commands for one episode.
 
         Args:
             task: a task's name.
-            cube: ``(7,)`` the cube's pose before the first step.
+            objects: ``(7,)`` the cube's pose before the first step.
 
         Returns:
             ``(300, 14)`` joint targets; row ``t`` is to be reached at the end of step ``t``.
         """
-        get_task(task)
-        arms = _PLANS[task](np.asarray(cube, dtype=np.float64))
+        arms = _PLANS[task](np.asarray(objects, dtype=np.float64))
         return np.concatenate([self._arm(arm, arms[arm]) for arm in ARMS], axis=1)
 
     def _arm(self, arm: str, plan: ArmPlan) -> Vector:

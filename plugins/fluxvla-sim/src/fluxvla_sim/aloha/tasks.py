@@ -1,6 +1,6 @@
-"""What an instruction asks for, and how to tell whether it was done.
+"""The two tasks of the cube scene, and how to tell whether they were done.
 
-Both tasks start from the same scene, so that the instruction alone decides what is right. Success
+Both start from the same scene, so that the instruction alone decides what is right. Success
 of both is judged in every episode: a policy that hears the wrong instruction should do the other
 task, and that can be counted.
 """
@@ -8,9 +8,7 @@ task, and that can be counted.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
-from fluxvla_core.errors import ConfigError
 from fluxvla_sim.aloha.scene import AlohaScene
 
 MAX_STEPS = 300
@@ -22,7 +20,7 @@ LIFTED_M = 0.10
 
 @dataclass(frozen=True)
 class Facts:
-    """What has happened in an episode so far, all that success is judged by.
+    """See :class:`fluxvla_sim.world.Facts`; the rewards are gym-aloha's.
 
     Args:
         steps: control steps taken.
@@ -47,20 +45,6 @@ class Facts:
             right_touches=any(scene.fingers_on_cube("right")),
             height=float(scene.cube[2]),
         )
-
-
-class Task(Protocol):
-    """One instruction and its success."""
-
-    name: str
-    instruction: str
-    record_steps: int
-
-    def success(self, facts: Facts) -> bool:
-        """Whether the task was done; once true it stays so, and the episode can end."""
-
-    def done(self, facts: Facts) -> bool:
-        """Whether nothing that comes could change :meth:`success`."""
 
 
 class TransferCube:
@@ -94,23 +78,3 @@ class LiftHold:
 
     def done(self, facts: Facts) -> bool:
         return facts.steps >= MAX_STEPS
-
-
-TASKS: dict[str, Task] = {task.name: task for task in (TransferCube(), LiftHold())}
-
-
-def get_task(name: str) -> Task:
-    """The task called ``name``.
-
-    Raises:
-        ConfigError: there is none; the message lists those that are.
-    """
-    if name not in TASKS:
-        raise ConfigError(f"there is no task {name!r}; there are {', '.join(TASKS)}")
-    return TASKS[name]
-
-
-def task_of(instruction: str) -> Task | None:
-    """The task that an instruction in these words asks for; None if none does."""
-    words = instruction.casefold().split()
-    return next((t for t in TASKS.values() if t.instruction.casefold().split() == words), None)

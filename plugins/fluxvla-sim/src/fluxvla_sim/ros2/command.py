@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import UsageError
@@ -13,16 +12,33 @@ class SimCommand:
     """The command's arguments; the work is in ``fluxvla_sim.ros2.node``."""
 
     api: ClassVar[str] = "1.0"
-    help: ClassVar[str] = "Simulate a robot in real time behind the ROS 2 topics of the real one."
+    help: ClassVar[str] = "Simulate a robot behind the ROS 2 topics of the real one."
 
     def add_arguments(self, parser: Any) -> None:
         parser.add_argument("robot", choices=("aloha", "ur5e"), help="which robot")
         parser.add_argument(
             "--ros2", action="store_true", help="over ROS 2 (there is no other way)"
         )
+        parser.add_argument(
+            "--task",
+            metavar="NAME",
+            help="ALOHA: insertion puts peg and socket in the cube's place",
+        )
         parser.add_argument("--seed", type=int, default=0, help="places the objects, default 0")
         parser.add_argument(
-            "--camera-hz", type=float, default=30.0, metavar="HZ", help="of each camera, default 30"
+            "--real-time-factor",
+            type=float,
+            default=1.0,
+            metavar="F",
+            help="simulated seconds in a second, for a machine that is too slow; default 1. The "
+            "operator must be told the same",
+        )
+        parser.add_argument(
+            "--camera-hz",
+            type=float,
+            default=30.0,
+            metavar="HZ",
+            help="of each camera that is listened to, in simulated time; default 30",
         )
         parser.add_argument("--height", type=int, default=480, help="of the pictures")
         parser.add_argument("--width", type=int, default=640, help="of the pictures")
@@ -81,14 +97,20 @@ class SimCommand:
             reporter.close()
 
     def _simulate(self, args: Any, faults: list[Any], reporter: Any) -> int:
+        from fluxvla_sim.robots import ROBOTS
+        from fluxvla_sim.ros2.judge import Judge
         from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_stream
 
-        body, scene, facts = _aloha(args) if args.robot == "aloha" else _ur(args)
+        robot = ROBOTS[args.robot]
+        world, _ = robot.find(args.task or robot.default_tasks[0])
+        body = _aloha(args) if args.robot == "aloha" else _ur(args)
+        _some_cameras(body, args.cameras)
         for _, stream, _ in faults:
             check_stream(stream, {*body.states, *body.latched, *body.cameras})
         settings = NodeSettings(
             name=f"sim_{args.robot}",
             seed=args.seed,
+            real_time_factor=args.real_time_factor,
             camera_hz=args.camera_hz,
             height=args.height,
             width=args.width,
@@ -96,13 +118,15 @@ class SimCommand:
             faults=faults,
             domain_id=args.domain_id,
         )
-        node = RobotNode(body, scene, settings, reporter, facts)
+        scene = world.open_scene(args.quality, args.height, args.width)
+        node = RobotNode(body, scene, settings, reporter, Judge(world))
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: node.stop())
         try:
             topics = [topic for topic, _ in body.states.values()]
             reporter.info(
-                f"simulating {args.robot}: {', '.join([*topics, *body.cameras.values()])}; "
+                f"simulating {args.robot} at {args.real_time_factor:g} of real time: "
+                f"{', '.join([*topics, *body.cameras.values()])}; "
                 f"commands on {', '.join(body.commands)}; Ctrl-C ends"
             )
             node.run(args.seconds)
@@ -133,9 +157,6 @@ def timed_fault(text: str) -> tuple[float, str, Any]:
     return (seconds, *Fault.parse(fault))
 
 
-Facts = Callable[[bool | None], Mapping[str, Any]]
-
-
 def _some_cameras(body: Any, names: list[str] | None) -> None:
     unknown = [name for name in names or () if name not in body.cameras]
     if unknown:
@@ -146,51 +167,23 @@ def _some_cameras(body: Any, names: list[str] | None) -> None:
         body.cameras = {name: body.cameras[name] for name in names}
 
 
-def _aloha(args: Any) -> tuple[Any, Any, Facts]:
+def _aloha(args: Any) -> Any:
     from fluxvla_aloha.presets import PRESETS
 
-    from fluxvla_sim.aloha.scene import AlohaScene
-    from fluxvla_sim.aloha.tasks import TASKS
-    from fluxvla_sim.aloha.tasks import Facts as AlohaFacts
     from fluxvla_sim.ros2.bodies import AlohaBody
 
     if args.preset not in PRESETS:
         raise UsageError(f"unknown preset {args.preset!r}; known are {', '.join(PRESETS)}")
-    body = AlohaBody(PRESETS[args.preset])
-    _some_cameras(body, args.cameras)
-    scene = AlohaScene(args.quality, args.height, args.width)
-    known = AlohaFacts()
-
-    def facts(commanded: bool | None) -> Mapping[str, Any]:
-        nonlocal known
-        if commanded is None:
-            known = AlohaFacts()
-        elif commanded:
-            known = known.after(scene)
-        done = {name: task.success(known) for name, task in TASKS.items()}
-        return {"steps": known.steps, **done}
-
-    return body, scene, facts
+    return AlohaBody(PRESETS[args.preset])
 
 
-def _ur(args: Any) -> tuple[Any, Any, Facts]:
+def _ur(args: Any) -> Any:
     from fluxvla_ur.operator import CONTROLLERS
 
     from fluxvla_sim.ros2.bodies import URBody
-    from fluxvla_sim.ur.scene import URScene
 
     if args.controller not in CONTROLLERS:
         raise UsageError(
             f"unknown controller {args.controller!r}; known are {', '.join(CONTROLLERS)}"
         )
-    body = URBody(args.controller)
-    _some_cameras(body, args.cameras)
-    scene = URScene(args.quality, args.height, args.width)
-    steps = 0
-
-    def facts(commanded: bool | None) -> Mapping[str, Any]:
-        nonlocal steps
-        steps = 0 if commanded is None else steps + int(commanded)
-        return {"steps": steps, "lifted": bool(scene.lifted())}
-
-    return body, scene, facts
+    return URBody(args.controller)

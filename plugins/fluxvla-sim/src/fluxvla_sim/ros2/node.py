@@ -1,10 +1,15 @@
-"""A scene in real time behind a robot's topics.
+"""A scene behind a robot's topics, in real time or in a stated share of it.
 
 The calling thread steps the physics on absolute deadlines and publishes the robot's state; a second
 one draws the cameras, each at its own time, from a copy of the positions, so that a slow
 renderer makes pictures rarer and nothing else late. Three topics are the simulation's own:
 ``/sim/reset`` (``std_msgs/Int64``: a seed), ``/sim/fault`` (``std_msgs/String``: as ``--fault``
-takes it, or ``STREAM=well``) and ``/sim/facts`` (``std_msgs/String``: JSON, ten times a second).
+takes it, or ``STREAM=well``) and ``/sim/facts`` (``std_msgs/String``: JSON, ten times a simulated
+second and whenever an episode begins or a task is done).
+
+A machine that cannot draw and think in real time is given a ``real_time_factor``: the whole robot
+then lives that much slower, its rates with it, and whoever drives it follows the same slowed clock
+(:mod:`fluxvla_sim.ros2.operators`). What was promised and not kept is counted: ``late`` periods.
 """
 
 from __future__ import annotations
@@ -12,12 +17,12 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import FluxError, UsageError
+from fluxvla_core.errors import ConfigError, FluxError, UsageError
 from fluxvla_core.ros2 import images, qos
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.faults import Fault, Faults, Outbox
@@ -26,8 +31,9 @@ from fluxvla_core.ros2.streams import IMAGE
 from fluxvla_core.ros2.trouble import BadMessage
 from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.ros2.bodies import Body
+from fluxvla_sim.ros2.judge import Judge
+from fluxvla_sim.world import CONTROL_HZ, Scene
 
-CONTROL_HZ = 50.0
 _FACTS_EVERY = 5
 # A process that was stopped for longer than this goes on from now, instead of catching up.
 _FAR_BEHIND_S = 0.5
@@ -41,7 +47,9 @@ class NodeSettings:
     Args:
         name: of the node.
         seed: of the first scene.
-        camera_hz: pictures a second of each camera, if the machine can.
+        real_time_factor: simulated seconds in a second.
+        camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
+            nobody listens to is not drawn.
         height, width: of every picture, in pixels.
         best_effort: offer pictures as camera drivers do by default, not reliably.
         faults: (seconds after the start, stream, fault), what falls ill by itself.
@@ -50,12 +58,21 @@ class NodeSettings:
 
     name: str
     seed: int = 0
+    real_time_factor: float = 1.0
     camera_hz: float = 30.0
     height: int = 480
     width: int = 640
     best_effort: bool = False
     faults: Sequence[tuple[float, str, Fault]] = ()
     domain_id: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.real_time_factor <= 1:
+            raise ConfigError(
+                f"the real-time factor must be above 0 and at most 1, got {self.real_time_factor:g}"
+            )
+        if not 0 < self.camera_hz <= 1000:
+            raise ConfigError(f"cameras need a rate from 0 to 1000 Hz, got {self.camera_hz:g}")
 
 
 @dataclass
@@ -74,31 +91,34 @@ class RobotNode:
 
     Args:
         body: the robot's side of its topics.
-        scene: the physics: ``model``, ``data``, ``state``, ``reset(seed)``, ``step(action)``.
-        facts: what ``/sim/facts`` tells; called after each period with whether the robot was
-            commanded since the reset, and with None at a reset.
+        scene: the physics.
+        judge: of the scene's world.
+
+    Raises:
+        LoadFailed: there is no ROS 2 here.
     """
 
     def __init__(
         self,
         body: Body,
-        scene: Any,
+        scene: Scene,
         settings: NodeSettings,
         reporter: Reporter,
-        facts: Callable[[bool | None], Mapping[str, Any]],
+        judge: Judge,
     ) -> None:
         self.counts = Counts()
         self._body, self._scene, self._settings = body, scene, settings
-        self._reporter, self._facts = reporter, facts
+        self._reporter, self._judge = reporter, judge
         self._faults = Faults()
         self._streams = {*body.states, *body.latched, *body.cameras}
         # The scene's data, the body's target and what is set by topics.
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._commanded = False
-        self._reset(settings.seed)
+        self._told: dict[str, Any] = {}
         self._connection = Connection(settings.name, settings.domain_id)
         try:
+            self._reset(settings.seed)
             self._open()
         except BaseException:
             self._connection.close()
@@ -129,7 +149,8 @@ class RobotNode:
         self._connection.close()
 
     def _live(self, seconds: float | None, drawing: _Drawing) -> None:
-        outbox, period = Outbox(self._faults), 1.0 / CONTROL_HZ
+        outbox = Outbox(self._faults)
+        period = 1.0 / (CONTROL_HZ * self._settings.real_time_factor)
         pending = sorted(self._settings.faults, key=lambda item: item[0])
         start = deadline = time.monotonic()
         while not self._stopping.is_set():
@@ -153,18 +174,39 @@ class RobotNode:
 
     def _period(self, outbox: Outbox, now: float) -> None:
         with self._lock:
-            self._scene.step(self._body.target(now))
+            self._scene.step(self._body.target(self._simulated(now)))
             state = self._scene.state
-            facts = self._facts(self._commanded)
-        stamp = self._connection.node.get_clock().now().to_msg()
+            if self._commanded:
+                self._judge.after(self._scene)
+            told = self._judge.tell()
+            # Within the lock, so that no state of before a reset is stamped after it.
+            stamp = self._now().to_msg()
+            reset_at = self._reset_at
         for stream, message in self._body.say(state).items():
             if stream in self._publishers:
                 if hasattr(message, "header"):
                     message.header.stamp = stamp
                 outbox.put(stream, self._publishers[stream], message, now)
         self.counts.periods += 1
-        if self.counts.periods % _FACTS_EVERY == 0:
+        news = any(told[key] != self._told.get(key) for key in ("resets", "tasks"))
+        if news or self.counts.periods % _FACTS_EVERY == 0:
+            self._told = told
+            facts = {
+                **told,
+                "reset_at": reset_at,
+                "time": self.counts.periods / CONTROL_HZ,
+                "late": self.counts.late,
+                "real_time_factor": self._settings.real_time_factor,
+            }
             self._facts_publisher.publish(self._string(data=json.dumps(facts)))
+
+    def _simulated(self, now: float) -> float:
+        """Simulated seconds: what a trajectory's duration is measured in."""
+        return now * self._settings.real_time_factor
+
+    def _now(self) -> Any:
+        """The node's clock, which stamps messages: the wall clock, whatever the factor."""
+        return self._connection.node.get_clock().now()
 
     def _open(self) -> None:
         connection, body = self._connection, self._body
@@ -197,7 +239,7 @@ class RobotNode:
         def hear(message: Any) -> None:
             try:
                 with self._lock:
-                    self._body.hear(topic, message, time.monotonic())
+                    self._body.hear(topic, message, self._simulated(time.monotonic()))
                     self._commanded = True
             except BadMessage as error:
                 # What a driver does with nonsense: nothing.
@@ -214,7 +256,8 @@ class RobotNode:
         with self._lock:
             self._scene.reset(max(seed, 0))
             self._body.reset(self._scene.state)
-            self._facts(None)
+            self._judge.reset(max(seed, 0))
+            self._reset_at = self._now().nanoseconds
             self._commanded = False
 
     def _ill(self, text: str) -> None:
@@ -233,7 +276,8 @@ class RobotNode:
     def _draw(self) -> None:
         mujoco, settings, model = import_mujoco(), self._settings, self._scene.model
         renderer, data = Renderer(model), mujoco.MjData(model)
-        outbox, period = Outbox(self._faults), 1.0 / settings.camera_hz
+        outbox = Outbox(self._faults)
+        period = 1.0 / (settings.camera_hz * settings.real_time_factor)
         start = time.monotonic()
         cameras = list(self._pictures)
         # Spread over the period, as cameras that nobody synchronised.
@@ -246,9 +290,12 @@ class RobotNode:
                 if wait > 0:
                     self._stopping.wait(wait)
                     continue
+                if not self._pictures[camera].get_subscription_count():
+                    due[camera] = max(due[camera] + period, time.monotonic())
+                    continue
                 with self._lock:
                     data.qpos[:] = self._scene.data.qpos
-                    stamp = self._connection.node.get_clock().now().to_msg()
+                    stamp = self._now().to_msg()
                 # All that a picture needs of the physics, given the positions.
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_comPos(model, data)

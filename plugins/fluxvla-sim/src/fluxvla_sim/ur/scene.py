@@ -18,7 +18,6 @@ from fluxvla_sim.render import Renderer, import_mujoco, set_quality
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-CONTROL_HZ = 50.0
 SUBSTEPS = 10
 GRIPPER = "gripper/"
 FINGER_JOINT = f"{GRIPPER}right_driver_joint"
@@ -84,7 +83,7 @@ def _furnish(spec: Any, mujoco: Any) -> None:
 
 
 class URScene:
-    """The simulated robot and its cube; see :class:`fluxvla_sim.aloha.scene.AlohaScene`."""
+    """The simulated robot and its cube; see :class:`fluxvla_sim.world.Scene`."""
 
     def __init__(self, quality: str = "cheap", height: int = 480, width: int = 640) -> None:
         self._mujoco = import_mujoco()
@@ -127,6 +126,11 @@ class URScene:
         """``(7,)`` joint angles in radians, gripper opening 0 closed to 1 open."""
         opening = 1.0 - self.data.qpos[self._finger] / FINGER_CLOSED
         return np.array([*self.data.qpos[self._joints], opening])
+
+    @property
+    def objects(self) -> npt.NDArray[np.float64]:
+        """``(7,)`` the cube's pose."""
+        return self.cube
 
     @property
     def cube(self) -> npt.NDArray[np.float64]:

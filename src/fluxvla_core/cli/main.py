@@ -122,7 +122,7 @@ def _unknown(word: str, names: list[str]) -> UsageError:
         return UsageError(
             f"unknown argument {word!r}: the command comes first", next="fluxvla run --help"
         )
-    near = _close(word, [*names, "config", "data", "plugins"])
+    near = _close(word, [*names, "config", "data", "eval", "plugins"])
     hint = f"; did you mean 'fluxvla {near[0]}'?" if near else ""
     return UsageError(f"no command {word!r}{hint}", next="fluxvla --help")
 

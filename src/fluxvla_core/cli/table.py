@@ -42,6 +42,9 @@ COMMANDS: Mapping[str, Entry] = {
     "data convert": Entry(
         "fluxvla_core.cli.data_commands:Convert", "write a dataset of LeRobot v2 as v3.0"
     ),
+    "eval compare": Entry(
+        "fluxvla_core.cli.eval_commands:Compare", "compare two evaluations, pair by pair"
+    ),
     "report": Entry("fluxvla_core.report.command:Report", "write the HTML report of a work dir"),
     "version": Entry("fluxvla_core.cli.version:Version", "print the versions"),
 }

@@ -36,8 +36,10 @@ def count_behaviours(records: Records) -> dict[str, Any]:
 
 def instruction_test(records: Records) -> dict[str, Any] | None:
     """Whether the policy does a scene's task more often when it is told to than when it is told
-    another: exact McNemar over the same seeds. None without wrong instructions."""
-    swapped = [r for r in records if r["group"] == SWAPPED]
-    if not swapped:
-        return None
-    return mcnemar.compare([r for r in records if r["group"] == POLICY], swapped).to_dict()
+    another: exact McNemar over the same seeds. None without wrong instructions on them."""
+    right, wrong = (
+        [r for r in records if r["group"] == group and r["status"] == DONE]
+        for group in (POLICY, SWAPPED)
+    )
+    pairs = {(r["task"], r["seed"]) for r in right} & {(r["task"], r["seed"]) for r in wrong}
+    return mcnemar.compare(right, wrong).to_dict() if pairs else None

@@ -53,7 +53,8 @@ def timing(
     steps = sum(r["steps"] for r in done)
 
     def mean_ms(name: str, count: int) -> float:
-        return 1e3 * sum(r["timing"].get(name, 0.0) for r in done) / max(count, 1)
+        spent: float = sum(r["timing"].get(name, 0.0) for r in done)
+        return 1e3 * spent / max(count, 1)
 
     found: dict[str, Any] = {
         "episodes": 0,

@@ -291,7 +291,7 @@ class EvalRunner:
         values: dict[str, Any] = {**course, "size": settings.size, **source, **spec.details}
         if self.instruction_swap:
             values["wrong_instructions_of"] = settings.tasks
-        return plain(
+        about: dict[str, Any] = plain(
             {
                 "policy": policy,
                 "environment": self._environment,
@@ -299,6 +299,7 @@ class EvalRunner:
                 "settings": values,
             }
         )
+        return about
 
     def wrong(self, name: str, what: str) -> ConfigError:
         """An error about a key of this section."""

@@ -166,8 +166,8 @@ def told_instead(environment: Any, task: str, wanted: Sequence[str]) -> str:
     Raises:
         ConfigError: the environment's scenes allow no other task.
     """
-    names = [each.name for each in environment.spec.tasks]
-    others = list(environment.others(task)) if hasattr(environment, "others") else []
+    names: list[str] = [each.name for each in environment.spec.tasks]
+    others: list[str] = list(environment.others(task)) if hasattr(environment, "others") else []
     others = [name for name in others if name in wanted] or others
     if not others:
         raise ConfigError(

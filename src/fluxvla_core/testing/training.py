@@ -85,7 +85,8 @@ class TinyVLA(nn.Module):
         loss = (found - actions - 0.1 * noise).square().mean()
         if self.bad_sample >= 0:
             loss = loss + torch.where(sample_ids == self.bad_sample, torch.nan, 0.0).sum()
-        self.batches += 1
+        if self.training:
+            self.batches += 1
         return {"loss": loss}
 
     @property

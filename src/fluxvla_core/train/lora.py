@@ -143,13 +143,18 @@ def attach(model: nn.Module, options: LoraOptions, where: str | None = None) -> 
     """
     from peft import LoraConfig, inject_adapter_in_model
 
-    check = [n for n in options.modules_to_save if not _ends(model, n)]
-    if check:
-        raise ConfigError(
-            f"lora.modules_to_save: no module's name ends in {check[0]!r}",
-            where=where,
-            next=f"the model has {_some(model)}",
-        )
+    targets = options.target_modules
+    for key, ends in (
+        ("target_modules", () if isinstance(targets, str) else targets),
+        ("modules_to_save", options.modules_to_save),
+    ):
+        for end in ends:
+            if not any(f".{name}".endswith(f".{end}") for name, _ in model.named_modules()):
+                raise ConfigError(
+                    f"lora.{key}: no module's name ends in {end!r}",
+                    where=where,
+                    next=f"the model has {_some(model)}",
+                )
     settings = {k: v for k, v in options.for_peft().items() if k != "inference_mode"}
     try:
         inject_adapter_in_model(LoraConfig(**settings), model)
@@ -204,10 +209,6 @@ def _peft_name(name: str) -> str:
     return re.sub(
         r"\.default(?=\.|$)", "", name.replace(".modules_to_save.default", "", 1), count=1
     )
-
-
-def _ends(model: nn.Module, end: str) -> bool:
-    return any(n == end or n.endswith("." + end) for n, _ in model.named_modules() if n)
 
 
 def _some(model: nn.Module) -> str:

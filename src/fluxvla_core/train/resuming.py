@@ -20,7 +20,7 @@ from fluxvla_core.train.checkpoint import (
     newest_whole,
 )
 from fluxvla_core.train.distributed import World, on_first
-from fluxvla_core.train.lora import adapter_tensors
+from fluxvla_core.train.lora import LoraOptions, adapter_tensors
 from fluxvla_core.train.optim import torch_state
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
@@ -121,6 +121,29 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
     return None
 
 
+def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
+    """Refuse to go on with another adapter than the checkpoint's, or with one, or without.
+
+    Raises:
+        CheckpointError: says both.
+    """
+    mine, saved = (None if o is None else o.for_peft() for o in (ours, theirs))
+    if mine != saved:
+        raise CheckpointError(
+            f"lora is {_shown(mine)}, the checkpoint's run had {_shown(saved)}",
+            where=where,
+            next="set it back; or begin another run from these weights: init_from = "
+            "'<this checkpoint>' and another --work-dir",
+        )
+
+
+def _shown(settings: Mapping[str, Any] | None) -> str:
+    if settings is None:
+        return "not set"
+    named = ("r", "lora_alpha", "lora_dropout", "target_modules", "modules_to_save")
+    return ", ".join(f"{key}={settings[key]}" for key in named)
+
+
 def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     """Put everything but the random generators back to where ``checkpoint`` was saved.
 
@@ -129,6 +152,7 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     """
     where = str(checkpoint.path)
     saved = checkpoint.json(TRAINER)
+    check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
     warning = check_same_run(saved, run.plan, where)
     if warning and run.world.first:
         run.context.reporter.warn(warning)

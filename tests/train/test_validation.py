@@ -1,0 +1,256 @@
+"""Loss on samples that are not trained on: what it is, what it keeps, and when it ends a run."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.testing.training import (
+    Notes,
+    TinyDataset,
+    TinyVLA,
+    checkpoint_differences,
+    differences,
+    run_ranks,
+    tiny_config,
+    train,
+    train_all,
+    unflushed,
+)
+from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
+from fluxvla_core.train.validation import share_statistics
+from fluxvla_core.train.weights import load_for_inference
+
+
+@pytest.fixture(autouse=True)
+def _fast():
+    with unflushed():
+        yield
+
+
+class Held(TinyDataset):
+    """Samples 100 to 106."""
+
+    def __init__(self, length=7):
+        super().__init__(length)
+
+    def get_sample(self, index, epoch):
+        return super().get_sample(100 + index, epoch)
+
+
+def make(work_dir, resume=None, val=None, model=None, **settings):
+    table = {"type": "OneProcessRunner", "max_steps": 8, "max_keep_ckpts": 0, **settings}
+    config = tiny_config(table, **(model or {}))
+    config["val_dataloader"] = {"dataset": Held()} if val is None else val
+    context = RunContext(
+        config=config,
+        section="runner",
+        work_dir=Path(work_dir),
+        resume=resume,
+        reporter=Notes(Path(work_dir)),
+    )
+    return build_runner_from_cfg(config["runner"], context)
+
+
+def run(work_dir, resume=None, **settings):
+    runner = make(work_dir, resume, **settings)
+    runner.run_setup(37)
+    runner.run(TinyDataset())
+    return runner
+
+
+def losses(work_dir):
+    rows = [json.loads(line) for line in (work_dir / "metrics.jsonl").open()]
+    return {row["step"]: row["val_loss"] for row in rows if "val_loss" in row}
+
+
+def by_hand(folder):
+    """The loss of the checkpoint's acting weights on Held, in batches of 4 that are filled up."""
+    model = TinyVLA().eval()
+    load_for_inference(model, Checkpoint.open(folder))
+    found = []
+    for indices in ([0, 1, 2, 3], [4, 5, 6, 0]):
+        samples = [Held().get_sample(i, 0) for i in indices]
+        batch = {k: torch.stack([torch.as_tensor(s[k]) for s in samples]) for k in samples[0]}
+        with torch.no_grad():
+            found.append(float(model(**batch)["loss"]))
+    return sum(found) / 2
+
+
+@pytest.mark.parametrize("ema_decay", [None, 0.9])
+def test_it_is_the_loss_of_the_weights_that_act(tmp_path, ema_decay):
+    """O3 of the field notes: no validation split."""
+    run(tmp_path, val_iter_interval=3, save_iter_interval=1, ema_decay=ema_decay)
+    found = losses(tmp_path)
+    assert list(found) == [3, 6, 8]
+    for step, loss in found.items():
+        folder = tmp_path / f"checkpoints/step-{step:09d}"
+        assert loss == pytest.approx(by_hand(folder), rel=1e-6)
+
+
+def test_looking_changes_nothing(tmp_path):
+    """Not the weights, not what dropout draws, not the averages."""
+    run(tmp_path / "looked", val_iter_interval=1, ema_decay=0.9, save_iter_interval=8)
+    plain = make(tmp_path / "plain", ema_decay=0.9)
+    plain.val_options = None
+    plain.run_setup(37)
+    plain.run(TinyDataset())
+    ends = [folders(tmp_path / d)[-1] for d in ("looked", "plain")]
+    assert set(checkpoint_differences(*ends)) == {
+        f"{ends[0].name}/{name}" for name in ("config.resolved.json", "trainer.json")
+    }
+
+
+def test_without_an_interval_it_is_measured_with_every_checkpoint(tmp_path):
+    run(tmp_path, save_iter_interval=5)
+    assert list(losses(tmp_path)) == [5, 8]
+
+
+def best_of(work_dir):
+    found = losses(work_dir)
+    return min(found, key=found.get)
+
+
+def test_the_best_one_is_saved_named_and_kept(tmp_path):
+    """With a rate this high the loss goes up and down."""
+    settings = {"val_iter_interval": 1, "max_keep_ckpts": 1, "learning_rate": 0.3, "max_steps": 12}
+    run(tmp_path, **settings)
+    best = best_of(tmp_path)
+    assert 1 <= best < 12
+    assert [p.name for p in folders(tmp_path)] == [f"step-{best:09d}", "step-000000012"]
+    assert os.readlink(tmp_path / "checkpoints" / "best") == f"step-{best:09d}"
+    assert Checkpoint.open(tmp_path / "checkpoints" / "best").step == best
+    assert latest(tmp_path).step == 12
+    said = latest(tmp_path).json("trainer.json")["validation"]
+    assert said == {
+        "best": losses(tmp_path)[best],
+        "best_step": best,
+        "worse": 12 - best,
+    }
+
+
+def test_a_run_that_goes_on_knows_the_best_one(tmp_path):
+    settings = {
+        "val_iter_interval": 1,
+        "learning_rate": 0.3,
+        "save_iter_interval": 6,
+        "max_keep_ckpts": 2,
+    }
+    run(tmp_path / "whole", max_steps=12, **settings)
+    run(tmp_path / "cut", max_steps=6, **settings)
+    (tmp_path / "cut/checkpoints/best").unlink()
+    run(tmp_path / "cut", "auto", max_steps=12, **settings)
+    found = set(differences(tmp_path / "whole", tmp_path / "cut"))
+    assert {name.partition("/")[2] for name in found} <= {"config.resolved.json"}
+    links = [os.readlink(tmp_path / d / "checkpoints/best") for d in ("whole", "cut")]
+    assert links[0] == links[1]
+
+
+def test_no_better_loss_for_long_enough_ends_the_run(tmp_path):
+    """O3 of the field notes: no early stop."""
+    settings = {"val_iter_interval": 1, "learning_rate": 3.0, "early_stop_patience": 2}
+    runner = run(tmp_path, max_steps=500, **settings)
+    found = losses(tmp_path)
+    assert runner.progress.step < 500
+    assert list(found)[-3] == best_of(tmp_path) == runner.progress.best_step
+    assert latest(tmp_path).step == runner.progress.step
+    said = (tmp_path / "said.txt").read_text()
+    assert f"(step {runner.progress.best_step}) in 2 validations: training ends" in said
+    again = run(tmp_path, "auto", max_steps=500, **settings)
+    assert again.progress.step == runner.progress.step
+
+
+def test_a_loss_that_is_not_finite_is_told(tmp_path):
+    with pytest.raises(RunFailed, match="the validation loss is nan at step 3"):
+        run(tmp_path, val_iter_interval=3, model={"bad_sample": 104})
+
+
+def test_workers_and_a_batch_size_of_its_own(tmp_path):
+    run(tmp_path / "a", val_iter_interval=4, model={"dropout": 0.0})
+    val = {"dataset": Held(), "per_device_batch_size": 7, "per_device_num_workers": 1}
+    run(tmp_path / "b", val=val, val_iter_interval=4, model={"dropout": 0.0})
+    found = [losses(tmp_path / d) for d in "ab"]
+    assert found[0][4] == pytest.approx(found[1][4], rel=0.3)
+    assert found[0] != found[1]
+
+
+@pytest.mark.parametrize(
+    ("val", "settings", "message"),
+    [
+        ({}, {}, "val_dataloader needs a dataset"),
+        ({"dataset": Held(), "batch_size": 2}, {}, "val_dataloader.batch_size: unknown key"),
+        (
+            {"dataset": Held(), "per_device_batch_size": 0},
+            {},
+            "val_dataloader.per_device_batch_size: must be a whole number above 0, got 0",
+        ),
+    ],
+)
+def test_tables_that_cannot_be_meant(tmp_path, val, settings, message):
+    with pytest.raises(ConfigError) as caught:
+        make(tmp_path, val=val, **settings)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["val_iter_interval", "early_stop_patience"])
+def test_what_needs_a_validation_set_says_so(tmp_path, key):
+    table = {"type": "OneProcessRunner", "max_steps": 1, key: 2}
+    config = tiny_config(table)
+    with pytest.raises(ConfigError) as caught:
+        build_runner_from_cfg(config["runner"], RunContext(config=config, section="runner"))
+    assert str(caught.value) == (
+        f"{key} needs a val_dataloader, which the config does not have\n"
+        "  next: val_dataloader = dict(dataset=dict(type=…, episodes=[…]))"
+    )
+
+
+class Normalised:
+    def __init__(self, name="private"):
+        self.statistic_name, self.statistics = name, {name: {"action": name}}
+
+    def use_statistics(self, entry):
+        self.statistics = {self.statistic_name: entry}
+
+
+class Mixed:
+    def __init__(self, *datasets):
+        self.datasets = list(datasets)
+
+
+def test_it_is_normalised_as_the_training_data_are():
+    train_set, val = Normalised(), Normalised()
+    train_set.statistics = {"private": {"action": "train's"}}
+    share_statistics(train_set, val)
+    assert val.statistics == train_set.statistics
+    inner = Normalised()
+    share_statistics(train_set, Mixed(inner, TinyDataset()))
+    assert inner.statistics == train_set.statistics
+    with pytest.raises(ConfigError, match="statistic_name 'other' is none of the training data's"):
+        share_statistics(train_set, Normalised("other"))
+
+
+@pytest.mark.parametrize("kind", ["DDPTrainRunner", "FSDPTrainRunner"])
+def test_two_ranks_share_it_and_go_on_as_if_nothing_had_been(tmp_path, kind):
+    table = {"type": kind, "max_steps": 4, "ema_decay": 0.9, "max_keep_ckpts": 0}
+    looked = tiny_config({**table, "val_iter_interval": 1}, batch=2, dropout=0.0)
+    looked["val_dataloader"] = {"dataset": Held()}
+    runs = [
+        {"config": config, "work_dir": str(tmp_path / name)}
+        for name, config in (("looked", looked), ("plain", tiny_config(table, 2, dropout=0.0)))
+    ]
+    assert run_ranks(2, train_all, *runs) == [0, 0]
+    assert list(losses(tmp_path / "looked")) == [1, 2, 3, 4]
+    ends = [latest(tmp_path / d).manifest.files for d in ("looked", "plain")]
+    for name in ("model.safetensors", "ema.safetensors", "optimizer.safetensors"):
+        assert ends[0][name] == ends[1][name], name
+    one = {**looked, "runner": {**looked["runner"], "type": "OneProcessRunner"}}
+    one["train_dataloader"] = {"per_device_batch_size": 4}
+    train({"config": one, "work_dir": str(tmp_path / "one")})
+    alone, shared = losses(tmp_path / "one"), losses(tmp_path / "looked")
+    assert shared == pytest.approx(alone, rel=1e-4)

@@ -38,6 +38,13 @@ NEEDS = (
     "safetensors",
     "termcolor",
 )
+TRY_CODEC = """
+try:
+    import torchcodec
+except Exception as error:
+    missing = [line.strip() for line in str(error).splitlines() if "libpython" in line]
+    raise SystemExit(missing[0] if missing else f"torchcodec: {error}")
+"""
 FFMPEG = ("avcodec", "avdevice", "avfilter", "avformat", "avutil", "swresample", "swscale")
 
 
@@ -78,6 +85,8 @@ def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "le
     def install_parts(changed: list[str], fresh: bool) -> None:
         _pip(env, "--no-deps", *LEROBOT)
         _link_ffmpeg(env)
+        # Some Pythons (Debian's, unless libpython3.x is installed) lack the library it links to.
+        env.run("python", "-c", TRY_CODEC, quiet=True, echo=False)
 
     env.filled(base, {"lerobot": " ".join(LEROBOT)}, install_base, install_parts)
     return env

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,8 +30,12 @@ def make_plan(
     section: str | None = None,
     overrides: Iterable[str] = (),
     work_dir: str | None = None,
+    settings: Mapping[str, str] | None = None,
 ) -> Plan:
     """Load, override and check a config, and choose the section.
+
+    Args:
+        settings: what options of the command line set in the section that is chosen.
 
     Raises:
         UsageError: no config is named, or the section is not one that can run.
@@ -41,9 +45,16 @@ def make_plan(
         raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
     config = apply_overrides(load_config(file), overrides)
     name = choose_section(config, examine(config), section)
+    config = _with_settings(config, name, settings or {})
     checked = check_config(config, name)
     place = Path(work_dir) if work_dir is not None else default_work_dir(Path(file))
     return Plan(config, name, name in checked.trains, place, checked.uses)
+
+
+def _with_settings(config: Config, section: str, settings: Mapping[str, str]) -> Config:
+    tree = {**config.tree, section: {**config.tree[section], **settings}}
+    origins = {**config.origins, **{f"{section}.{key}": f"--{key}" for key in settings}}
+    return Config(tree, origins, config.file)
 
 
 def _configs_here() -> str:

@@ -36,6 +36,7 @@ class Run:
             "--resume", metavar="auto|PATH", help="go on from the newest, or this, checkpoint"
         )
         parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
+        parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
         parser.once("--nproc", type=positive, default=1, metavar="N", help="processes (default 1)")
         add_plugin_files(parser)
         parser.add_argument(
@@ -54,7 +55,8 @@ class Run:
 
             die_with_parent()
         load_plugin_files(args.plugin_files)
-        plan = make_plan(args.config, args.section, args.overrides, args.work_dir)
+        settings = {"record": args.record} if args.record is not None else {}
+        plan = make_plan(args.config, args.section, args.overrides, args.work_dir, settings)
         _check_fit(args, plan)
         if args.dry_run:
             print(_outline(plan, args.log_format))

@@ -181,7 +181,11 @@ class Episode:
         state = np.asarray(window["qpos"] if frame is None else frame.state, dtype=np.float64)
         stamps = frame.stamps if frame is not None else {}
         reading = Frame(state=state, images=window["images"], stamps=stamps)
-        check_frame(reading, self._plan.robot.embodiment, self._plan.cameras)
+        try:
+            check_frame(reading, self._plan.robot.embodiment, self._plan.cameras)
+        except BadFrame:
+            self._record.refused("reading", state=state, images=window["images"])
+            raise
         return state
 
     def _observe(self, last: Array) -> Seen:
@@ -221,13 +225,17 @@ class Episode:
     def _admit(self, seen: Seen, answer: Answer) -> Array:
         plan, policy = self._plan, self._plan.policy
         embodiment, last = plan.robot.embodiment, self._limiter.last
-        keyframes = check_chunk(
-            answer.chunk, embodiment, last, policy.action_rate_hz, plan.settings
-        )
-        if len(keyframes) != policy.horizon:
-            raise BadChunk(
-                f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+        try:
+            keyframes = check_chunk(
+                answer.chunk, embodiment, last, policy.action_rate_hz, plan.settings
             )
+            if len(keyframes) != policy.horizon:
+                raise BadChunk(
+                    f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+                )
+        except BadChunk:
+            self._record.refused("chunk", answer=answer.chunk)
+            raise
         keyframes = keyframes.copy()
         keyframes.flags.writeable = False
         if plan.hooks:
@@ -235,6 +243,8 @@ class Episode:
             plan.hooks.call("inferred", chunk=keyframes, latency_s=answer.seconds)
         stages = {"policy": answer.seconds, **getattr(policy, "stages", {})}
         self._record.chunk(keyframes, seen.at, stages)
+        if hasattr(policy, "taken"):
+            policy.taken()
         return keyframes[: plan.keyframes]
 
     def _execute(self, actions: Array, rate: Rate) -> None:

@@ -88,6 +88,10 @@ class EpisodeRecord:
             self._trace.picture(camera, stamps.get(camera, now), image)
         self.event(tally.OBSERVATION, state=state, stamps=stamps, ms=_milliseconds(seconds))
 
+    def refused(self, what: str, **values: Any) -> None:
+        """Something was not let through; ``values`` may be anything."""
+        self.event(tally.REFUSED, what=what, given=_shown(values))
+
     def chunk(self, keyframes: Array, observed: float, seconds: Mapping[str, float]) -> None:
         """A chunk was admitted; ``seconds`` by stage."""
         self.event(
@@ -155,6 +159,23 @@ class EpisodeRecord:
                 self._trace.picture(camera, frame.stamps[camera], image)
         shown = plan.cameras or images
         self._trace.frames({name: images[name] for name in shown if name in images})
+
+
+def _shown(value: Any) -> Any:
+    """``value`` as JSON that shows what is wrong with it."""
+    if isinstance(value, Mapping):
+        return {str(key): _shown(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray) and (value.dtype.kind not in "fiu" or value.ndim > 2):
+        return f"{value.shape} {value.dtype}"
+    if isinstance(value, (np.ndarray, list, tuple)):
+        return [_shown(inner) for inner in value]
+    if isinstance(value, (float, np.floating)) and not np.isfinite(value):
+        return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return repr(value)[:500]
 
 
 def _milliseconds(seconds: Mapping[str, float]) -> dict[str, float]:

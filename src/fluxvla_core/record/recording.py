@@ -89,7 +89,7 @@ class Recorded:
         self.start = events[0]
         if self.start.get("format") != tally.FORMAT:
             raise DataError(
-                f"the record has format {self.start.get('format')!r}; {tally.FORMAT!r} is read here",
+                f"the record is of format {self.start.get('format')!r}, not {tally.FORMAT!r}",
                 where=str(path),
             )
         self.embodiment = EmbodimentSpec.from_dict(self.start["embodiment"])

@@ -8,19 +8,14 @@ from typing import Any
 from fluxvla_core.record.timings import Timings
 
 FORMAT = "fluxvla-episode-1"
-START, OBSERVATION, CHUNK, COMMAND, STOP, END = (
-    "start",
-    "observation",
-    "chunk",
-    "command",
-    "stop",
-    "end",
-)
+START, OBSERVATION, CHUNK, REFUSED = "start", "observation", "chunk", "refused"
+COMMAND, STOP, END = "command", "stop", "end"
 """Values of an event's ``event``.
 
 ``start``: what runs on what (the first event); ``observation``: a reading that was looked at;
-``chunk``: a policy's answer that was admitted; ``command``: what was sent; ``stop``: a safe stop;
-``end``: how it ended. All have ``t``, seconds on the loop's clock.
+``chunk``: a policy's answer that was admitted; ``refused``: a reading or an answer that was not;
+``command``: what was sent; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on
+the loop's clock.
 """
 
 

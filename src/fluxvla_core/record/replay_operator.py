@@ -1,0 +1,203 @@
+"""``ReplayOperator``: the robot of a recording, which does again what it did, whatever it is told.
+
+The same config runs in simulation, on a recording or on the robot by changing ``operator``.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.protocols import Clock
+from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
+from fluxvla_core.errors import DataError, NotReady, Rejected
+from fluxvla_core.record import tally
+from fluxvla_core.record.recording import Event, Recorded, age_at, open_recording
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+# Times in a recording are rounded to nanoseconds.
+_ROUNDING_S = 1e-6
+
+
+class ReplayOperator:
+    """Shows what was recorded, and takes commands without following them.
+
+    As fast as possible by default: it has a clock of its own, on which each command takes a
+    control period, as in a simulation. A policy that answers as it did gives the same episode.
+
+    Args:
+        recording: an episode's folder or MCAP file, of ``fluxvla run --record``.
+        realtime: at the pace at which it was recorded.
+        context: what the run knows (injected): its reporter is told when the recording ends.
+    """
+
+    api: ClassVar[str] = "1.0"
+    # Its tracking error is the difference between two policies, not a fault.
+    follows_commands: ClassVar[bool] = False
+
+    def __init__(
+        self, recording: str, realtime: bool = False, context: RunContext | None = None
+    ) -> None:
+        self.recording = recording
+        self.realtime = realtime
+        self._reporter = (context or RunContext()).reporter
+        self._connected = False
+        self._ended = False
+        self._began = 0.0
+
+    @cached_property
+    def recorded(self) -> Recorded:
+        """The recording, read when it is first needed.
+
+        Raises:
+            DataError: it cannot be read, or has nothing to show.
+        """
+        found = open_recording(self.recording)
+        lacks = [name for name in found.embodiment.camera_names if name not in found.pictures]
+        if lacks and len(lacks) == len(found.embodiment.cameras):
+            raise DataError(
+                "this episode has no pictures: its robot cannot be replayed",
+                where=str(found.path),
+                cause="it was run without --record",
+                next="ReplayPolicy can replay its actions; record anew with --record DIR",
+            )
+        return found
+
+    @property
+    def embodiment(self) -> EmbodimentSpec:
+        """The recorded robot."""
+        return self.recorded.embodiment
+
+    @cached_property
+    def clock(self) -> Clock:
+        """Real time, or a clock that begins when the recording did."""
+        return MonotonicClock() if self.realtime else SimulatedClock(self._first)
+
+    def connect(self) -> None:
+        """Go to the beginning."""
+        self._connected = True
+        self._rewind()
+
+    def begin_episode(self, instruction: str, episode: int) -> None:
+        """Go to the beginning, and say so if another task was recorded."""
+        self._rewind()
+        if instruction != self.recorded.instruction:
+            self._reporter.warn(
+                f"the recording {self.recorded.path} is of {self.recorded.instruction!r}, "
+                f"not of {instruction!r}"
+            )
+
+    def get_frame(self) -> Frame:
+        """What had arrived by now; pictures in fresh arrays.
+
+        Raises:
+            NotReady: not connected, or nothing had arrived yet.
+        """
+        now, shown = self._now(), self.clock.now()
+        seen = self._observation(now)
+        stamps = {STATE: shown - age_at(seen, STATE)}
+        images = {}
+        for camera, pictures in self.recorded.pictures.items():
+            index = pictures.newest(now)
+            if index is None:
+                raise NotReady(f"the recording has no picture of {camera} before {now:.3f} s")
+            images[camera] = pictures.read(index)
+            # Where only what was looked at was recorded, nobody knows how old it was since.
+            age = now - pictures.times[index] if self.recorded.native else age_at(seen, camera)
+            stamps[camera] = shown - max(0.0, age)
+        return Frame(state=self._state(now), images=images, stamps=stamps)
+
+    def get_state(self) -> Array:
+        """``(state_dim,)`` of now.
+
+        Raises:
+            NotReady: not connected, or nothing had arrived yet.
+        """
+        return self._state(self._now())
+
+    def send_action(self, action: npt.ArrayLike) -> None:
+        """Take a ``(dim,)`` command; without ``realtime`` a control period passes.
+
+        Raises:
+            NotReady: not connected.
+            Rejected: wrong shape or not finite.
+        """
+        self._now()
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (self.embodiment.dim,) or not np.isfinite(values).all():
+            raise Rejected(
+                f"the recorded {self.embodiment.name} takes ({self.embodiment.dim},) finite "
+                f"numbers, got {values.tolist()}"
+            )
+        if isinstance(self.clock, SimulatedClock):
+            self.clock.advance(1.0 / self.embodiment.rate_hz)
+
+    def task_done(self) -> bool:
+        """Whether the recording is over; said once."""
+        over = self._now() >= self._last - _ROUNDING_S
+        if over and not self._ended:
+            self._ended = True
+            cut = "" if self.recorded.whole else ", where it was cut short"
+            self._reporter.info(f"the recording {self.recorded.path} ends here{cut}")
+        return over
+
+    def stop(self) -> None:
+        """Nothing moves."""
+
+    def close(self) -> None:
+        """Forget the connection; any number of times."""
+        self._connected = False
+
+    def _rewind(self) -> None:
+        self._began, self._ended = self.clock.now(), False
+
+    def _now(self) -> float:
+        """Seconds on the recorded loop's clock."""
+        if not self._connected:
+            raise NotReady("the recording is not connected", next="call connect() first")
+        return self._first + (self.clock.now() - self._began)
+
+    @cached_property
+    def _first(self) -> float:
+        return float(self._observations[0]["t"])
+
+    @cached_property
+    def _last(self) -> float:
+        """When the last command of the task was done; how the arm came to rest is no part of it."""
+        times, _ = self.recorded.commands("run")
+        return float(times[-1]) if len(times) else float(self._observations[-1]["t"])
+
+    @cached_property
+    def _observations(self) -> list[Event]:
+        found = self.recorded.of(tally.OBSERVATION)
+        if not found:
+            raise DataError(
+                "the recording holds no reading of the robot", where=str(self.recorded.path)
+            )
+        return found
+
+    @cached_property
+    def _observed(self) -> Array:
+        return np.array([event["t"] for event in self._observations], dtype=np.float64)
+
+    @cached_property
+    def _states(self) -> tuple[Array, Array]:
+        return self.recorded.states()
+
+    def _observation(self, now: float) -> Event:
+        return self._observations[max(0, _newest(self._observed, now))]
+
+    def _state(self, now: float) -> Array:
+        times, states = self._states
+        return np.array(states[max(0, _newest(times, now))])
+
+
+def _newest(times: Array, now: float) -> int:
+    """Index of the last of ascending ``times`` that is not after ``now``; -1 if there is none."""
+    return int(np.searchsorted(times, now + _ROUNDING_S, side="right")) - 1

@@ -15,6 +15,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-libero": {
         "commands": ("collect-libero",),
         "runners": ("LiberoEvalRunner", "LiberoInferenceRunner"),

@@ -1,0 +1,1 @@
+"""Any Gymnasium environment for FluxVLA: evaluation and collection from a config."""

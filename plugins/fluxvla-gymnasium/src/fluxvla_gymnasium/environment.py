@@ -1,0 +1,240 @@
+"""``GymnasiumEnvironment``: one Gymnasium id behind the core's contract.
+
+Gymnasium says what shape numbers have, and not what they mean. The config does, with an embodiment:
+a policy that means something else by its numbers is refused before the first step.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.environment import EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
+from fluxvla_core.evaluate.drawing import check_render, set_render, use_egl
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_gymnasium.parts import parts, pictures, state_row
+from fluxvla_gymnasium.success import SUCCESS, is_done
+
+if TYPE_CHECKING:
+    from fluxvla_core.contracts.frame import Observation
+
+Array = npt.NDArray[np.float64]
+
+
+class GymnasiumEnvironment:
+    """One Gymnasium environment as one task.
+
+    An episode ends when Gymnasium says so, or with success. Its seed is given to Gymnasium's reset
+    and to the action space, from which some environments draw.
+
+    Args:
+        id: Gymnasium's, for example ``gym_aloha/AlohaTransferCube-v0``.
+        embodiment: what its numbers mean: a table as ``EmbodimentSpec.from_dict`` takes it. Joints
+            are the action's numbers in their order, ``state_joints`` the state's.
+        module: an installed package that registers the id when it is imported, ``gym_aloha``.
+        make: further arguments of ``gymnasium.make``.
+        instruction: what a policy is told; the id by default.
+        max_steps: steps after which an episode ends at the latest.
+        state: parts of the observation that are the state, in this order, keys of nested parts
+            joined by dots; by default every part that is no picture, by name.
+        cameras: camera of the embodiment -> part of the observation, or ``render`` for what
+            Gymnasium's ``render()`` gives; by default the part of that name.
+        success: ``info`` (its ``is_success`` or ``success``) or ``terminated``.
+        success_reward: instead: a step's reward from which on the task is done.
+        render: ``cheap`` pictures (no shadows, no multisampling) where the simulator is MuJoCo, or
+            the environment's own: ``reference``.
+
+    Raises:
+        ConfigError: a value is impossible.
+        SpecMismatch: the embodiment is none.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(
+        self,
+        id: str,
+        embodiment: Mapping[str, Any] | EmbodimentSpec,
+        module: str | None = None,
+        make: Mapping[str, Any] | None = None,
+        instruction: str | None = None,
+        max_steps: int = 1000,
+        state: Sequence[str] | None = None,
+        cameras: Mapping[str, str] | None = None,
+        success: str = "info",
+        success_reward: float | None = None,
+        render: str = "cheap",
+    ) -> None:
+        check_render(render)
+        if ":" in id:
+            name, _, rest = id.partition(":")
+            raise ConfigError(
+                f"id {id!r} names a module", next=f"set module = {name!r} and id = {rest!r}"
+            )
+        if module is not None and not module.isidentifier():
+            raise ConfigError(f"module {module!r} is no name of an installed package")
+        if success not in SUCCESS:
+            raise ConfigError(f"success {success!r} is none of {', '.join(SUCCESS)}")
+        if max_steps < 1:
+            raise ConfigError(f"max_steps must be at least 1, got {max_steps}")
+        if not isinstance(embodiment, EmbodimentSpec):
+            embodiment = EmbodimentSpec.from_dict({"cameras": (), **embodiment})
+        unknown = sorted(set(cameras or {}) - set(embodiment.camera_names))
+        if unknown:
+            raise ConfigError(
+                f"cameras: the embodiment has no camera {unknown[0]!r}; "
+                f"it has {', '.join(embodiment.camera_names) or 'none'}"
+            )
+        name = re.sub(r"[^\w.-]+", "-", id)
+        self.spec = EnvironmentSpec(
+            name=id,
+            embodiment=embodiment,
+            tasks=(TaskSpec(name, instruction or id, max_steps),),
+            details={"render": render},
+        )
+        self._module = module
+        self._make = dict(make or {})
+        self._keys = state
+        self._cameras = {**{n: n for n in embodiment.camera_names}, **(cameras or {})}
+        if "render" in self._cameras.values():
+            self._make.setdefault("render_mode", "rgb_array")
+        self._success = success
+        self._success_reward = success_reward
+        self._render = render
+        self._env: Any = None
+        self._parts: dict[str, npt.NDArray[Any]] = {}
+        self._done = False
+
+    @property
+    def state(self) -> Array:
+        """``(state_dim,)``: the observation's numbers in one row."""
+        return state_row(self._parts, self._keys)
+
+    def reset(self, seed: int, task: str) -> None:
+        """Begin an episode.
+
+        Raises:
+            MissingPlugin: no installed package has this id.
+            SpecMismatch: the action or the state has not as many numbers as the embodiment.
+            RunFailed: the environment cannot be made.
+        """
+        if self._env is None:
+            self._env = self._made()
+        self._env.action_space.seed(seed)
+        seen, _ = self._env.reset(seed=seed)
+        self._parts, self._done = parts(seen), False
+        if len(self.state) != self.spec.embodiment.state_dim:
+            raise SpecMismatch(
+                f"the state of {self.spec.name} has {len(self.state)} numbers, "
+                f"the embodiment {self.spec.embodiment.state_dim}",
+                cause=f"the observation's parts are {_shapes(self._parts)}",
+                next="mend state_joints, or name the parts that are the state: state = ['...']",
+            )
+
+    def step(self, action: Array) -> Step:
+        """One step; values beyond the action space's limits are the environment's affair.
+
+        Raises:
+            RunFailed: the environment does not say whether its task is done.
+        """
+        from gymnasium.spaces import Discrete
+
+        space = self._env.action_space
+        if isinstance(space, Discrete):
+            given: Any = int(np.clip(np.rint(action[0]), space.start, space.start + space.n - 1))
+        else:
+            given = np.asarray(action, space.dtype).reshape(space.shape)
+        seen, reward, terminated, truncated, info = self._env.step(given)
+        self._parts = parts(seen)
+        reward, terminated = float(reward), bool(terminated)
+        self._done |= is_done(self._success, self._success_reward, reward, terminated, info)
+        return Step(reward, self._done, terminated or bool(truncated) or self._done)
+
+    def observe(self, cameras: Sequence[Camera]) -> Observation:
+        """State and pictures; these are of the environment's sizes.
+
+        Raises:
+            SpecMismatch: there is no such picture.
+        """
+        return {
+            "qpos": self.state.astype(np.float32),
+            "images": {camera.name: self._picture(camera.name) for camera in cameras},
+            "task_description": self.spec.tasks[0].instruction,
+        }
+
+    def close(self) -> None:
+        """Give everything back; any number of times."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _picture(self, camera: str) -> npt.NDArray[np.uint8]:
+        key = self._cameras.get(camera, camera)
+        if key == "render":
+            return np.array(self._env.render(), dtype=np.uint8)
+        found = pictures(self._parts)
+        ends = [name for name in found if name == key or name.endswith(f".{key}")]
+        if len(ends) != 1:
+            raise SpecMismatch(
+                f"{self.spec.name} has no picture {key!r}; it has {', '.join(found) or 'none'}",
+                next=f"set cameras = {{{camera!r}: '<one of these, or render>'}}",
+            )
+        return found[ends[0]].copy()
+
+    def _made(self) -> Any:
+        use_egl()
+        import gymnasium
+        from gymnasium.error import UnregisteredEnv
+        from gymnasium.spaces import Box, Discrete
+
+        where = f"gymnasium.make({self.spec.name!r})"
+        if self._module is not None:
+            try:
+                importlib.import_module(self._module)
+            except ImportError as error:
+                raise MissingPlugin(
+                    f"module {self._module!r} cannot be imported: {error}",
+                    next="install the package that has the environment",
+                ) from error
+        try:
+            env = gymnasium.make(self.spec.name, **self._make)
+        except UnregisteredEnv as error:
+            raise MissingPlugin(
+                f"there is no Gymnasium environment {self.spec.name!r}: {error}",
+                cause="its package is not installed, or registers it only when it is imported",
+                next="install it; set module = '<the package>'",
+            ) from error
+        except Exception as error:
+            raise RunFailed(
+                f"the environment cannot be made: {type(error).__name__}: {error}", where=where
+            ) from error
+        space = env.action_space
+        if not isinstance(space, (Box, Discrete)):
+            raise SpecMismatch(f"{where}: actions in {space} are no vector", where=where)
+        numbers = 1 if isinstance(space, Discrete) else int(np.prod(space.shape))
+        if numbers != self.spec.embodiment.dim:
+            raise SpecMismatch(
+                f"actions of {self.spec.name} have {numbers} numbers, "
+                f"the embodiment has {self.spec.embodiment.dim} joints"
+            )
+        for model in _mujoco_models(env):
+            set_render(model, self._render)
+        return env
+
+
+def _mujoco_models(env: Any) -> list[Any]:
+    """``MjModel`` of Gymnasium's MuJoCo environments and of those around dm_control."""
+    inner = env.unwrapped
+    physics = getattr(getattr(inner, "_env", None), "physics", None)
+    found = [getattr(inner, "model", None), getattr(getattr(physics, "model", None), "ptr", None)]
+    return [model for model in found if hasattr(getattr(model, "vis", None), "quality")]
+
+
+def _shapes(found: Mapping[str, npt.NDArray[Any]]) -> str:
+    return ", ".join(f"{name or 'the whole'} {array.shape}" for name, array in found.items())

@@ -132,3 +132,21 @@ def little_model():
 
 if os.environ.get("WALKING_MODEL") == "1":
     VLAS.register_module("Strides")(little_model())
+
+
+@POLICIES.register_module()
+class Thinker(Walker):
+    """A walker that looks and thinks for a while."""
+
+    cameras = ("eye",)
+
+    def __init__(self, seconds=0.0):
+        super().__init__()
+        self.seconds = seconds
+
+    def predict_action(self, observation):
+        import time
+
+        assert observation["images"]["eye"].shape == (24, 32, 3)
+        time.sleep(self.seconds)
+        return super().predict_action(observation)

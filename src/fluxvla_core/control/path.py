@@ -21,11 +21,15 @@ Execute = Callable[[Array, Rate], None]
 
 @dataclass(frozen=True)
 class Sent:
-    """One command that was sent: ``(D,)`` target as it was planned, and command as it was sent."""
+    """One command that was sent: ``(D,)`` target as it was planned, and command as it was sent.
+
+    ``held``: there was no target, so the arm brakes or stays.
+    """
 
     target: Array
     command: Array
     clamps: tuple[Clamp, ...]
+    held: bool = False
 
 
 class CommandPath:
@@ -103,12 +107,18 @@ class CommandPath:
 
     def _send_brake(self) -> None:
         before = self.limiter.last
-        self._send(before[None], self.limiter.brake()[None], [[]])
+        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
-    def _send(self, wanted: Array, commands: Array, clamps: Sequence[Sequence[Clamp]]) -> int:
+    def _send(
+        self,
+        wanted: Array,
+        commands: Array,
+        clamps: Sequence[Sequence[Clamp]],
+        held: bool = False,
+    ) -> int:
         """Hand the commands over; how many were played."""
         rows = zip(wanted, commands, clamps, strict=True)
-        self._rows = deque(Sent(t, c, tuple(found)) for t, c, found in rows)
+        self._rows = deque(Sent(t, c, tuple(found), held) for t, c, found in rows)
         self._between = self._unpaced = False
         handed = commands.copy()
         handed.flags.writeable = False

@@ -70,6 +70,25 @@ def timing(
     return found
 
 
+def ticks(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What became of the ticks of live episodes, as JSON values.
+
+    ``missed_share``: of all beats, those at which the policy had no target ready;
+    ``skipped_beats`` and ``late_ticks`` are the machine's; ``stopped_by``: rule -> episodes.
+    """
+    done = [r for r in records if r["status"] == DONE]
+    beats = sum(r["steps"] for r in done)
+    rules = [rule for r in done for rule in r["trips"][:1]]
+    return {
+        "ticks": sum(r["ticks"] for r in done),
+        "missed_ticks": sum(r["missed_ticks"] for r in done),
+        "missed_share": sum(r["missed_ticks"] for r in done) / max(beats, 1),
+        "skipped_beats": sum(r["skipped_beats"] or 0 for r in done),
+        "late_ticks": sum(r["late_ticks"] for r in done),
+        "stopped_by": {rule: rules.count(rule) for rule in dict.fromkeys(rules)},
+    }
+
+
 def check_any_done(records: Sequence[Mapping[str, Any]], ledger: Path) -> None:
     """Refuse to call it a result when every episode ended in an error.
 
@@ -96,6 +115,13 @@ def tell(reporter: Reporter, results: Mapping[str, Any], folder: Path) -> None:
         reporter.info(
             f"{speed['steps']} steps in {speed['seconds']:.0f} s: "
             f"{speed['steps_per_s']:.0f} steps/s in {speed['workers']} processes"
+        )
+    if "live" in results:
+        live = results["live"]
+        stopped = ", ".join(f"{rule} {count}" for rule, count in live["stopped_by"].items())
+        reporter.info(
+            f"live: {live['missed_share']:.1%} of {live['ticks']} ticks without a target of the "
+            f"policy, {live['skipped_beats']} beats skipped; stopped by safety: {stopped or 'none'}"
         )
     for video in results["videos"]:
         reporter.artifact("video", folder / video["path"])

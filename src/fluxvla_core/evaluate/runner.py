@@ -22,6 +22,7 @@ from fluxvla_core.evaluate import results
 from fluxvla_core.evaluate.behaviours import count_behaviours, instruction_test
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
+from fluxvla_core.evaluate.live import Live, check_options
 from fluxvla_core.evaluate.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
@@ -34,7 +35,7 @@ from fluxvla_core.evaluate.pool import WorkerPool
 from fluxvla_core.evaluate.rollout import Course
 from fluxvla_core.evaluate.serving import PolicyServer
 from fluxvla_core.evaluate.shards import Shard, shard_of
-from fluxvla_core.evaluate.showing import choose_episodes, record_videos
+from fluxvla_core.evaluate.showing import choose_episodes, record_videos, recorded_videos
 from fluxvla_core.evaluate.subject import chosen_checkpoint
 from fluxvla_core.evaluate.summary import summarise
 from fluxvla_core.evaluate.worker import (
@@ -47,7 +48,9 @@ from fluxvla_core.evaluate.worker import (
     choose_tasks,
 )
 
-FOLDER = "eval"
+FOLDER, LIVE_FOLDER = "eval", "eval_live"
+RECORDS = "episodes"
+"""Where the records of live episodes are, in their evaluation's folder."""
 
 
 class EvalRunner:
@@ -75,7 +78,10 @@ class EvalRunner:
             right one does better.
         swap_seed: of the first of these episodes; by default they repeat those of the policy.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
-        workers: processes that simulate; ``--nproc`` overrides it.
+        live: on the wall clock, through the control loop and the safety of a robot, into
+            ``<work_dir>/eval_live/``: True, or a table with the keys ``live.TAKEN`` of an
+            inference runner. Slow policies miss ticks; outcomes depend on the machine.
+        workers: processes that simulate, 2 by default and 1 live; ``--nproc`` overrides it.
         batch_size: rows of every forward pass of the policy. Results follow from it, because sums
             do; they do not follow from how many of the rows were in use.
         serve_policy: one model in this process answers all workers, in batches; otherwise each
@@ -114,7 +120,8 @@ class EvalRunner:
         instruction_swap: bool = False,
         swap_seed: int | None = None,
         baseline: bool = False,
-        workers: int = 2,
+        live: bool | Mapping[str, Any] = False,
+        workers: int | None = None,
         batch_size: int = 1,
         serve_policy: bool | None = None,
         record_videos: int = 4,
@@ -135,7 +142,8 @@ class EvalRunner:
         self.shard = shard_of()
         # Under a launcher, nproc is the number of launched processes, not of each one's workers.
         own = self.context.nproc > 1 and self.shard.count == 1
-        self.workers = self.context.nproc if own else workers
+        usual = 1 if live else 2
+        self.workers = self.context.nproc if own else (usual if workers is None else workers)
         self.ckpt_path = ckpt_path
         self.episodes = episodes
         self.seed = seed
@@ -144,7 +152,7 @@ class EvalRunner:
         self.baseline = baseline
         self.record_videos = record_videos
         self.episode_timeout_s = episode_timeout_s
-        self.folder = Path(self.context.work_dir) / FOLDER
+        self.folder = Path(self.context.work_dir) / (LIVE_FOLDER if live else FOLDER)
         self._given = tasks
         for name, value, least in (
             ("episodes", episodes, 1),
@@ -162,6 +170,13 @@ class EvalRunner:
             raise self.wrong("height", "and width belong together: give both or none")
         if video_fps <= 0:
             raise self.wrong("video_fps", f"must be positive, got {video_fps:g}")
+        if live and instruction_swap:
+            raise self.wrong("instruction_swap", "cannot be live: evaluate it stepped")
+        try:
+            options = check_options(live if isinstance(live, Mapping) else {}) if live else None
+        except ConfigError as error:
+            raise self.wrong("live", error.what) from error
+        self._live = None if options is None else plain(options)
         if environment is None:
             raise ConfigError(
                 f"{type(self).__name__} has no environment: where is the policy to act?",
@@ -215,6 +230,7 @@ class EvalRunner:
             course=self._course,
             size=self._size,
             video=self._film(self._spec),
+            live=self._live_settings(self._spec, video_fps=self._video[3]),
         )
 
     def run(self) -> dict[str, Any]:
@@ -244,11 +260,15 @@ class EvalRunner:
                 return self._leave_to_others(keys, ledger)
             results.check_any_done(records, ledger.path)
             shown = choose_episodes(records, self.record_videos)
-            videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
+            if self._live is None:
+                videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
+            else:
+                videos = recorded_videos(shown, self.folder, RECORDS)
         found = {
             "format": results.FORMAT,
             "policy": what["policy"] if isinstance(what["policy"], str) else what["policy"]["type"],
             "environment": what["environment"]["type"],
+            "mode": "stepped" if self._live is None else "live",
             "groups": summarise(records),
             "instruction_test": instruction_test(records),
             "behaviours": count_behaviours(records),
@@ -257,6 +277,8 @@ class EvalRunner:
             "videos": videos,
             "timing": results.timing(records, new, seconds, self.workers),
         }
+        if self._live is not None:
+            found["live"] = results.ticks(records)
         path = self.folder / "results.json"
         results.write_results(path, found)
         reporter.artifact("evaluation", path)
@@ -289,6 +311,8 @@ class EvalRunner:
         course = asdict(settings.course)
         del course["cameras"]
         values: dict[str, Any] = {**course, "size": settings.size, **source, **spec.details}
+        if self._live is not None:
+            values["live"] = self._live
         if self.instruction_swap:
             values["wrong_instructions_of"] = settings.tasks
         about: dict[str, Any] = plain(
@@ -333,6 +357,21 @@ class EvalRunner:
             "whoever ends last writes the results"
         )
         return {"shard": part.index, "episodes_left": left}
+
+    def _live_settings(self, spec: EnvironmentSpec, video_fps: float) -> Live | None:
+        if self._live is None:
+            return None
+        if not spec.limited:
+            raise self.wrong(
+                "live",
+                f"needs an environment that takes joint targets; {spec.name} does not, and the "
+                "safety of a robot cannot be kept for its actions",
+            )
+        options = dict(self._live)
+        if self._course.replan_every is not None:
+            options.setdefault("execute_horizon", self._course.replan_every)
+        fps = video_fps if self.record_videos else None
+        return Live(options, str(self.folder / RECORDS), fps)
 
     def _film(self, spec: EnvironmentSpec) -> Video:
         names, height, width, fps = self._video

@@ -79,6 +79,24 @@ def record_videos(
     ]
 
 
+def recorded_videos(
+    records: Sequence[Mapping[str, Any]], folder: Path, below: str
+) -> list[dict[str, Any]]:
+    """The videos that were made while the episodes ran, as :func:`record_videos` lists its own.
+
+    Args:
+        records: of live episodes, with ``record``: their folders, relative to ``folder/below``.
+    """
+    return [
+        {
+            **{key: record[key] for key in ("group", "task", "seed", "success")},
+            "path": video.relative_to(folder).as_posix(),
+        }
+        for record in records
+        for video in sorted((folder / below / record["record"]).glob("*.mp4"))[:1]
+    ]
+
+
 def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     seen: dict[str, int] = {}
     ranked = []

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.environment import Actor, Environment, TaskSpec
@@ -17,6 +17,9 @@ from fluxvla_core.evaluate.policies import Source, fit, make_policy
 from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
 from fluxvla_core.evaluate.serving import Facts, ServedPolicy
 from fluxvla_core.spec.embodiment import Camera
+
+if TYPE_CHECKING:
+    from fluxvla_core.evaluate.live import Live
 
 POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
 """Groups of episodes: the policy, the policy told another task, its untrained twin."""
@@ -55,6 +58,7 @@ class Settings:
         course: how episodes are run; its cameras are filled in for each policy.
         size: height and width of the policy's pictures; as it was trained by default.
         served: policies that the parent answers for, by group.
+        live: on the wall clock instead of stepped.
     """
 
     environment: Mapping[str, Any]
@@ -64,6 +68,7 @@ class Settings:
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
     served: Mapping[str, Facts] = field(default_factory=dict)
+    live: Live | None = None
 
 
 class EpisodeWorker:
@@ -94,6 +99,8 @@ class EpisodeWorker:
         # First of all, so that a policy that does not fit is refused before a scene is built.
         actor, cameras = self.actor(key.group)
         tasks = self.environment.spec.tasks
+        if settings.live is not None:
+            return self._live(settings.live, key, actor, cameras)
         told = None
         if key.group == SWAPPED:
             told = find_task(tasks, told_instead(self.environment, key.task, settings.tasks))
@@ -111,6 +118,26 @@ class EpisodeWorker:
         finally:
             if film is not None:
                 film.close()
+        record["timing"]["memory_mb"] = memory_mb()
+        return record
+
+    def _live(
+        self, live: Live, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
+    ) -> dict[str, Any]:
+        from fluxvla_core.evaluate.live import run_live
+
+        task, course = find_task(self.environment.spec.tasks, key.task), self._settings.course
+        record = run_live(
+            f"{key.group}-{key.task}-{key.seed}",
+            self.environment,
+            actor,
+            task,
+            key.seed,
+            course.policy_seed + key.seed,
+            cameras,
+            course.max_steps or task.max_steps,
+            live,
+        )
         record["timing"]["memory_mb"] = memory_mb()
         return record
 

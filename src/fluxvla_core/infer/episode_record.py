@@ -113,6 +113,7 @@ class EpisodeRecord:
             command=sent.command,
             state=state,
             clamps=[asdict(clamp) for clamp in sent.clamps],
+            **({"held": True} if sent.held else {}),
             ms=_milliseconds({k: v for k, v in seconds.items() if v is not None}),
         )
         self._film()

@@ -29,6 +29,7 @@ class Tally:
         self._clamps: dict[str, dict[str, int]] = {}
         self._chunks = 0
         self._steps = 0
+        self._held = 0
 
     def add(self, event: Mapping[str, Any]) -> None:
         """Count one event."""
@@ -41,6 +42,7 @@ class Tally:
             self._chunks += 1
         elif kind == COMMAND:
             self._steps += event.get("phase") == "run"
+            self._held += event.get("phase") == "run" and bool(event.get("held"))
             self._count_clamps(event.get("clamps") or ())
         for stage, value in (event.get("ms") or {}).items():
             if value is not None:
@@ -65,6 +67,7 @@ class Tally:
             "joints": [joint.get("name") for joint in embodiment.get("joints", ())],
             "rate_hz": start.get("rate_hz"),
             "skipped_beats": end.get("skipped_beats"),
+            "held_beats": self._held,
             "clamps": self._clamps,
             "trips": end.get("trips", []),
             "timings": self._timings.summary(),

@@ -106,6 +106,7 @@ def _episode(reader: Reader, folder: Path, units: Mapping[str, str]) -> Episode:
             "rate": f"{summary['rate_hz']:g} Hz" if "rate_hz" in summary else None,
             "chunks of the policy": summary.get("chunks"),
             "beats that were skipped": summary.get("skipped_beats"),
+            "beats without a target": summary.get("held_beats"),
             "trips": "; ".join(_trip(row) for row in summary.get("trips", [])),
             "clamped commands": clamp_counts(summary.get("clamps")),
         },

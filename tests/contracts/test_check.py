@@ -80,8 +80,8 @@ def test_what_a_class_may_have_besides_must_take_what_it_is_given(
 
 
 def test_an_action_filter_is_called_with_an_action():
+    cls = type("Lazy", (), {"__call__": lambda self: None})
     with pytest.raises(LoadFailed, match=r"Lazy .*__call__\(\) must accept 1 argument"):
-        cls = type("Lazy", (), {"__call__": lambda self: None})
         check_class("action_filters", cls, "here")
 
 

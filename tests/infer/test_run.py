@@ -200,7 +200,7 @@ def test_nearly_closed_grippers_are_closed_if_asked_for(bench, make_arm):
 
 
 def test_a_filter_that_does_not_fit_the_robot_is_said_before_it_is_connected(bench):
-    with pytest.raises(ConfigError, match="LowPass: there is no joint 'jow'; did you mean 'jaw'?"):
+    with pytest.raises(ConfigError, match="LowPass: there is no joint 'jow'"):
         bench.run(action_filters=[{"type": "LowPass", "share": 0.5, "joints": ["jow"]}])
     assert bench.arm.calls == []
 

@@ -151,7 +151,8 @@ class Loop:
         last, ahead = self.path.limiter.last, self.joiner.ahead()
 
         def think(seen: Seen) -> tuple[Seen, Any]:
-            return seen, self.think(seen, ahead and ahead.seen_at(seen.at, self.horizon))
+            rest = None if ahead is None else ahead.seen_at(seen.at, self.horizon)
+            return seen, self.think(seen, rest)
 
         if self.lockstep:
             seen = self.observe(last)

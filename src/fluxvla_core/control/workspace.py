@@ -83,11 +83,12 @@ class WorkspaceBox:
         # What the limits would do to it afterwards counts.
         wanted = np.clip(target[self._columns], *self._limits)
         allowed = self._inside(wanted)
-        if allowed is None and self._last is None:
-            raise BadCommand(
-                f"{type(self).__name__}: the first target is outside the box, and no near one is in"
-            )
         if allowed is None:
+            if self._last is None:
+                raise BadCommand(
+                    f"{type(self).__name__}: the first target is outside the box, and no near one "
+                    "is in it"
+                )
             allowed = self._last
         elif allowed is wanted:
             # What the joints' own limits will change is recorded there.

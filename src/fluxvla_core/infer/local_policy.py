@@ -18,11 +18,13 @@ from fluxvla_core.build import (
     build_vla_from_cfg,
     parameters,
 )
+from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot_v3 import camera_name
 from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
+from fluxvla_core.infer.scaling import scaling_of
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.train.checkpoint import Checkpoint, newest_whole
@@ -33,11 +35,13 @@ PRECISIONS = ("float32", "bf16")
 
 @dataclass(frozen=True)
 class Question:
-    """One episode's question: what it sees, its seed, and how many it asked before."""
+    """One episode's question: what it sees, its seed, how many it asked before, and what the
+    answer has to go on from."""
 
     observation: Observation
     seed: int
     call: int
+    rest: Continuation | None = None
 
 
 class LocalPolicy:
@@ -109,8 +113,33 @@ class LocalPolicy:
         self._calls += 1
         return chunk
 
+    @property
+    def continues(self) -> bool:
+        """Whether its model takes the rest of a chunk, and what it makes can be scaled back."""
+        if "prev_actions" not in self._takes:
+            return False
+        zeros = np.zeros(self.embodiment.state_dim)
+        return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
+
+    def continue_action(self, observation: Observation, rest: Continuation) -> Array:
+        """As ``predict_action``, for a chunk that goes on from ``rest``; see ``contracts.optional``.
+
+        The model gets ``prev_actions`` ``(1, T, D)`` normalised, ``prefix_weights`` ``(1, T)``,
+        ``prefix_len`` ``(1,)`` and ``max_guidance_weight`` ``(1,)``.
+
+        Raises:
+            ConfigError: the model takes no such thing, or its actions cannot be scaled back.
+            DataError: the observation lacks something that the transforms need.
+        """
+        question = Question(observation, self._seed, self._calls, rest)
+        chunk = self.predict_batch([question])[0]
+        self._calls += 1
+        return chunk
+
     def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
         """An answer to each of at most ``batch_size`` questions, in one forward pass.
+
+        Either all of them go on from a chunk, or none does.
 
         Raises:
             DataError, ConfigError: an observation lacks something that the transforms need.
@@ -131,7 +160,9 @@ class LocalPolicy:
         }
         prepared = time.perf_counter()
         mixed = self._precision == "bf16"
-        with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=mixed):
+        # A model that is guided differentiates, which tensors of inference_mode do not allow.
+        mode = torch.no_grad() if "prev_actions" in batch else torch.inference_mode()
+        with mode, torch.autocast(device.type, torch.bfloat16, enabled=mixed):
             actions = self.model.predict_action(**batch).float().cpu().numpy()
         inferred = time.perf_counter()
         chunks = [
@@ -157,9 +188,29 @@ class LocalPolicy:
         row = self._prepare(self._sized(question.observation))
         if "noise" in self._takes:
             row["noise"] = torch.from_numpy(self._noise(question.seed, question.call))
+        if question.rest is not None:
+            row |= self._rest(question.rest, question.observation)
         if not self._takes_all:
             row = {key: value for key, value in row.items() if key in self._takes}
         return row
+
+    def _rest(self, rest: Continuation, observation: Observation) -> dict[str, Any]:
+        """The rest of a chunk as the model takes it, a batch of one."""
+        import torch
+
+        states = np.asarray(observation["qpos"], dtype=np.float64)
+        scaling = scaling_of(self._denormalize, self.model.action_shape, states)
+        if "prev_actions" not in self._takes or scaling is None:
+            raise ConfigError(
+                f"the policy of {self.source or 'this model'} cannot go on from a chunk"
+            )
+        actions = scaling.normalized(rest.actions)
+        return {
+            "prev_actions": torch.from_numpy(actions.astype(np.float32))[None],
+            "prefix_weights": torch.from_numpy(rest.weights.astype(np.float32))[None],
+            "prefix_len": torch.tensor([rest.frozen]),
+            "max_guidance_weight": torch.tensor([rest.max_guidance_weight], dtype=torch.float32),
+        }
 
     def _sized(self, observation: Observation) -> dict[str, Any]:
         """The observation with pictures of the size that the policy was trained on.

@@ -13,6 +13,7 @@ from fluxvla_core.build import (
     build_projector_from_cfg,
     build_vision_backbone_from_cfg,
 )
+from fluxvla_models.guidance import Guide
 
 
 class CompactVLA(nn.Module):
@@ -78,10 +79,26 @@ class CompactVLA(nn.Module):
         lang_masks: Tensor,
         states: Tensor,
         noise: Tensor,
+        prev_actions: Tensor | None = None,
+        prefix_weights: Tensor | None = None,
+        prefix_len: Tensor | None = None,
+        max_guidance_weight: Tensor | None = None,
     ) -> Tensor:
-        """Observation and ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``."""
+        """Observation and ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+
+        Args:
+            prev_actions: ``(B, T, D)`` normalised, to go on from; the other three belong to it,
+                see ``guidance.Guide``.
+            prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
+        """
         context = self._context(images, lang_tokens, lang_masks, states)
-        return self.vla_head.sample(context, noise)
+        if prev_actions is None:
+            return self.vla_head.sample(context, noise)
+        assert prefix_weights is not None
+        assert prefix_len is not None
+        assert max_guidance_weight is not None
+        guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        return self.vla_head.sample(context, noise, guide)
 
     @property
     def action_shape(self) -> tuple[int, int]:

@@ -10,10 +10,13 @@ integration step lands on the estimate.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from fluxvla_models.guidance import Guide
 
 
 class FlowBlock(nn.Module):
@@ -105,14 +108,22 @@ class FlowMatchingHead(nn.Module):
         error = (found - clean.flatten(0, 1)).square()
         return (error * masks.repeat_interleave(draws, 0)[..., None]).mean()
 
-    def sample(self, context: Tensor, noise: Tensor) -> Tensor:
-        """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps."""
+    def sample(self, context: Tensor, noise: Tensor, guide: Guide | None = None) -> Tensor:
+        """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps.
+
+        With ``guide`` to one that goes on from another; that takes a backward pass for each step.
+        """
         x = noise
         for step in range(self.num_steps):
-            time = torch.full((len(x),), step / self.num_steps, device=x.device, dtype=x.dtype)
+            share = step / self.num_steps
+            time = torch.full((len(x),), share, device=x.device, dtype=x.dtype)
             # velocity / num_steps, with 1 - t = (num_steps - step) / num_steps
-            x = x + (self.estimate(x, time, context) - x) / (self.num_steps - step)
-        return x
+            if guide is None:
+                x = x + (self.estimate(x, time, context) - x) / (self.num_steps - step)
+                continue
+            found, pull = guide.pull(partial(self.estimate, time=time, context=context), x, share)
+            x = x + (found - x) / (self.num_steps - step) + pull / self.num_steps
+        return x if guide is None else guide.freeze(x)
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""

@@ -122,7 +122,7 @@ class LocalPolicy:
         return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """As ``predict_action``, for a chunk that goes on from ``rest``; see ``contracts.optional``.
+        """As ``predict_action``, for a chunk that goes on from ``rest`` (``ContinuesChunks``).
 
         The model gets ``prev_actions`` ``(1, T, D)`` normalised, ``prefix_weights`` ``(1, T)``,
         ``prefix_len`` ``(1,)`` and ``max_guidance_weight`` ``(1,)``.

@@ -1,8 +1,8 @@
 """A policy's actions back to what its model computes with, whatever made them physical.
 
-A checkpoint, or a config, says how a model's actions become a robot's (``denormalize_action``); what
-undoes it is not said, and may depend on the state (actions relative to it). But every such transform
-that can be undone scales and shifts, element by element, so that two of its answers tell it all.
+A checkpoint, or a config, says how a model's actions become a robot's (``denormalize_action``).
+What undoes that is not said, and may depend on the state (actions relative to it). But whatever can
+be undone scales and shifts, element by element, so that two of its answers tell it all.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _CLOSE = 1e-4
 
 @dataclass(frozen=True)
 class Scaling:
-    """``physical = offset + slope * normalized``, each ``(T, D)``; ``width`` of the model's rows."""
+    """``physical = offset + slope * normalized``, both ``(T, D)``; the model's rows are wider."""
 
     offset: Array
     slope: Array

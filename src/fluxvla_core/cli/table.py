@@ -42,6 +42,9 @@ COMMANDS: Mapping[str, Entry] = {
     "data convert": Entry(
         "fluxvla_core.cli.data_commands:Convert", "write a dataset of LeRobot v2 as v3.0"
     ),
+    "data collect": Entry(
+        "fluxvla_core.cli.collect_command:Collect", "record demonstrations of a scripted expert"
+    ),
     "eval compare": Entry(
         "fluxvla_core.cli.eval_commands:Compare", "compare two evaluations, pair by pair"
     ),

@@ -65,7 +65,7 @@ def resolve_name(policy: str | Mapping[str, Any], environment: Any) -> str | Map
     expert = getattr(environment, "expert", None)
     if expert is None:
         raise ConfigError(
-            f"{type(environment).__name__} names no expert",
+            f"{getattr(environment, '__name__', type(environment).__name__)} names no expert",
             next=f"choose another policy: {CHECKPOINT}, {RANDOM}, or dict(type='...')",
         )
     return {"type": expert}

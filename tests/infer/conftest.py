@@ -208,6 +208,11 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
+@pytest.fixture(scope="session")
+def make_bench() -> type[Bench]:
+    return Bench
+
+
 @pytest.fixture
 def make_arm() -> type[Arm]:
     return Arm

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -11,21 +13,44 @@ from fluxvla_core.record.recording import open_recording
 from fluxvla_core.record.replay_operator import ReplayOperator
 from fluxvla_core.record.replay_policy import ReplayPolicy
 from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.testing import OperatorConformance
 
 pytest.importorskip("rosbags")
 
 
-@pytest.fixture
-def path(bench):
+@pytest.fixture(scope="module")
+def path(make_bench, tmp_path_factory):
+    bench = make_bench(tmp_path_factory.mktemp("recorded"))
     bench.arm.get_state = lambda: bench.arm.state
-    bench.run(record=str(bench.work_dir / "rec"), max_publish_step=60, prepare_pose=[0.1, 0, 0.5])
-    return str(bench.work_dir / "rec" / "001-1")
+    bench.run(record=str(bench.work_dir), max_publish_step=60, prepare_pose=[0.1, 0, 0.5])
+    return str(bench.work_dir / "001-1")
 
 
-def again(bench, path, number, **arguments):
+def again(bench, path, **arguments):
     bench.run(record=str(bench.work_dir / "rec"), prepare_pose=[0.1, 0, 0.5], **arguments)
-    found = open_recording(bench.work_dir / "rec" / f"{number:03d}-1")
-    return open_recording(path), found
+    return open_recording(path), open_recording(bench.work_dir / "rec")
+
+
+class TestReplayOperator(OperatorConformance):
+    entry_point = "ReplayOperator"
+    arguments: ClassVar = {"recording": "there/is/none"}
+
+    @pytest.fixture
+    def operator(self, path):
+        operator = ReplayOperator(path)
+        yield operator
+        operator.close()
+
+
+class TestReplayOperatorInRealTime(OperatorConformance):
+    entry_point = "ReplayOperator"
+    arguments: ClassVar = {"recording": "there/is/none", "realtime": True}
+
+    @pytest.fixture
+    def operator(self, path):
+        operator = ReplayOperator(path, realtime=True)
+        yield operator
+        operator.close()
 
 
 class Looker:
@@ -64,7 +89,7 @@ def test_the_recorded_robot_gives_a_policy_what_it_saw(bench, make_arm):
 def test_the_recorded_actions_give_the_recorded_commands(bench, path, make_arm):
     bench.arm = make_arm()
     bench.arm.get_state = lambda: bench.arm.state
-    first, second = again(bench, path, 2, policy={"type": "ReplayPolicy", "recording": path})
+    first, second = again(bench, path, policy={"type": "ReplayPolicy", "recording": path})
 
     np.testing.assert_array_equal(first.commands()[1], second.commands()[1])
     np.testing.assert_array_equal(first.chunks(), second.chunks())
@@ -74,7 +99,7 @@ def test_the_recorded_actions_give_the_recorded_commands(bench, path, make_arm):
 def test_after_its_last_answer_a_recording_ends_the_episode(bench, path, make_arm):
     bench.arm = make_arm()
     _, second = again(
-        bench, path, 2,
+        bench, path,
         policy={"type": "ReplayPolicy", "recording": path}, max_publish_step=1000,
     )  # fmt: skip
 
@@ -85,7 +110,7 @@ def test_after_its_last_answer_a_recording_ends_the_episode(bench, path, make_ar
 def test_the_commands_themselves_can_be_replayed(bench, path, make_arm):
     bench.arm = make_arm()
     table = {"type": "ReplayPolicy", "recording": path, "actions": "commands"}
-    first, second = again(bench, path, 2, policy=table, max_publish_step=1000)
+    first, second = again(bench, path, policy=table, max_publish_step=1000)
 
     np.testing.assert_allclose(
         first.commands("run")[1], second.commands("run")[1], rtol=0, atol=1e-12
@@ -108,7 +133,7 @@ def test_lines_of_json_are_enough_for_a_policy(bench, make_arm):
 @pytest.mark.realtime
 def test_on_a_robot_the_answer_that_warms_up_is_not_taken(bench, path, make_arm):
     bench.arm = make_arm(realtime=True)
-    first, second = again(bench, path, 2, policy=ReplayPolicy(path), max_publish_step=1000)
+    first, second = again(bench, path, policy=ReplayPolicy(path), max_publish_step=1000)
 
     np.testing.assert_array_equal(first.chunks(), second.chunks())
 
@@ -116,10 +141,10 @@ def test_on_a_robot_the_answer_that_warms_up_is_not_taken(bench, path, make_arm)
 @pytest.mark.realtime
 def test_a_recording_plays_in_real_time(bench, path):
     found = ReplayOperator(path, realtime=True)
-    _, second = again(bench, path, 2, operator=found)
+    _, second = again(bench, path, operator=found)
 
     times, _ = second.commands("run")
-    assert times[-1] - times[0] >= 0.9 * (60 - 1) / 50
+    assert times[-1] - times[0] > 0.5 * (60 - 1) / 50  # as fast as possible, it takes 0.1 s
     assert second.summary()["outcome"] == "done"
 
 
@@ -154,10 +179,8 @@ def test_a_robot_that_is_not_connected_says_so(path):
     with pytest.raises(NotReady, match=r"call connect\(\) first"):
         operator.get_frame()
     operator.connect()
-    with pytest.raises(Rejected, match=r"takes \(3,\) finite numbers"):
+    with pytest.raises(Rejected, match="elbow"):
         operator.send_action([0.0, np.nan, 0.0])
-    operator.close()
-    operator.close()
 
 
 def test_what_a_policy_replays_is_one_of_two():

@@ -5,6 +5,7 @@ The same config runs in simulation, on a recording or on the robot by changing `
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -15,9 +16,10 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.contracts.protocols import Clock
 from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
-from fluxvla_core.errors import DataError, NotReady, Rejected
+from fluxvla_core.errors import DataError, NotReady
 from fluxvla_core.record import tally
 from fluxvla_core.record.recording import Event, Recorded, age_at, open_recording
+from fluxvla_core.ros2.actions import checked_action
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -59,8 +61,7 @@ class ReplayOperator:
             DataError: it cannot be read, or has nothing to show.
         """
         found = open_recording(self.recording)
-        lacks = [name for name in found.embodiment.camera_names if name not in found.pictures]
-        if lacks and len(lacks) == len(found.embodiment.cameras):
+        if found.embodiment.cameras and not found.pictures:
             raise DataError(
                 "this episode has no pictures: its robot cannot be replayed",
                 where=str(found.path),
@@ -69,10 +70,12 @@ class ReplayOperator:
             )
         return found
 
-    @property
+    @cached_property
     def embodiment(self) -> EmbodimentSpec:
-        """The recorded robot."""
-        return self.recorded.embodiment
+        """The recorded robot, with those of its cameras that were recorded."""
+        spec = self.recorded.embodiment
+        seen = tuple(c for c in spec.cameras if c.name in self.recorded.pictures)
+        return replace(spec, cameras=seen)
 
     @cached_property
     def clock(self) -> Clock:
@@ -126,15 +129,10 @@ class ReplayOperator:
 
         Raises:
             NotReady: not connected.
-            Rejected: wrong shape or not finite.
+            Rejected: wrong shape, not finite, or outside the limits.
         """
         self._now()
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != (self.embodiment.dim,) or not np.isfinite(values).all():
-            raise Rejected(
-                f"the recorded {self.embodiment.name} takes ({self.embodiment.dim},) finite "
-                f"numbers, got {values.tolist()}"
-            )
+        checked_action(self.embodiment, action)
         if isinstance(self.clock, SimulatedClock):
             self.clock.advance(1.0 / self.embodiment.rate_hz)
 

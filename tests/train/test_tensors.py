@@ -12,13 +12,13 @@ from safetensors.torch import load_file
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.tensors import check_names, read_tensors, save_tensors
+from fluxvla_core.train.tensors import TensorFile, check_names, read_tensors
 from fluxvla_core.train.writer import CheckpointWriter
 
 
 def saved(tmp_path, tensors):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
-        save_tensors(writer, "t.safetensors", tensors)
+        TensorFile.whole("t.safetensors", tensors, True).write(writer)
         return writer.commit() / "t.safetensors"
 
 

@@ -11,7 +11,7 @@ from torch import nn
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.train.checkpoint import Checkpoint
 from fluxvla_core.train.ema import Ema
-from fluxvla_core.train.tensors import save_tensors
+from fluxvla_core.train.tensors import TensorFile
 from fluxvla_core.train.weights import (
     check_model_tensors,
     left_out,
@@ -44,9 +44,10 @@ class Model(nn.Module):
 
 def checkpoint(tmp_path, model, without, ema=None):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
-        save_tensors(writer, "model.safetensors", model_tensors(model, without.names))
+        tensors = model_tensors(model, without.names)
+        TensorFile.whole("model.safetensors", tensors, True).write(writer)
         if ema is not None:
-            save_tensors(writer, "ema.safetensors", ema.shadow)
+            TensorFile.whole("ema.safetensors", ema.shadow, True).write(writer)
         writer.write_json("trainer.json", {"left_out": without.to_dict()})
         return Checkpoint.open(writer.commit())
 

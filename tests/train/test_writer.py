@@ -22,7 +22,8 @@ def write(work_dir, step, disk=None, text=b"weights"):
         writer.write_bytes("model.safetensors", text * step)
         writer.write_json("trainer.json", {"step": step, "loss": 0.1 + 0.2})
         writer.write_bytes("rng/rank-00000.safetensors", b"r")
-        writer.write_folder("processors", lambda folder: (folder / "t.json").write_text("{}"))
+        writer.fill_folder("processors", lambda folder: (folder / "t.json").write_text("{}"))
+        writer.enter_folder("processors")
         return writer.commit()
 
 

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -179,7 +180,7 @@ def train(settings: Mapping[str, Any]) -> Any:
     if settings.get("signal"):
         rank, batch, number = settings["signal"]
         if rank == int(os.environ.get("RANK", "0")):
-            table["collator"] = SignallingCollator(batch, number)
+            table["collator"] = SignallingCollator(batch, number, context.work_dir)
     stop.NOTICE_S = settings.get("notice_s", stop.NOTICE_S)
     if settings.get("kill_write"):
         kill_at_operation(settings["kill_write"])
@@ -207,15 +208,22 @@ def train_all(*runs: Mapping[str, Any]) -> None:
 
 
 class SignallingCollator(DictCollator):
-    """Sends this process signal ``number`` on the way to the ``batch``-th batch."""
+    """Sends this process signal ``number`` on the way to the ``batch``-th batch.
 
-    def __init__(self, batch: int, number: int) -> None:
+    SIGKILL waits until a checkpoint is there, which may still be on its way when a step is done.
+    """
+
+    def __init__(self, batch: int, number: int, work_dir: Path) -> None:
         super().__init__(KEYS)
-        self.left, self.number = batch, number
+        self.left, self.number, self.work_dir = batch, number, work_dir
 
     def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         self.left -= 1
         if self.left == 0:
+            limit = time.monotonic() + 60.0
+            while self.number == signal.SIGKILL and not folders(self.work_dir):
+                assert time.monotonic() < limit, "no checkpoint within a minute"
+                time.sleep(0.01)
             os.kill(os.getpid(), self.number)
         return super().__call__(samples)
 

@@ -51,6 +51,8 @@ class BaseTrainRunner(TrainRun):
         save_iter_interval: save every so many steps; 10000 in step-based runs that say nothing,
             only by epochs in epoch-based ones. The end of a run is always saved.
         max_keep_ckpts: newest checkpoints (by step) to keep; 0 keeps all.
+        async_save: write checkpoints beside the training, from a copy in memory; False waits for
+            the disk and needs no copy.
         optimizer: table of ``fluxvla.optimizers``; ``AdamW`` if None.
         lr_scheduler_type: ``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``.
         lr_schedule: for ``step-based``: ``{part of the run: rate}``, with 0.
@@ -101,6 +103,7 @@ class BaseTrainRunner(TrainRun):
         save_epoch_interval: int = 1,
         save_iter_interval: int | None = None,
         max_keep_ckpts: int = 2,
+        async_save: bool = True,
         lr_scheduler_type: str = "constant",
         lr_schedule: Mapping[Any, float] | None = None,
         warmup_ratio: float = 0.0,
@@ -132,6 +135,7 @@ class BaseTrainRunner(TrainRun):
             save_epoch_interval=save_epoch_interval,
             save_iter_interval=save_iter_interval,
             max_keep_ckpts=max_keep_ckpts,
+            async_save=async_save,
             lr_scheduler_type=lr_scheduler_type,
             lr_schedule=lr_schedule,
             warmup_ratio=warmup_ratio,
@@ -289,7 +293,9 @@ class BaseTrainRunner(TrainRun):
         train_loss: float | None = None,
         only_trainable: bool = True,
     ) -> Path | None:
-        """Save ``run_dir/checkpoints/step-…``; called on every rank.
+        """Begin to save ``run_dir/checkpoints/step-…``; called on every rank.
+
+        With ``async_save`` it is there, and known to be, after :meth:`settle_saves`.
 
         Args:
             run_dir: the work dir.
@@ -301,21 +307,22 @@ class BaseTrainRunner(TrainRun):
         Raises:
             RunFailed: it cannot be written; the earlier ones are as they were.
         """
+        from fluxvla_core.train.saver import Saver
         from fluxvla_core.train.saving import save_snapshot, take_snapshot
 
+        if self._saver is None:
+            self._saver = Saver(self.world, False)
         path = save_snapshot(
-            self.world,
+            self._saver,
             Path(run_dir),
             global_step,
             epoch,
             take_snapshot(self, train_loss, only_trainable),
             self.options.max_keep_ckpts,
-            self.context.reporter.warn,
             self.progress.best_step,
         )
-        if self.world.first:
-            self.context.reporter.artifact("checkpoint", path)
-            self.hooks.call("checkpoint_saved", path=path, step=global_step)
+        if not self._saver.beside:
+            self.settle_saves()
         return path
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:

@@ -8,7 +8,8 @@ and a robot that reads an embodiment use the same door as the trainer.
         model.safetensors        weights and buffers, but for frozen ones that the model brings
         ema.safetensors          averaged weights, when they are kept
         adapter/                 what LoRA trains, as peft has it, instead of in the model's file
-        optimizer.safetensors    optimizer state by parameter name, whole (not per rank)
+        optimizer.safetensors    optimizer state by parameter name; where ranks hold parts of it,
+        optimizer/rank-00000.safetensors    instead, in the layout that torch's DCP reads
         optimizer.json           its groups and scalars
         trainer.json             step, epoch, cursor, scheduler, last loss
         rng/rank-00000.safetensors
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,11 +34,14 @@ if TYPE_CHECKING:
     import torch
 
     from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.train.parts import Stored
 
 FOLDER = "checkpoints"
 MODEL = "model.safetensors"
 EMA = "ema.safetensors"
 OPTIMIZER = "optimizer.safetensors"
+OPTIMIZER_PARTS = "optimizer"
+RANDOM = "rng"
 OPTIMIZER_META = "optimizer.json"
 TRAINER = "trainer.json"
 POLICY = "policy.json"
@@ -193,6 +198,19 @@ class Checkpoint:
         if not self.has(name):
             raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
         return read_tensors(self.path / name)
+
+    def optimizer_tensors(self) -> Mapping[str, Stored]:
+        """The optimizer's state by ``<parameter>/<key>``, read when and as far as it is indexed.
+
+        Raises:
+            CheckpointError: there is none, or it cannot be read.
+        """
+        from fluxvla_core.train.parts import StoredTensors
+
+        names = sorted(n for n in self.manifest.files if n.startswith(OPTIMIZER_PARTS + "/"))
+        if not names and not self.has(OPTIMIZER):
+            raise CheckpointError(f"the checkpoint has no {OPTIMIZER}", where=str(self.path))
+        return StoredTensors([self.path / name for name in names or [OPTIMIZER]])
 
 
 def folders(place: str | Path) -> list[Path]:

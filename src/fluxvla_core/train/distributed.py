@@ -124,15 +124,6 @@ def total(world: World, values: Tensor) -> Tensor:
     return values
 
 
-def gather(world: World, tensor: Tensor) -> list[Tensor]:
-    """The CPU ``tensor`` of each rank, of one shape, on the first rank; elsewhere nothing."""
-    if world.size == 1:
-        return [tensor]
-    boxes = [torch.empty_like(tensor) for _ in range(world.size)] if world.first else None
-    dist.gather(tensor.contiguous(), boxes, dst=0, group=world.control)
-    return boxes or []
-
-
 def share_text(world: World, text: str) -> str:
     """The first rank's ``text`` on every rank."""
     if world.size == 1:
@@ -147,16 +138,19 @@ def share_text(world: World, text: str) -> str:
 
 
 def texts(world: World, text: str) -> list[str]:
-    """Every rank's ``text`` (cut to 2000 bytes) on every rank."""
+    """Every rank's ``text`` on every rank."""
     if world.size == 1:
         return [text]
-    mine = torch.zeros(2000, dtype=torch.uint8)
-    data = text.encode()[:2000]
+    data = text.encode()
+    lengths = [torch.zeros(1, dtype=torch.int64) for _ in range(world.size)]
+    dist.all_gather(lengths, torch.tensor([len(data)]), group=world.control)
+    longest = max(int(length) for length in lengths)
+    mine = torch.zeros(max(longest, 1), dtype=torch.uint8)
     if data:
         mine[: len(data)] = torch.frombuffer(bytearray(data), dtype=torch.uint8)
     boxes = [torch.empty_like(mine) for _ in range(world.size)]
     dist.all_gather(boxes, mine, group=world.control)
-    return [bytes(b.tolist()).rstrip(b"\0").decode(errors="replace") for b in boxes]
+    return [bytes(box[: int(n)].tolist()).decode() for box, n in zip(boxes, lengths, strict=True)]
 
 
 def on_first(world: World, work: Callable[[], str]) -> str:

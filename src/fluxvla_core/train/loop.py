@@ -17,6 +17,7 @@ from fluxvla_core.train.forward import IDS, ForwardArguments, to_device
 from fluxvla_core.train.memory import GB, peak_bytes
 from fluxvla_core.train.optim import trainable
 from fluxvla_core.train.resuming import restore_rng
+from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.shelf import name_best
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
@@ -31,6 +32,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     if not world.first:
         run.hooks = HookCaller(context)
     run.dataset, run.plan = dataset, run._plan(len(dataset))
+    run._saver = Saver(world, options.async_save, run.optimizer)
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))
     run.left_out = left_out(run.model)
     if options.ema_decay is not None:
@@ -110,6 +112,8 @@ class StepLoop:
                 save = save or better or bool(stopped) or self._enough()
             if save:
                 self.save()
+            elif self._stop.due(step):
+                run.settle_saves(wait=False)
         return stopped
 
     def _look_ahead(self) -> None:
@@ -207,18 +211,17 @@ class StepLoop:
         run.hooks.call("after_step", step=step, metrics=shown)
 
     def save(self) -> None:
-        """A checkpoint of where the run stands, unless there is one already."""
+        """Begin a checkpoint of where the run stands, unless there is one already."""
         run, progress = self._run, self._run.progress
         if progress.saved == progress.step:
             return
+        run.settle_saves()
         if run.world.first:
             run.metric.sync()
         run.save_checkpoint(
             run.context.work_dir, progress.step, progress.cursor.epoch, progress.loss
         )
         progress.saved = progress.step
-        if run.world.first and progress.best_step == progress.step:
-            name_best(run.context.work_dir, progress.step)
         self._window.restart_clock()
 
 

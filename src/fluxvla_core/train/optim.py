@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.train.parts import Stored
 from fluxvla_core.train.schedule import Schedule
 from fluxvla_core.train.tensors import like, whole
 
@@ -77,7 +78,7 @@ def named_state(
 def torch_state(
     model: nn.Module,
     optimizer: torch.optim.Optimizer,
-    tensors: NamedState,
+    tensors: Mapping[str, Tensor | Stored],
     described: Mapping[str, Any],
     where: str,
 ) -> dict[str, Any]:
@@ -106,10 +107,11 @@ def torch_state(
     state: dict[int, dict[str, Any]] = {}
     for place, value in {**tensors, **described["scalars"]}.items():
         name, _, key = place.rpartition("/")
-        if isinstance(value, Tensor):
+        if isinstance(value, Tensor | Stored):
             same = value.shape == parameters[name].shape
+            everything = tuple(slice(0, n) for n in value.shape)
             # A copy: what was read may be a view of the checkpoint's file.
-            value = (like(parameters[name], value) if same else value).clone()
+            value = (like(parameters[name], value) if same else value[everything]).clone()
         state.setdefault(index[name], {})[key] = value
     groups, first = [], 0
     for mine, saved in zip(optimizer.param_groups, described["groups"], strict=True):

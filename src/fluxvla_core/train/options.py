@@ -31,6 +31,7 @@ class TrainOptions:
     save_epoch_interval: int
     save_iter_interval: int | None
     max_keep_ckpts: int
+    async_save: bool
     lr_scheduler_type: str
     lr_schedule: Mapping[Any, float] | None
     warmup_ratio: float
@@ -110,6 +111,7 @@ class TrainOptions:
             "must be a positive number, or None",
         )
         for key in (
+            "async_save",
             "enable_mixed_precision_training",
             "enable_gradient_checkpointing",
             "compile_blocks",

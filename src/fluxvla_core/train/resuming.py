@@ -12,7 +12,6 @@ from fluxvla_core.train.batches import StepPlan
 from fluxvla_core.train.checkpoint import (
     EMA,
     MODEL,
-    OPTIMIZER,
     OPTIMIZER_META,
     TRAINER,
     Checkpoint,
@@ -162,7 +161,7 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     state = torch_state(
         run.model,
         run.optimizer,
-        checkpoint.tensors(OPTIMIZER),
+        checkpoint.optimizer_tensors(),
         checkpoint.json(OPTIMIZER_META),
         where,
     )

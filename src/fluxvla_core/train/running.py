@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fluxvla_core.train.loop import StepLoop
     from fluxvla_core.train.lora import LoraOptions
     from fluxvla_core.train.progress import Progress
+    from fluxvla_core.train.saver import Saver
     from fluxvla_core.train.strategy import Strategy
     from fluxvla_core.train.weights import LeftOut
 
@@ -55,6 +56,7 @@ class TrainRun:
     _checkpoint: Checkpoint | None = None
     _arguments: ForwardArguments | None = None
     _loop: StepLoop | None = None
+    _saver: Saver | None = None
 
     if TYPE_CHECKING:
 
@@ -88,6 +90,7 @@ class TrainRun:
                 steps = self.max_steps is not None
                 number = self._run_step_based() if steps else self._run_epoch_based()
                 self.loop.save()
+                self.settle_saves()
             outcome = "interrupted" if number else "ok"
         except (RuntimeError, MemoryError) as error:
             step = self.progress.step + 1
@@ -98,6 +101,8 @@ class TrainRun:
         finally:
             if self._loop is not None:
                 self._loop.close()
+            if self._saver is not None:
+                self._saver.close()
             if self.world.first:
                 self.metric.finalize()
             self.hooks.call("run_finished", outcome=outcome)
@@ -105,6 +110,27 @@ class TrainRun:
         if number:
             raise stopped(number, f"step {self.progress.step} in {self.context.work_dir}")
         return self.context.work_dir
+
+    def settle_saves(self, wait: bool = True) -> None:
+        """Take note of what became of the checkpoint on its way; called on every rank.
+
+        Args:
+            wait: for its end; otherwise nothing happens while some rank still writes.
+
+        Raises:
+            RunFailed: it could not be written; the earlier ones are as they were.
+        """
+        from fluxvla_core.train.shelf import name_best
+
+        saved = self._saver.settle(wait) if self._saver is not None else None
+        if saved is None or not self.world.first:
+            return
+        for warning in saved.warnings:
+            self.context.reporter.warn(warning)
+        if saved.step == self.progress.best_step:
+            name_best(saved.path.parent.parent, saved.step)
+        self.context.reporter.artifact("checkpoint", saved.path)
+        self.hooks.call("checkpoint_saved", path=saved.path, step=saved.step)
 
     @property
     def world(self) -> World:

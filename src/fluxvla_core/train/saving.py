@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,14 +16,16 @@ from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.resolved import environment
 from fluxvla_core.train import checkpoint as ckpt
 from fluxvla_core.train import lora
-from fluxvla_core.train.distributed import World, gather, on_first
+from fluxvla_core.train.distributed import World, on_first, texts
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.optim import named_state
+from fluxvla_core.train.parts import is_split, own_parts
+from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.shelf import rotate
 from fluxvla_core.train.state import rng_state
-from fluxvla_core.train.tensors import save_tensors
+from fluxvla_core.train.tensors import TensorFile
 from fluxvla_core.train.weights import LeftOut, model_tensors
-from fluxvla_core.train.writer import CheckpointWriter
+from fluxvla_core.train.writer import CheckpointWriter, json_bytes
 
 if TYPE_CHECKING:
     from fluxvla_core.train.strategy import Strategy
@@ -54,45 +55,65 @@ class Snapshot:
 
 
 def save_snapshot(
-    world: World,
+    saver: Saver,
     work_dir: Path,
     step: int,
     epoch: int,
     snapshot: Snapshot,
     keep: int,
-    warn: Callable[[str], None],
     spare: int | None = None,
 ) -> Path:
-    """Write the checkpoint of ``step``, then remove all but the ``keep`` newest (0: keep all).
+    """Begin the checkpoint of ``step``; ``saver.settle`` tells when it is there.
 
-    The one of step ``spare`` stays too.
+    Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
+    but for that of step ``spare``; old ones that cannot be removed are only warned of.
 
-    Every rank calls this; the first one writes. Old ones that cannot be removed are only warned
-    of.
+    Returns:
+        The folder that it will be.
 
     Raises:
-        RunFailed: it could not be written; on every rank, with the earlier ones as they were.
+        RunFailed: the state of the scheduler or metric is not JSON.
     """
-    writer = CheckpointWriter(work_dir, step, epoch) if world.first else None
-    with writer or nullcontext():
-        elsewhere = {*snapshot.left_out.names, *lora.adapter_names(snapshot.model)}
-        save_tensors(writer, ckpt.MODEL, model_tensors(snapshot.model, elsewhere))
-        if snapshot.adapter:
-            save_tensors(writer, lora.WEIGHTS, snapshot.adapter)
-        if snapshot.ema is not None:
-            save_tensors(writer, ckpt.EMA, snapshot.ema.shadow)
-        tensors, described = named_state(snapshot.model, snapshot.optimizer)
-        save_tensors(writer, ckpt.OPTIMIZER, tensors)
-        _save_rng(world, writer)
+    world = saver.world
+    writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
+    tensors, described = named_state(snapshot.model, snapshot.optimizer)
+    split = any(map(is_split, tensors.values()))
+    values = {ckpt.OPTIMIZER_META: described, ckpt.TRAINER: snapshot.trainer, **snapshot.documents}
+    documents: dict[str, bytes] = {}
+
+    def prepare() -> str:
+        documents.update({name: json_bytes(name, value) for name, value in values.items()})
+        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
+        # Now rather than in the thread: the training may use the same tokenizer meanwhile.
+        for name, fill in snapshot.folders.items():
+            writer.fill_folder(name, fill)
+        return ""
+
+    on_first(world, prepare)
+    files = [
+        *_model_files(saver, snapshot),
+        TensorFile.whole(rng_file(world.rank), rng_state(), True),
+    ]
+    if split:
+        parts = own_parts(tensors, world.first)
+        files.append(TensorFile.parts(part_file(world.rank), parts))
+    else:
+        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
+
+    def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
+        try:
+            for file in held:
+                file.write(writer)
+        except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
+            writer.refuse(error)
+        reports = texts(group, writer.report())
 
         def finish() -> str:
-            assert writer is not None
-            writer.write_json(ckpt.OPTIMIZER_META, described)
-            writer.write_json(ckpt.TRAINER, snapshot.trainer)
-            for name, document in snapshot.documents.items():
-                writer.write_json(name, document)
-            for name, fill in snapshot.folders.items():
-                writer.write_folder(name, fill)
+            writer.join(reports)
+            for name, data in documents.items():
+                writer.write_bytes(name, data)
+            for name in snapshot.folders:
+                writer.enter_folder(name)
             path = writer.commit()
             try:
                 rotate(work_dir, keep, spare=spare)
@@ -100,21 +121,36 @@ def save_snapshot(
                 warn(f"old checkpoints could not be removed: {error}")
             return str(path)
 
-        return Path(on_first(world, finish))
+        return Path(on_first(group, finish))
+
+    saver.start(step, files, write)
+    return writer.final
+
+
+def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
+    elsewhere = {*snapshot.left_out.names, *lora.adapter_names(snapshot.model)}
+    model = model_tensors(snapshot.model, elsewhere)
+    if saver.beside:
+        # The next forward pass may change buffers, while weights stay until the optimizer's step.
+        copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
+        model = {name: copies.get(id(t), t) for name, t in model.items()}
+    first = saver.world.first
+    files = [TensorFile.whole(ckpt.MODEL, model, first)]
+    if snapshot.adapter:
+        files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
+    if snapshot.ema is not None:
+        files.append(TensorFile.whole(ckpt.EMA, snapshot.ema.shadow, first))
+    return files
 
 
 def rng_file(rank: int) -> str:
     """Name of a rank's file of random states."""
-    return f"rng/rank-{rank:05d}.safetensors"
+    return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
 
 
-def _save_rng(world: World, writer: CheckpointWriter | None) -> None:
-    gathered = {key: gather(world, tensor) for key, tensor in sorted(rng_state().items())}
-    if writer is not None:
-        for rank in range(world.size):
-            save_tensors(
-                writer, rng_file(rank), {key: ranks[rank] for key, ranks in gathered.items()}
-            )
+def part_file(rank: int) -> str:
+    """Name of a rank's file with its parts of the optimizer's state."""
+    return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
 
 
 def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool) -> Snapshot:

@@ -64,11 +64,13 @@ class StopRequest:
         """Choose how often ranks compare notes; ``step_time`` (s) must be equal on all ranks."""
         self._every = max(1, int(NOTICE_S / step_time)) if step_time > 0 else 1
 
+    def due(self, step: int) -> bool:
+        """Whether ranks compare notes after ``step``."""
+        return self._world.size == 1 or step % self._every == 0
+
     def wanted(self, step: int) -> int:
         """The signal that some rank got, or 0; every rank gets the same answer."""
-        if self._world.size > 1 and step % self._every:
-            return 0
-        return agree(self._world, self._signal)
+        return agree(self._world, self._signal) if self.due(step) else 0
 
 
 def stopped(number: int, place: str) -> BaseException:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fluxvla_core.train.lora import LoraOptions
     from fluxvla_core.train.options import LoaderOptions, TrainOptions
     from fluxvla_core.train.progress import Progress
+    from fluxvla_core.train.saver import Saver
     from fluxvla_core.train.weights import LeftOut
 
 
@@ -49,6 +50,7 @@ class Strategy(Protocol):
     hooks: HookCaller
     _arguments: ForwardArguments | None
     _checkpoint: Checkpoint | None
+    _saver: Saver | None
 
     @property
     def world(self) -> World: ...
@@ -67,3 +69,4 @@ class Strategy(Protocol):
     def save_checkpoint(
         self, run_dir: Path, global_step: int, epoch: int, train_loss: float | None = None
     ) -> Any: ...
+    def settle_saves(self, wait: bool = True) -> None: ...

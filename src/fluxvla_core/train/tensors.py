@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributed.tensor import DTensor, distribute_tensor
+from torch.distributed.tensor import DTensor
 
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.train.parts import Region, Stored, describe_parts, is_split, local
 from fluxvla_core.train.writer import CheckpointWriter
 
 _DTYPES: Mapping[torch.dtype, str] = {
@@ -48,47 +50,98 @@ def copy_whole(target: Tensor, source: Tensor) -> None:
         target.copy_(like(target, source))
 
 
-def like(target: Tensor, source: Tensor) -> Tensor:
+def like(target: Tensor, source: Tensor | Stored) -> Tensor:
     """The full ``source`` on the device of ``target``, sharded as it is; nothing is sent."""
+    # Each rank cuts its own part: all have read the same verified files.
+    part = source[Region.of(target).slices].to(target.device)
     if not isinstance(target, DTensor):
-        return source.to(target.device)
-    # Each rank cuts its own part: all have read the same verified file.
-    return distribute_tensor(
-        source.to(target.device), target.device_mesh, target.placements, src_data_rank=None
+        return part
+    return DTensor.from_local(
+        part.contiguous(),
+        target.device_mesh,
+        target.placements,
+        run_check=False,
+        shape=target.shape,
+        stride=target.stride(),
     )
 
 
-def save_tensors(writer: CheckpointWriter | None, name: str, tensors: Mapping[str, Tensor]) -> None:
-    """Write ``tensors`` as file ``name``; all ranks call it, the first one has the writer.
+@dataclass(frozen=True)
+class TensorFile:
+    """A safetensors file that is to be written.
 
-    Two names for one tensor (tied weights) are stored once, with the other name in the header.
-
-    Raises:
-        CheckpointError: a dtype that the format does not have.
+    Args:
+        name: in the checkpoint's folder.
+        header: what stands before the data.
+        tensors: in the order of the header. Those that are split are gathered when they are
+            written or held, in which all ranks take part.
+        mine: whether this rank writes the file.
     """
-    owner: dict[int, str] = {}
-    aliases: dict[str, str] = {}
-    for key, tensor in tensors.items():
-        first = owner.setdefault(id(tensor), key)
-        if first != key:
-            aliases[key] = first
+
+    name: str
+    header: bytes
+    tensors: tuple[Tensor, ...]
+    mine: bool
+
+    @classmethod
+    def whole(cls, name: str, tensors: Mapping[str, Tensor], mine: bool) -> TensorFile:
+        """One file with all of ``tensors``; all ranks make it, one of them writes it.
+
+        Two names for one tensor (tied weights) are stored once, with the other name in the header.
+
+        Raises:
+            CheckpointError: a dtype that the format does not have.
+        """
+        owner: dict[int, str] = {}
+        aliases: dict[str, str] = {}
+        for key, tensor in tensors.items():
+            first = owner.setdefault(id(tensor), key)
+            if first != key:
+                aliases[key] = first
+        kept = {key: tensors[key] for key in _ordered(owner.values(), tensors)}
+        header = _header(kept, {_ALIASES: json.dumps(aliases)})
+        return cls(name, header, tuple(kept.values()), mine)
+
+    @classmethod
+    def parts(cls, name: str, tensors: Mapping[str, Tensor]) -> TensorFile:
+        """A file of this rank with its parts of ``tensors``.
+
+        Raises:
+            CheckpointError: a dtype that the format does not have.
+        """
+        kept = {key: local(tensors[key]) for key in _ordered(tensors, tensors)}
+        return cls(name, _header(kept, describe_parts(tensors)), tuple(kept.values()), True)
+
+    def gathered(self) -> TensorFile:
+        """The same with whole tensors; all ranks call it, those that do not write get none."""
+        found = []
+        for tensor in self.tensors:
+            if self.mine or is_split(tensor):
+                full = whole(tensor)
+                if self.mine:
+                    found.append(full)
+        return replace(self, tensors=tuple(found))
+
+    def write(self, writer: CheckpointWriter) -> None:
+        """Write it, one tensor at a time in memory."""
+        if not self.mine:
+            self.gathered()
+            return
+        with writer.open(self.name) as file:
+            file.write(struct.pack("<Q", len(self.header)) + self.header)
+            for tensor in self.tensors:
+                file.write(_bytes(whole(tensor)))
+
+
+def _ordered(keys: Iterable[str], tensors: Mapping[str, Tensor]) -> list[str]:
     # Widest first keeps every tensor aligned to its own width.
-    order = sorted(owner.values(), key=lambda key: (-tensors[key].element_size(), key))
-    header = _header([(key, tensors[key]) for key in order], aliases)
-    if writer is None:
-        for key in order:
-            whole(tensors[key])
-        return
-    with writer.open(name) as file:
-        file.write(struct.pack("<Q", len(header)) + header)
-        for key in order:
-            file.write(_bytes(whole(tensors[key])))
+    return sorted(keys, key=lambda key: (-tensors[key].element_size(), key))
 
 
-def _header(entries: Sequence[tuple[str, Tensor]], aliases: Mapping[str, str]) -> bytes:
-    table: dict[str, Any] = {"__metadata__": {"format": "pt", _ALIASES: json.dumps(aliases)}}
+def _header(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
+    table: dict[str, Any] = {"__metadata__": {"format": "pt", **metadata}}
     begin = 0
-    for key, tensor in entries:
+    for key, tensor in tensors.items():
         if tensor.dtype not in _DTYPES:
             raise CheckpointError(f"tensor {key} has dtype {tensor.dtype}, which cannot be saved")
         end = begin + tensor.numel() * tensor.element_size()
@@ -125,7 +178,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def check_names(
-    found: Mapping[str, Tensor], wanted: Mapping[str, Tensor], what: str, where: str
+    found: Mapping[str, Tensor | Stored], wanted: Mapping[str, Tensor], what: str, where: str
 ) -> None:
     """Refuse tensors that are not those of this model.
 

@@ -2,6 +2,7 @@
 
 A checkpoint is written into a folder with another name, every file flushed to the device, the
 manifest last; then the folder gets its final name in one rename. Readers only look at final names.
+Several ranks may write files of one checkpoint; the first makes, completes and names the folder.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import contextlib
 import errno
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -38,20 +39,22 @@ class CheckpointWriter:
         work_dir: the run's folder; the checkpoint goes to ``checkpoints/step-…`` in it.
         step, epoch: what the checkpoint says of itself.
         disk: the file operations.
+        rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
+            by :meth:`report` and :meth:`join`.
     """
 
-    def __init__(self, work_dir: Path, step: int, epoch: int, disk: Disk | None = None) -> None:
+    def __init__(
+        self, work_dir: Path, step: int, epoch: int, disk: Disk | None = None, rank: int = 0
+    ) -> None:
         self.disk = disk or Disk()
-        self.step, self.epoch = step, epoch
+        self.step, self.epoch, self.rank = step, epoch, rank
         self.final = work_dir / FOLDER / step_name(step)
         self.folder = self.final.with_name(self.final.name + PARTIAL)
         self.files: dict[str, FileEntry] = {}
         self._error: OSError | None = None
 
     def __enter__(self) -> CheckpointWriter:
-        if self.folder.exists():
-            self.attempt(self.disk.remove_folder, self.folder)
-        self.attempt(self.disk.make_folder, self.folder)
+        self.begin()
         return self
 
     def __exit__(
@@ -61,7 +64,15 @@ class CheckpointWriter:
         trace: TracebackType | None,
     ) -> None:
         if error is not None:
-            self._discard()
+            self.discard()
+
+    def begin(self, *folders: str) -> None:
+        """Make the folder that all ranks write into, with ``folders`` in it; others do nothing."""
+        if self.rank == 0:
+            if self.folder.exists():
+                self.attempt(self.disk.remove_folder, self.folder)
+            for folder in (self.folder, *(self.folder / name for name in folders)):
+                self.attempt(self.disk.make_folder, folder)
 
     def attempt(self, operation: Callable[..., T], *arguments: Any) -> T | None:
         """``operation(*arguments)``, or None if it or anything before it failed."""
@@ -71,6 +82,12 @@ class CheckpointWriter:
             except OSError as error:
                 self._error = error
         return None
+
+    def refuse(self, error: Exception) -> None:
+        """Let :meth:`commit` fail with ``error``, unless something before it failed."""
+        if self._error is None:
+            kind = OSError(None, f"{type(error).__name__}: {error}")
+            self._error = error if isinstance(error, OSError) else kind
 
     @contextmanager
     def open(self, name: str) -> Iterator[HashedFile]:
@@ -87,32 +104,53 @@ class CheckpointWriter:
             file.write(data)
 
     def write_json(self, name: str, value: Mapping[str, Any]) -> None:
-        """A file with ``value`` as JSON; floats keep every bit, NaN is refused.
+        """A file with ``value`` as JSON.
 
         Raises:
             RunFailed: something in ``value`` is no JSON value.
         """
-        try:
-            text = json.dumps(value, indent=1, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise RunFailed(
-                f"{name} of the checkpoint cannot be written as JSON: {error}",
-                cause="the state of the scheduler or metric holds more than plain values",
-            ) from error
-        self.write_bytes(name, (text + "\n").encode())
+        self.write_bytes(name, json_bytes(name, value))
 
-    def write_folder(self, name: str, save: Callable[[Path], Any]) -> None:
-        """A folder that ``save`` fills by itself, as ``save_pretrained`` does."""
+    def fill_folder(self, name: str, save: Callable[[Path], Any]) -> None:
+        """A folder that ``save`` fills by itself, as ``save_pretrained`` does.
+
+        Its files are entered by :meth:`enter_folder`.
+        """
         self.attempt(self._fill_folder, self.folder / name, save)
 
     def _fill_folder(self, folder: Path, save: Callable[[Path], Any]) -> None:
         self.disk.make_folder(folder)
         save(folder)
+
+    def enter_folder(self, name: str) -> None:
+        """Flush what :meth:`fill_folder` brought to the device, and enter it in the manifest."""
+        self.attempt(self._enter_folder, self.folder / name)
+
+    def _enter_folder(self, folder: Path) -> None:
         for path in files_below(folder):
             self.disk.finish(path.open("rb+"))
             self.files[path.relative_to(self.folder).as_posix()] = FileEntry(
                 path.stat().st_size, hash_file(path)
             )
+
+    def report(self) -> str:
+        """What this rank has written, or its error, for :meth:`join` on the first rank."""
+        files = {name: [entry.size, entry.sha256] for name, entry in self.files.items()}
+        error = self._error and [self._error.errno, self._error.strerror or str(self._error)]
+        return json.dumps({"rank": self.rank, "files": files, "error": error})
+
+    def join(self, reports: Iterable[str]) -> None:
+        """Take in what other ranks report of their files."""
+        for report in map(json.loads, reports):
+            if report["rank"] == self.rank:
+                continue
+            self.files |= {name: FileEntry(*entry) for name, entry in report["files"].items()}
+            if report["error"] is not None and self._error is None:
+                number, text = report["error"]
+                text = f"{text}, on rank {report['rank']}"
+                if number == errno.ENOENT:
+                    text += ", which may not see the first rank's work dir"
+                self._error = OSError(number, text)
 
     def commit(self) -> Path:
         """Give the folder its final name and return it.
@@ -124,7 +162,7 @@ class CheckpointWriter:
         self.write_bytes(MANIFEST, Manifest(self.step, self.epoch, self.files).to_bytes())
         self.attempt(self._put_in_place)
         if self._error is not None:
-            self._discard()
+            self.discard()
             raise _failure(self._error, self.step, self.final) from self._error
         return self.final
 
@@ -137,11 +175,12 @@ class CheckpointWriter:
         self.disk.rename(self.folder, self.final)
         self.disk.sync_folder(self.final.parent)
 
-    def _discard(self) -> None:
+    def discard(self) -> None:
+        """Remove what was written."""
         # A partial folder that cannot be removed either does no harm: readers ignore its name,
         # and the next save of this step removes it.
         with contextlib.suppress(OSError):
-            if self.folder.exists():
+            if self.rank == 0 and self.folder.exists():
                 self.disk.remove_folder(self.folder)
 
 
@@ -154,7 +193,8 @@ class HashedFile:
         self._file: BinaryIO | None = writer.attempt(self._create, writer.folder / name)
 
     def _create(self, path: Path) -> BinaryIO:
-        if not path.parent.exists():
+        # Other ranks' folders are there, or are those of a disk that the first rank does not see.
+        if self._writer.rank == 0 and not path.parent.exists():
             self._writer.disk.make_folder(path.parent)
         return self._writer.disk.create(path)
 
@@ -181,6 +221,21 @@ class HashedFile:
         self._writer.disk.finish(file)
         if self._name != MANIFEST:
             self._writer.files[self._name] = FileEntry(self._size, self._digest.hexdigest())
+
+
+def json_bytes(name: str, value: Mapping[str, Any]) -> bytes:
+    """``value`` as JSON; floats keep every bit, NaN is refused.
+
+    Raises:
+        RunFailed: something in ``value`` is no JSON value.
+    """
+    try:
+        return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
+    except (TypeError, ValueError) as error:
+        raise RunFailed(
+            f"{name} of the checkpoint cannot be written as JSON: {error}",
+            cause="the state of the scheduler or metric holds more than plain values",
+        ) from error
 
 
 def _failure(error: OSError, step: int, path: Path) -> RunFailed:

@@ -1,0 +1,207 @@
+"""Which part of a sharded tensor this rank holds, and reading any part back from saved ones.
+
+Each rank saves its own parts of the optimizer's state in a safetensors file, with the place of
+each part in its header, in the layout that torch.distributed.checkpoint's
+``HuggingFaceStorageReader`` reads (torch/distributed/checkpoint/hf_storage.py). DCP's own writer
+is not used: its default one pickles the metadata and its safetensors one forms each file in
+memory as a whole, and neither can be summed, flushed and failed one operation at a time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributed.tensor import DTensor, Shard
+
+from fluxvla_core.errors import CheckpointError
+
+PLACES = "DCP_SHARDING_INFO"
+"""Header entry: JSON of ``{name: {"saved_offsets": [...]}}``."""
+SHAPES = "shapes"
+"""Header entry: JSON of ``{name: [...]}``, the shapes of the whole tensors."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A block of a tensor: where it begins and how long it is in each dimension."""
+
+    offsets: tuple[int, ...]
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, tensor: Tensor) -> Region:
+        """What this rank holds of ``tensor``; all of it if it is not sharded.
+
+        Raises:
+            CheckpointError: it is split in a way that is no block.
+        """
+        offsets, sizes = [0] * tensor.ndim, list(tensor.shape)
+        if isinstance(tensor, DTensor):
+            for dim, placement in enumerate(tensor.placements):
+                if isinstance(placement, Shard):
+                    # As torch.chunk cuts: equal parts, the last ones shorter or empty.
+                    length = sizes[placement.dim]
+                    part = -(-length // tensor.device_mesh.size(dim))
+                    begin = min(tensor.device_mesh.get_local_rank(dim) * part, length)
+                    offsets[placement.dim] += begin
+                    sizes[placement.dim] = min(part, length - begin)
+            if tuple(sizes) != tuple(tensor.to_local().shape):
+                raise CheckpointError(
+                    f"a tensor that is split by {tensor.placements} cannot be saved or loaded",
+                    cause="only splits into one block per process can",
+                )
+        return cls(tuple(offsets), tuple(sizes))
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        """For indexing the whole tensor."""
+        return tuple(slice(o, o + n) for o, n in zip(self.offsets, self.sizes, strict=True))
+
+    def common(self, other: Region) -> Region | None:
+        """The block that lies in both, in whole coordinates; None if there is none."""
+        begins = [max(pair) for pair in zip(self.offsets, other.offsets, strict=True)]
+        ends = [
+            min(a + n, b + m)
+            for a, n, b, m in zip(self.offsets, self.sizes, other.offsets, other.sizes, strict=True)
+        ]
+        sizes = [end - begin for begin, end in zip(begins, ends, strict=True)]
+        return Region(tuple(begins), tuple(sizes)) if all(n > 0 for n in sizes) else None
+
+    def inside(self, outer: Region) -> tuple[slice, ...]:
+        """For indexing a tensor that holds just ``outer``."""
+        moved = [o - p for o, p in zip(self.offsets, outer.offsets, strict=True)]
+        return Region(tuple(moved), self.sizes).slices
+
+
+def is_split(tensor: Tensor) -> bool:
+    """Whether more than one rank is needed to put ``tensor`` together."""
+    return isinstance(tensor, DTensor) and any(
+        isinstance(placement, Shard) and tensor.device_mesh.size(dim) > 1
+        for dim, placement in enumerate(tensor.placements)
+    )
+
+
+def own_parts(tensors: Mapping[str, Tensor], first: bool) -> dict[str, Tensor]:
+    """Those of ``tensors`` that this rank saves its part of: each part is saved by one rank.
+
+    Args:
+        first: whether this rank saves what is not split.
+    """
+    found = {}
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, DTensor):
+            mine = first
+        else:
+            mesh = tensor.device_mesh
+            copies = [d for d, p in enumerate(tensor.placements) if not isinstance(p, Shard)]
+            mine = all(mesh.get_local_rank(dim) == 0 for dim in copies)
+            region = Region.of(tensor)
+            mine = mine and (prod(region.sizes) > 0 or not any(region.offsets))
+        if mine:
+            found[name] = tensor
+    return found
+
+
+def describe_parts(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """What the header of a file with this rank's parts of ``tensors`` says of them."""
+    places = {name: {"saved_offsets": Region.of(t).offsets} for name, t in tensors.items()}
+    shapes = {name: list(t.shape) for name, t in tensors.items()}
+    return {PLACES: json.dumps(places), "DCP_VERSION": "1.0", SHAPES: json.dumps(shapes)}
+
+
+def local(tensor: Tensor) -> Tensor:
+    """This rank's part of ``tensor``."""
+    tensor = tensor.detach()
+    return tensor.to_local() if isinstance(tensor, DTensor) else tensor
+
+
+class Stored:
+    """One tensor in the files of a checkpoint; indexing reads what is asked for, and no more."""
+
+    def __init__(self, name: str, shape: Sequence[int]) -> None:
+        self.name = name
+        self.shape = torch.Size(shape)
+        self._parts: list[tuple[Any, Region]] = []
+
+    def add(self, file: Any, region: Region) -> None:
+        """``file``, opened by safetensors, has ``region`` under this name."""
+        self._parts.append((file, region))
+
+    def __getitem__(self, where: tuple[slice, ...]) -> Tensor:
+        """A block, on the CPU; it may be a view of the file.
+
+        Raises:
+            CheckpointError: parts of it are in no file.
+        """
+        ranges = [s.indices(length) for s, length in zip(where, self.shape, strict=True)]
+        wanted = Region(
+            tuple(begin for begin, _, _ in ranges), tuple(end - begin for begin, end, _ in ranges)
+        )
+        for file, region in self._parts:
+            if region == wanted:
+                whole: Tensor = file.get_tensor(self.name)
+                return whole
+        out: Tensor | None = None
+        found = 0
+        for file, region in self._parts:
+            both = wanted.common(region)
+            if both is None:
+                continue
+            piece: Tensor = file.get_slice(self.name)[both.inside(region)]
+            if out is None:
+                out = torch.empty(wanted.sizes, dtype=piece.dtype)
+            out[both.inside(wanted)] = piece
+            found += prod(both.sizes)
+        if found != prod(wanted.sizes):
+            raise CheckpointError(f"parts of {self.name} are in no file of the checkpoint")
+        if out is None:  # nothing was asked for: this rank's part is empty
+            file, region = self._parts[0]
+            none = tuple(slice(0, 0) if n == 0 else slice(0, n) for n in wanted.sizes)
+            out = torch.empty(wanted.sizes, dtype=file.get_slice(self.name)[none].dtype)
+        return out
+
+
+class StoredTensors(Mapping[str, Stored]):
+    """The tensors of one or several safetensors files, by name; parts of one belong together.
+
+    Raises:
+        CheckpointError: a file cannot be read as that format.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        from safetensors import SafetensorError, safe_open
+
+        self._tensors: dict[str, Stored] = {}
+        for path in paths:
+            try:
+                file = safe_open(path, framework="pt")
+                self._enter(file, file.metadata() or {})  # type: ignore[no-untyped-call]
+            except (OSError, KeyError, ValueError, SafetensorError) as error:
+                raise CheckpointError(
+                    f"{path.name} cannot be read: {error}", where=str(path)
+                ) from error
+
+    def _enter(self, file: Any, header: Mapping[str, str]) -> None:
+        places = json.loads(header.get(PLACES, "{}"))
+        shapes = json.loads(header.get(SHAPES, "{}"))
+        for name in file.keys():  # noqa: SIM118 - it is no mapping
+            sizes = tuple(file.get_slice(name).get_shape())
+            offsets = tuple(places[name]["saved_offsets"]) if places else (0,) * len(sizes)
+            shape = shapes.get(name, sizes)
+            self._tensors.setdefault(name, Stored(name, shape)).add(file, Region(offsets, sizes))
+
+    def __getitem__(self, name: str) -> Stored:
+        return self._tensors[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tensors)
+
+    def __len__(self) -> int:
+        return len(self._tensors)

@@ -246,7 +246,7 @@ def _counted(operation: Callable[..., Any], left: list[int]) -> Callable[..., An
 
 
 def run_ranks(
-    ranks: int, function: Callable[..., Any], *args: Any, timeout: float = 120.0
+    ranks: int, function: Callable[..., Any], *args: Any, timeout: float = 600.0
 ) -> list[int | None]:
     """Call ``function(*args)`` in ``ranks`` new processes that form one group on the loopback.
 

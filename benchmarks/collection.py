@@ -37,17 +37,18 @@ os.environ.setdefault("LP_NUM_THREADS", "1")
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene
 from fluxvla_sim.aloha.tasks import MAX_STEPS
-from fluxvla_sim.aloha.world import ALOHA, CUBE
+from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.demonstrations import demonstrate
-from fluxvla_sim.eval_runner import AlohaSimEvalRunner
-from fluxvla_sim.eval_worker import SimEvalWorker
-from fluxvla_sim.policies import ExpertPolicy
-from fluxvla_sim.rollout import rollout
+from fluxvla_sim.environment import AlohaSimEnvironment
+from fluxvla_sim.expert import SimExpert
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.policies import Source
 from fluxvla_core.evaluate.pool import WorkerPool
+from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
+from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera
 
 RESULTS = Path(__file__).with_name("results") / "collection.json"
@@ -116,10 +117,16 @@ def stock(steps: int = 4) -> float:
 
 def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     """Episodes a minute through the engine, and in a bare loop in this process."""
-    settings = AlohaSimEvalRunner(policy="expert")._settings
+    course = Course(replan_every=5)
+    settings = Settings(
+        environment={"type": "AlohaSimEnvironment"},
+        tasks=("lift_hold",),
+        sources={"policy": Source({"type": "SimExpert"})},
+        course=course,
+    )
     keys = [EpisodeKey("policy", "lift_hold", seed) for seed in range(episodes)]
     folder = Path(tempfile.mkdtemp())
-    with WorkerPool(partial(SimEvalWorker, settings), workers) as pool:
+    with WorkerPool(partial(EpisodeWorker, settings), workers) as pool:
         for _ in pool.run([EpisodeKey("policy", "lift_hold", 10**6)] * workers):
             continue
         ledger = open_ledger(folder / "episodes.jsonl", {}, SilentReporter())
@@ -127,14 +134,12 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
         run_in_pool(pool, keys, ledger, SilentReporter())
         engine = time.perf_counter() - began
     shutil.rmtree(folder)
-    scene, task = AlohaScene(), TASKS["lift_hold"]
-    policy = ExpertPolicy(ALOHA, CUBE, scene)
-    rollout(ALOHA, CUBE, scene, policy, task, task.instruction, 10**6, (), settings.replan_every)
+    environment, expert = AlohaSimEnvironment(), SimExpert()
+    task = find_task(environment.spec.tasks, "lift_hold")
+    run_episode(environment, expert, task, 10**6, course)
     began = time.perf_counter()
     for key in keys:
-        rollout(
-            ALOHA, CUBE, scene, policy, task, task.instruction, key.seed, (), settings.replan_every
-        )
+        run_episode(environment, expert, task, key.seed, course)
     bare = time.perf_counter() - began
     return 60 * episodes / engine, 60 * episodes / bare
 

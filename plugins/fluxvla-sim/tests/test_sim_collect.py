@@ -21,7 +21,8 @@ from fluxvla_sim.aloha.scene import AlohaScene
 from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.collect import SPARE_STRIDE, Collection, _Demonstrator, collect
 from fluxvla_sim.collect_command import CollectCommand
-from fluxvla_sim.demonstrations import demonstrate, frame_stride
+from fluxvla_sim.demonstrations import demonstrate
+from fluxvla_sim.expert import frame_stride
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
@@ -97,7 +98,7 @@ def test_a_failed_demonstration_is_none(scene, expert):
 
 @pytest.mark.parametrize("fps", [0.0, 15.0, 60.0])
 def test_a_frame_rate_that_does_not_fit_is_refused(fps):
-    with pytest.raises(ValueError, match=rf"fps must divide 50, got {fps:g}"):
+    with pytest.raises(ConfigError, match=rf"{fps:g} frames a second do not divide 50"):
         frame_stride(fps)
 
 
@@ -175,10 +176,10 @@ def test_a_killed_collection_goes_on_to_the_same_dataset(tmp_path):
         ({"episodes": 0}, "nothing to collect"),
         ({"tasks": ("juggle",)}, "no task 'juggle'"),
         ({"camera_names": ("head",)}, "no camera 'head'"),
-        ({"fps": 15.0}, "fps must divide 50, got 15"),
+        ({"fps": 15.0}, "15 frames a second do not divide 50 control steps"),
         ({"noise": 0.5}, "noise must be from 0 to 0.2 rad, got 0.5"),
         ({"seed": -1}, "seed must be from 0 to 999999996"),
-        ({"quality": "best"}, "quality 'best' is none of cheap, reference"),
+        ({"render": "best"}, "render 'best' is none of cheap, coarse, reference"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
@@ -9,8 +11,11 @@ from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert, arm_ik
 from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, AlohaScene
 from fluxvla_sim.aloha.tasks import MAX_STEPS, Facts
-from fluxvla_sim.aloha.world import CUBE
-from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
+from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
+from fluxvla_sim.motion import minimum_jerk, quaternion_product, quaternion_share, turn
+from fluxvla_sim.ur.scene import HOME as UR_HOME
+from fluxvla_sim.ur.tasks import LiftFacts
+from fluxvla_sim.ur.world import UR5E
 
 TASKS = {task.name: task for task in CUBE.tasks}
 CORNERS = [
@@ -74,6 +79,73 @@ def test_wrist_and_forearm_of_the_picking_arm_never_roll(expert):
         assert np.abs(rolls).max() < 1e-3
 
 
+def plans_within_limits(robot, plan, home):
+    joints = robot.embodiment(()).joints
+    speed = np.diff(np.vstack([home, plan]), axis=0) * 50
+    acceleration = np.diff(np.vstack([np.zeros_like(home), speed]), axis=0) * 50
+    assert (plan >= [j.lower for j in joints]).all()
+    assert (plan <= [j.upper for j in joints]).all()
+    assert (np.abs(speed).max(0) <= [0.95 * j.velocity for j in joints]).all()
+    assert (np.abs(acceleration).max(0) <= [0.95 * j.acceleration for j in joints]).all()
+
+
+def test_peg_and_socket_meet_wherever_they_lie():
+    scene = INSERTION.open_scene("cheap")
+    expert = INSERTION.open_expert(scene.model)
+    (task,) = INSERTION.tasks
+    upright = [1.0, 0, 0, 0]
+    far = np.array([0.2, 0.6, 0.05, *upright, -0.2, 0.4, 0.05, *upright])
+    near = np.array([0.1, 0.4, 0.05, *upright, -0.1, 0.6, 0.05, *upright])
+    for objects in (far, near):
+        scene.reset_to(objects)
+        facts = INSERTION.begin()
+        for command in expert.plan(task.name, scene.objects):
+            scene.step(command)
+            facts = facts.after(scene)
+        assert task.success(facts), (objects, facts)
+        assert task.done(facts)
+    scene.reset(7_000_000)
+    plans_within_limits(ALOHA, expert.plan(task.name, scene.objects), HOME)
+
+
+def test_the_ur5e_lifts_the_cube_wherever_it_lies():
+    (world,) = UR5E.worlds
+    (task,) = world.tasks
+    scene = world.open_scene("cheap")
+    expert = world.open_expert(scene.model)
+    for seed in range(7_000_000, 7_000_004):
+        scene.reset(seed)
+        facts = world.begin()
+        plan = expert.plan(task.name, scene.objects)
+        plans_within_limits(UR5E, plan, UR_HOME)
+        for command in plan[: task.record_steps]:
+            scene.step(command)
+            facts = facts.after(scene)
+        assert task.success(facts), (seed, facts)
+
+
+def test_a_cube_that_is_only_tossed_up_is_not_held():
+    (task,) = UR5E.worlds[0].tasks
+    tossed, lifts = LiftFacts(), SimpleNamespace(lifted=lambda: tossed.steps % 10 != 9)
+    for _ in range(60):
+        tossed = tossed.after(lifts)
+    assert not task.success(tossed), "never held for longer than nine steps on end"
+    lifts.lifted = lambda: True
+    for _ in range(10):
+        tossed = tossed.after(lifts)
+    assert task.success(tossed)
+
+
+@pytest.mark.parametrize("world", [*ALOHA.worlds, *UR5E.worlds])
+def test_noise_leaves_grippers_alone_and_begins_at_rest(world):
+    noise = world.noise(np.random.default_rng(0))
+    joints = (ALOHA if world in ALOHA.worlds else UR5E).embodiment(()).joints
+    assert noise.shape == (world.max_steps, len(joints))
+    grippers = [index for index, joint in enumerate(joints) if joint.kind == "gripper"]
+    assert np.abs(noise[0]).max() == np.abs(noise[:, grippers]).max() == 0.0
+    assert 0.5 < noise[:40].std() * 2 < 3
+
+
 @pytest.mark.parametrize("arm", ["left", "right"])
 def test_inverse_kinematics_finds_reachable_poses(scene, arm):
     ik = arm_ik(scene.model, arm)
@@ -109,3 +181,10 @@ def test_quaternions_turn_the_right_way_round():
     np.testing.assert_allclose(half, turn((0, 0, 1), 180), atol=1e-12)
     tilted = quaternion_product(turn((0, 0, 1), 180), turn((0, 1, 0), 60))
     np.testing.assert_allclose(tilted, [0, -0.5, 0, np.sqrt(0.75)], atol=1e-12)
+
+
+def test_a_share_of_a_turn_goes_the_short_way_round():
+    quarter = turn((0, 0, 1), 90)
+    np.testing.assert_allclose(quaternion_share(quarter, 0.5), turn((0, 0, 1), 45), atol=1e-12)
+    np.testing.assert_allclose(quaternion_share(-quarter, 0.5), turn((0, 0, 1), 45), atol=1e-12)
+    np.testing.assert_allclose(quaternion_share(np.array([1.0, 0, 0, 0]), 0.5), [1, 0, 0, 0])

@@ -36,7 +36,7 @@ class Collection:
         fps: frames a second; must divide 50.
         camera_names, height, width: of the pictures.
         noise: see ``demonstrate``, in rad.
-        quality: see ``fluxvla_sim.render``.
+        render: see ``SimEnvironment``.
 
     Raises:
         ConfigError: a value is impossible.
@@ -51,11 +51,12 @@ class Collection:
     height: int = 144
     width: int = 192
     noise: float = 0.0
-    quality: str = "cheap"
+    render: str = "cheap"
 
     def __post_init__(self) -> None:
-        from fluxvla_sim.demonstrations import frame_stride
-        from fluxvla_sim.operators import check_quality, sim_cameras
+        from fluxvla_core.evaluate.drawing import check_render
+        from fluxvla_sim.expert import frame_stride
+        from fluxvla_sim.operators import sim_cameras
         from fluxvla_sim.robots import ROBOTS
 
         if self.robot not in ROBOTS:
@@ -64,11 +65,8 @@ class Collection:
         for task in self.tasks:
             robot.find(task)
         sim_cameras(robot, self.camera_names, self.height, self.width)
-        check_quality(self.quality)
-        try:
-            frame_stride(self.fps)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
+        check_render(self.render)
+        frame_stride(self.fps)
         if self.episodes < 1 or not self.tasks:
             raise ConfigError(f"nothing to collect: {self.episodes} episodes of {self.tasks}")
         if not 0 <= self.seed <= SPARE_STRIDE - self.episodes:
@@ -177,8 +175,7 @@ class _Demonstrator:
             if known is not None:
                 scene, expert = known[2:]
             else:
-                size = max(480, collection.height), max(640, collection.width)
-                scene = world.open_scene(collection.quality, *size)
+                scene = world.open_scene(collection.render)
                 expert = world.open_expert(scene.model)
             self._stages[name] = world, task, scene, expert
         return self._stages[name]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluxvla_sim.world import CONTROL_HZ, Expert, Scene, Task, World
+from fluxvla_sim.expert import frame_stride
+from fluxvla_sim.world import Expert, Scene, Task, World
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -74,15 +75,3 @@ def demonstrate(
         return None
     stacked = {name: np.stack(pictures) for name, pictures in images.items()}
     return Demonstration(seed, stacked, np.stack(states), np.stack(actions))
-
-
-def frame_stride(fps: float) -> int:
-    """Control steps from frame to frame.
-
-    Raises:
-        ValueError: ``fps`` does not divide 50.
-    """
-    stride = round(CONTROL_HZ / fps) if fps > 0 else 0
-    if stride < 1 or stride * fps != CONTROL_HZ:
-        raise ValueError(f"fps must divide {CONTROL_HZ:g}, got {fps:g}")
-    return stride

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.evaluate.drawing import check_render
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_sim.aloha.world import ALOHA
-from fluxvla_sim.render import QUALITIES
 from fluxvla_sim.sim_operator import SimOperator
 from fluxvla_sim.ur.world import UR5E
 from fluxvla_sim.world import SimRobot
@@ -36,17 +36,6 @@ def sim_cameras(
     return tuple(Camera(name, height, width) for name in names)
 
 
-def check_quality(quality: str) -> str:
-    """``quality``, if there is such a one.
-
-    Raises:
-        ConfigError: there is not.
-    """
-    if quality not in QUALITIES:
-        raise ConfigError(f"quality {quality!r} is none of {', '.join(QUALITIES)}")
-    return quality
-
-
 class AlohaSimOperator(SimOperator):
     """gym-aloha's scenes: two ViperX 300 S arms, 50 Hz.
 
@@ -57,10 +46,10 @@ class AlohaSimOperator(SimOperator):
         camera_names: cameras of the scene, in the order of the images.
         height, width: of every picture, in pixels.
         realtime: follow the wall clock instead of simulated time.
-        quality: ``cheap`` or ``reference`` pictures.
+        render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
 
     Raises:
-        ConfigError: an unknown task, camera or quality.
+        ConfigError: an unknown task, camera or way to render.
     """
 
     def __init__(
@@ -71,10 +60,11 @@ class AlohaSimOperator(SimOperator):
         height: int = 480,
         width: int = 640,
         realtime: bool = False,
-        quality: str = "cheap",
+        render: str = "cheap",
     ) -> None:
+        check_render(render)
         cameras = sim_cameras(ALOHA, camera_names, height, width)
-        super().__init__(ALOHA, task, cameras, seed, realtime, check_quality(quality))
+        super().__init__(ALOHA, task, cameras, seed, realtime, render)
 
 
 class URSimOperator(SimOperator):
@@ -86,10 +76,10 @@ class URSimOperator(SimOperator):
         camera_names: ``front`` and ``wrist``, in the order of the images.
         height, width: of every picture, in pixels.
         realtime: follow the wall clock instead of simulated time.
-        quality: ``cheap`` or ``reference`` pictures.
+        render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
 
     Raises:
-        ConfigError: an unknown task, camera or quality.
+        ConfigError: an unknown task, camera or way to render.
     """
 
     def __init__(
@@ -100,7 +90,8 @@ class URSimOperator(SimOperator):
         height: int = 480,
         width: int = 640,
         realtime: bool = False,
-        quality: str = "cheap",
+        render: str = "cheap",
     ) -> None:
+        check_render(render)
         cameras = sim_cameras(UR5E, camera_names, height, width)
-        super().__init__(UR5E, task, cameras, seed, realtime, check_quality(quality))
+        super().__init__(UR5E, task, cameras, seed, realtime, render)

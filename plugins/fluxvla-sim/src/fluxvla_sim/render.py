@@ -1,16 +1,13 @@
-"""Pictures from MuJoCo without a window, at the price that a control loop can afford.
+"""Pictures from MuJoCo without a window, from any thread, in any size.
 
-MuJoCo's default quality (4096-pixel shadow maps, 4x multisampling) costs about ten times as much as
-the picture itself on a software renderer, whatever the resolution. ``quality='cheap'`` turns both
-off; ``'reference'`` keeps what the model file asks for.
-
-On Linux everything is drawn by EGL, which needs no display, unless ``MUJOCO_GL`` says otherwise.
+A robot's scene is drawn by whoever looks: the thread that observes, the one that records, the
+cameras' thread of a ROS 2 node. What qualities there are and what they cost is in
+``fluxvla_core.evaluate.drawing``.
 """
 
 from __future__ import annotations
 
 import atexit
-import ctypes
 import os
 import sys
 import weakref
@@ -20,10 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import RunFailed
-
-QUALITIES = ("cheap", "reference")
-APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
-_EGL = "libEGL.so.1"
+from fluxvla_core.evaluate.drawing import APT, use_egl
 
 
 def import_mujoco() -> Any:
@@ -32,62 +26,32 @@ def import_mujoco() -> Any:
     Raises:
         RunFailed: EGL is wanted and its library is not installed.
     """
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "egl")
-    if _wants_egl() and "mujoco" not in sys.modules:
-        _check_egl()
+    use_egl()
     import mujoco
 
     return mujoco
 
 
-def _wants_egl() -> bool:
-    return sys.platform == "linux" and os.environ.get("MUJOCO_GL", "egl").lower() == "egl"
-
-
-def _check_egl() -> None:
-    try:
-        ctypes.CDLL(_EGL)
-    except OSError as error:
-        raise RunFailed(
-            f"the simulator cannot draw: {_EGL} cannot be loaded ({error})",
-            cause="Mesa's EGL is not installed",
-            next=APT,
-        ) from error
-
-
 def _gl_context_class(mujoco: Any) -> Any:
-    if not _wants_egl():
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "egl").lower() != "egl":
         return mujoco.GLContext
     # Whoever imported mujoco first chose its default; this class works whatever that was.
-    _check_egl()
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     from mujoco.egl import GLContext
 
     return GLContext
 
 
-def set_quality(model: Any, quality: str, height: int, width: int) -> None:
-    """Prepare ``model`` for drawing; only has an effect before its first :class:`Renderer`.
-
-    Args:
-        model: ``mujoco.MjModel``, changed in place.
-        quality: ``cheap`` or ``reference``.
-        height, width: the largest picture that will be asked for, in pixels.
-    """
-    if quality not in QUALITIES:
-        raise ValueError(f"quality {quality!r} is none of {QUALITIES}")
-    if quality == "cheap":
-        model.vis.quality.shadowsize = 0
-        model.vis.quality.offsamples = 0
-    model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-
-
 class Renderer:
-    """One OpenGL context for one model: any camera, any size up to the model's buffer.
+    """One OpenGL context for one model: any camera, any size; it grows with the largest.
 
     Any thread may draw, one at a time: the context is given back after each picture.
+
+    Args:
+        model: ``mujoco.MjModel``, whose quality is set by then.
+
+    Raises:
+        RunFailed: nothing here can draw.
     """
 
     def __init__(self, model: Any) -> None:
@@ -95,22 +59,8 @@ class Renderer:
         self._mujoco = mujoco
         self._model = model
         self._gl: Any = None
-        try:
-            make_context = _gl_context_class(mujoco)
-            self._gl = make_context(model.vis.global_.offwidth, model.vis.global_.offheight)
-            self._gl.make_current()
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        except RunFailed:
-            raise
-        # PyOpenGL and mujoco raise ImportError, RuntimeError and classes of their own here.
-        except Exception as error:
-            raise RunFailed(
-                f"the simulator cannot draw: no OpenGL context could be made ({error})",
-                cause="no EGL driver is installed, or none works without a display",
-                next=APT,
-            ) from error
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        _release_current_context()
+        self._context: Any = None
+        self._open()
         # Before mujoco's own handler shuts EGL down; after it, freeing only prints tracebacks.
         atexit.register(_close_at_exit, weakref.ref(self))
         self._scene = mujoco.MjvScene(model, maxgeom=2000)
@@ -125,14 +75,15 @@ class Renderer:
             data: ``mujoco.MjData`` whose kinematics are up to date.
 
         Raises:
-            ValueError: the model has no such camera, or its buffer is smaller than the picture.
+            ValueError: the model has no such camera.
+            RunFailed: a picture of this size cannot be drawn here.
         """
         mujoco, vis = self._mujoco, self._model.vis.global_
         if height > vis.offheight or width > vis.offwidth:
-            raise ValueError(
-                f"{height}x{width} is larger than the buffer {vis.offheight}x{vis.offwidth}; "
-                "give set_quality the largest size"
-            )
+            self.close()
+            vis.offheight, vis.offwidth = max(vis.offheight, height), max(vis.offwidth, width)
+        if self._gl is None:
+            self._open()
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA.value, camera)
         if index < 0:
             names = [self._model.camera(i).name for i in range(self._model.ncam)]
@@ -151,12 +102,30 @@ class Renderer:
         return np.ascontiguousarray(bottom_up[::-1])
 
     def close(self) -> None:
-        """Free the context; any number of times."""
+        """Free the context; any number of times. The next picture makes another."""
         if self._gl is not None:
             self._gl.make_current()
-            self._context.free()
+            if self._context is not None:
+                self._context.free()
             self._gl.free()
-            self._gl = None
+            self._gl = self._context = None
+
+    def _open(self) -> None:
+        mujoco, vis = self._mujoco, self._model.vis.global_
+        try:
+            self._gl = _gl_context_class(mujoco)(vis.offwidth, vis.offheight)
+            self._gl.make_current()
+            scale = mujoco.mjtFontScale.mjFONTSCALE_100.value
+            self._context = mujoco.MjrContext(self._model, scale)
+        # PyOpenGL and mujoco raise ImportError, RuntimeError and classes of their own here.
+        except Exception as error:
+            raise RunFailed(
+                f"the simulator cannot draw: no OpenGL context could be made ({error})",
+                cause="no EGL driver is installed, or none works without a display",
+                next=APT,
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        _release_current_context()
 
 
 def _close_at_exit(reference: weakref.ref[Renderer]) -> None:

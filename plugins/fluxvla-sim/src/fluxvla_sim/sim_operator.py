@@ -32,7 +32,7 @@ class SimOperator:
         cameras: in the order of the images.
         seed: of the first episode; :meth:`connect` resets to it.
         realtime: follow the wall clock.
-        quality: of the pictures.
+        render: quality of the pictures.
 
     Raises:
         ConfigError: the robot has no such task.
@@ -47,14 +47,15 @@ class SimOperator:
         cameras: tuple[Camera, ...],
         seed: int,
         realtime: bool,
-        quality: str,
+        render: str,
     ) -> None:
+        self.robot = robot
         self.world, self.task = robot.find(task)
         self.embodiment = robot.embodiment(cameras)
         self.seed = seed
         self.realtime = realtime
         self.clock = MonotonicClock() if realtime else SimulatedClock()
-        self._quality = quality
+        self._render = render
         self._period = 1.0 / self.embodiment.rate_hz
         self._periods = 0
         self._started = 0.0
@@ -63,13 +64,20 @@ class SimOperator:
         self._target: npt.NDArray[np.float64] = np.zeros(self.embodiment.dim)
         self._facts = self.world.begin()
 
+    @property
+    def scene(self) -> Any:
+        """The scene; experts see through it.
+
+        Raises:
+            NotReady: not connected.
+        """
+        return self._connected()
+
     def connect(self) -> None:
         """Build the scene and reset it to ``seed``; again after :meth:`close` if wanted."""
         with self._lock:
             if self._scene is None:
-                sizes = [(c.height, c.width) for c in self.embodiment.cameras] or [(1, 1)]
-                height, width = (max(of) for of in zip(*sizes, strict=True))
-                self._scene = self.world.open_scene(self._quality, height, width)
+                self._scene = self.world.open_scene(self._render)
                 self._periods, self._started = 0, self.clock.now()
                 self.reset(self.seed)
 

@@ -59,11 +59,11 @@ class Scene(Protocol):
 class Facts(Protocol):
     """What has happened in an episode so far: all that success is judged by.
 
-    ``steps`` were taken, and ``best_reward`` is the highest reward of any of them.
+    ``steps`` were taken, the last one with ``reward``.
     """
 
     steps: int
-    best_reward: int
+    reward: int
 
     def after(self, scene: Any) -> Facts:
         """The facts after one more control period of ``scene``."""
@@ -100,7 +100,7 @@ class World:
     Args:
         tasks: all start from the same scenes, so that the instruction alone says what is right.
         max_steps: control steps in an episode.
-        open_scene: from quality, largest picture height and width to a scene.
+        open_scene: from the pictures' quality to a scene.
         open_expert: from the scene's model to an expert.
         begin: the facts before the first step.
         noise: from a generator to ``(max_steps, D)`` offsets of about unit size, in rad, that
@@ -109,7 +109,7 @@ class World:
 
     tasks: tuple[Task, ...]
     max_steps: int
-    open_scene: Callable[[str, int, int], Scene]
+    open_scene: Callable[[str], Scene]
     open_expert: Callable[[Any], Expert]
     begin: Callable[[], Facts]
     noise: Callable[[np.random.Generator], Array]

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_sim.render import Renderer, import_mujoco, set_quality
+from fluxvla_core.evaluate.drawing import set_render
+from fluxvla_sim.render import Renderer, import_mujoco
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -45,7 +46,7 @@ def to_metres(opening: float | npt.NDArray[np.float64]) -> Any:
 HOME: npt.NDArray[np.float64] = np.array([*HOME_ARM, to_normalized(HOME_FINGER)] * 2)
 
 
-def load_model(file: str, quality: str = "cheap", height: int = 480, width: int = 640) -> Any:
+def load_model(file: str, render: str = "cheap") -> Any:
     """``mujoco.MjModel`` of one of the files that gym-aloha installs.
 
     Raises:
@@ -59,7 +60,7 @@ def load_model(file: str, quality: str = "cheap", height: int = 480, width: int 
             "the ALOHA scene is not installed", next="pip install --no-deps gym-aloha==0.1.5"
         )
     model = mujoco.MjModel.from_xml_path(str(Path(package.origin).parent / "assets" / file))
-    set_quality(model, quality, height, width)
+    set_render(model, render)
     return model
 
 
@@ -69,8 +70,7 @@ class TwoArms:
     A subclass says in ``file`` which, places the objects in :meth:`reset`, and gives the reward.
 
     Args:
-        quality: see :mod:`fluxvla_sim.render`.
-        height, width: the largest picture that :meth:`render` will be asked for.
+        render: quality of the pictures, see ``fluxvla_core.evaluate.drawing``.
 
     Attributes:
         steps: commands since the last reset.
@@ -78,9 +78,9 @@ class TwoArms:
 
     file: str
 
-    def __init__(self, quality: str = "cheap", height: int = 480, width: int = 640) -> None:
+    def __init__(self, render: str = "cheap") -> None:
         self._mujoco = import_mujoco()
-        self.model = load_model(self.file, quality, height, width)
+        self.model = load_model(self.file, render)
         self.data = self._mujoco.MjData(self.model)
         self.steps = 0
         self._renderer: Renderer | None = None

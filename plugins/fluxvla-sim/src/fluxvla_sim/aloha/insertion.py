@@ -56,11 +56,13 @@ class InsertionFacts:
     """See :class:`fluxvla_sim.world.Facts`; the rewards are gym-aloha's."""
 
     steps: int = 0
+    reward: int = 0
     best_reward: int = 0
 
     def after(self, scene: InsertionScene) -> InsertionFacts:
         """The facts after one more control step of ``scene``."""
-        return InsertionFacts(self.steps + 1, max(self.best_reward, scene.reward()))
+        reward = scene.reward()
+        return InsertionFacts(self.steps + 1, reward, max(self.best_reward, reward))
 
 
 class Insertion:

@@ -24,13 +24,14 @@ class Facts:
 
     Args:
         steps: control steps taken.
-        best_reward: the highest gym-aloha reward of any step.
+        reward: gym-aloha's, of the last step; ``best_reward`` the highest of any.
         left_touched: whether a finger of the left arm ever touched the cube.
         right_touches: whether a finger of the right arm touches the cube now.
         height: of the cube's centre now, in metres.
     """
 
     steps: int = 0
+    reward: int = 0
     best_reward: int = 0
     left_touched: bool = False
     right_touches: bool = False
@@ -38,9 +39,11 @@ class Facts:
 
     def after(self, scene: AlohaScene) -> Facts:
         """The facts after one more control step of ``scene``."""
+        reward = scene.reward()
         return Facts(
             steps=self.steps + 1,
-            best_reward=max(self.best_reward, scene.reward()),
+            reward=reward,
+            best_reward=max(self.best_reward, reward),
             left_touched=self.left_touched or any(scene.fingers_on_cube("left")),
             right_touches=any(scene.fingers_on_cube("right")),
             height=float(scene.cube[2]),

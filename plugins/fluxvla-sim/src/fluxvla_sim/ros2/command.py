@@ -6,6 +6,7 @@ import signal
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import UsageError
+from fluxvla_core.evaluate.drawing import RENDERS
 
 
 class SimCommand:
@@ -43,7 +44,7 @@ class SimCommand:
         parser.add_argument("--height", type=int, default=480, help="of the pictures")
         parser.add_argument("--width", type=int, default=640, help="of the pictures")
         parser.add_argument(
-            "--quality", choices=("cheap", "reference"), default="cheap", help="of the pictures"
+            "--render", choices=RENDERS, default="cheap", help="quality of the pictures"
         )
         parser.add_argument(
             "--cameras", nargs="+", metavar="NAME", help="the scene's cameras; all by default"
@@ -118,7 +119,7 @@ class SimCommand:
             faults=faults,
             domain_id=args.domain_id,
         )
-        scene = world.open_scene(args.quality, args.height, args.width)
+        scene = world.open_scene(args.render)
         node = RobotNode(body, scene, settings, reporter, Judge(world))
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: node.stop())

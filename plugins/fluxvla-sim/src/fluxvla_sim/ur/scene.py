@@ -13,7 +13,8 @@ import numpy as np
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_sim.render import Renderer, import_mujoco, set_quality
+from fluxvla_core.evaluate.drawing import set_render
+from fluxvla_sim.render import Renderer, import_mujoco
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -31,7 +32,7 @@ CUBE_LOW, CUBE_HIGH = (-0.24, 0.42), (-0.04, 0.56)  # metres, world frame
 LIFTED_M = 0.08
 
 
-def load_model(quality: str = "cheap", height: int = 480, width: int = 640) -> Any:
+def load_model(render: str = "cheap") -> Any:
     """``mujoco.MjModel`` of arm, gripper, table, cube and the cameras ``front`` and ``wrist``.
 
     Raises:
@@ -58,7 +59,7 @@ def load_model(quality: str = "cheap", height: int = 480, width: int = 640) -> A
     spec.attach(arm, frame=spec.worldbody.add_frame(), prefix="")
     _furnish(spec, mujoco)
     model = spec.compile()
-    set_quality(model, quality, height, width)
+    set_render(model, render)
     return model
 
 
@@ -85,9 +86,9 @@ def _furnish(spec: Any, mujoco: Any) -> None:
 class URScene:
     """The simulated robot and its cube; see :class:`fluxvla_sim.world.Scene`."""
 
-    def __init__(self, quality: str = "cheap", height: int = 480, width: int = 640) -> None:
+    def __init__(self, render: str = "cheap") -> None:
         self._mujoco = import_mujoco()
-        self.model = load_model(quality, height, width)
+        self.model = load_model(render)
         self.data = self._mujoco.MjData(self.model)
         self.steps = 0
         self._renderer: Renderer | None = None

@@ -18,19 +18,18 @@ _HELD_STEPS = 10
 class LiftFacts:
     """See :class:`fluxvla_sim.world.Facts`; the reward is 1 while the cube is held in the air.
 
-    ``held_steps`` is for how many steps on end it was held, up to now; ``longest`` the most ever.
+    ``held`` is for how many steps on end it has been held; ``longest`` the most ever.
     """
 
     steps: int = 0
-    best_reward: int = 0
-    held_steps: int = 0
+    reward: int = 0
+    held: int = 0
     longest: int = 0
 
     def after(self, scene: URScene) -> LiftFacts:
         """The facts after one more control step of ``scene``."""
-        held = self.held_steps + 1 if scene.lifted() else 0
-        best = max(self.best_reward, int(held > 0))
-        return LiftFacts(self.steps + 1, best, held, max(self.longest, held))
+        held = self.held + 1 if scene.lifted() else 0
+        return LiftFacts(self.steps + 1, int(held > 0), held, max(self.longest, held))
 
 
 class LiftCube:

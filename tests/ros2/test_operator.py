@@ -53,6 +53,20 @@ def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
     assert all(0 <= time.monotonic() - stamp < 1.0 for stamp in frame.stamps.values())
 
 
+def test_pictures_that_nobody_looked_at_can_be_had(arm):
+    pictures, received = arm.pictures_after("cam", 0.0)
+    assert received >= len(pictures) > 0
+    assert all(picture.shape == (48, 64, 3) for _, picture in pictures)
+    newest = max(stamp for stamp, _ in pictures)
+
+    wait_for(lambda: arm.pictures_after("cam", newest)[0])
+
+    assert min(stamp for stamp, _ in arm.pictures_after("cam", newest)[0]) > newest
+    assert arm.pictures_after("elsewhere", 0.0) == ([], 0)
+    arm.close()
+    assert arm.pictures_after("cam", 0.0) == ([], 0)
+
+
 def test_the_state_alone(arm):
     np.testing.assert_array_equal(arm.get_state(), [0.1, 0.2, 0.5])
 

@@ -185,6 +185,30 @@ class RosOperator(ABC):
         states = {spec.name: newest[spec.name].message for spec in self._specs_of(STATE)}
         return self.read_state(states)
 
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """What a camera sent, for those who record more than is looked at; any thread may ask.
+
+        Args:
+            after: receipt time; earlier pictures are left out, and all but the newest few.
+
+        Returns:
+            Receipt times and ``(H, W, 3)`` uint8 RGB pictures, oldest first; and how many arrived
+            since connecting.
+
+        Raises:
+            BadMessage: a picture has another size or encoding than its camera.
+        """
+        connection = self._connection
+        specs = [s for s in self._specs_of(CAMERA) if s.camera and s.camera.name == camera]
+        if connection is None or not specs:
+            return [], 0
+        ring = connection.streams[specs[0].name].ring
+        new = [received for received in ring.items() if received.receipt > after]
+        found = [(r.receipt, frames.pictures(specs, {specs[0].name: r})[0][camera]) for r in new]
+        return found, ring.received - ring.duplicates - ring.overtaken
+
     def send_action(self, action: npt.ArrayLike) -> None:
         """Publish one ``(dim,)`` command.
 

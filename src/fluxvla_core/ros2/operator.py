@@ -248,15 +248,17 @@ class RosOperator(ABC):
 
     def close(self) -> None:
         """Hold, then give the connection back; any number of times."""
-        with self._lock:
-            connection = self._connection
-            if connection is None:
-                return
-            self.stop()
-            self._flush()
+        connection = self._connection
+        if connection is None:
+            return
+        try:
+            with self._lock:
+                self.stop()
+                self._flush()
+        finally:
             self._connection = None
-        # Without the lock: the ROS thread may be waiting for it, and close waits for the thread.
-        connection.close()
+            # Without the lock: the ROS thread may wait for it, and close waits for the thread.
+            connection.close()
 
     # For subclasses.
 
@@ -301,7 +303,7 @@ class RosOperator(ABC):
             command.topic: connection.publisher(command.topic, message_class(command.message))
             for command in commands
         }
-        startup = Startup(connection, self._specs, commands)
+        startup = Startup(connection, self._specs, commands, self._publishers)
         startup.wait(self.connect_timeout_s)
         for warning in startup.count(self.rate_window_s):
             log.warning("%s", warning)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fluxvla_core.errors import FluxError, NotReady
@@ -25,16 +25,22 @@ class Startup:
     Args:
         connection: with all streams subscribed and all publishers made.
         specs: the streams.
-        commands: the publishers.
+        commands: what is published.
+        publishers: topic -> publisher, for each of ``commands``.
     """
 
     def __init__(
-        self, connection: Connection, specs: Sequence[StreamSpec], commands: Sequence[CommandSpec]
+        self,
+        connection: Connection,
+        specs: Sequence[StreamSpec],
+        commands: Sequence[CommandSpec],
+        publishers: Mapping[str, Any],
     ) -> None:
         self._connection = connection
         self._node = connection.node
         self._specs = [spec for spec in specs if spec.required]
         self._exclusive = [command.topic for command in commands if command.exclusive]
+        self._publishers = publishers
         self._since = time.monotonic()
 
     def wait(self, timeout_s: float) -> None:
@@ -105,7 +111,9 @@ class Startup:
             stream.refresh()
         if quiet:
             return NotReady("waiting") if hurry else self._why(quiet)
-        deaf = [t for t in self._exclusive if not self._node.count_subscribers(t)]
+        # Not the graph's word for it: until the two have found each other, commands are lost, and
+        # the first one that arrives would be a jump.
+        deaf = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
         if deaf:
             return discovery.nobody_listens(deaf)
         return self._contested()

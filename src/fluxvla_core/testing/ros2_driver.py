@@ -75,6 +75,11 @@ class Driver:
         self._process.stdin.write(json.dumps(order) + "\n")
         self._process.stdin.flush()
 
+    @property
+    def exit_code(self) -> int | None:
+        """Of the process; None while it runs."""
+        return self._process.poll()
+
     def kill(self) -> None:
         """End it with SIGKILL: no goodbye on the graph."""
         self._process.kill()

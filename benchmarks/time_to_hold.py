@@ -1,0 +1,80 @@
+"""How long after each fault the arm rests, as somebody on the other side of DDS sees it.
+
+    python benchmarks/time_to_hold.py [--rounds 5] [--only WORDS]
+
+The real runner moves an arm of three joints over ROS 2; the faults are provoked for real
+(``robot_fault_list``). The time is from the fault to the receipt, in another process, of the first
+command that is not changed any more. It contains what is allowed before something counts as a
+fault: ``max_age_s`` (0.5 s) of silence, ``tracking_time_s`` (0.25 s) away from the command.
+Loopback only. Writes ``benchmarks/results/time_to_hold.json``, which docs/safety.md quotes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.robot_fault_list import FAULTS
+from benchmarks.robot_faults import Fault, Result, play, stage_crew
+
+RESULTS = Path(__file__).with_name("results") / "time_to_hold.json"
+
+
+def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:
+    """One fault's figures."""
+    holds = [result.hold_s for result in results if result.hold_s is not None]
+    found: dict[str, Any] = {"outcome": fault.outcome, "exit_code": fault.exit_code}
+    found["said"] = results[0].said.partition("\n")[0]
+    if holds:
+        found["hold_s"] = [round(hold, 3) for hold in holds]
+        found["median_s"] = round(statistics.median(holds), 2)
+        found["max_s"] = round(max(holds), 2)
+    return found
+
+
+def main() -> int:
+    """Measure, print and write; 1 if a fault was not named as it should be."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--only", default="", help="faults whose name contains this; not written")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    args = parser.parse_args()
+    faults = [fault for fault in FAULTS if args.only in fault.name]
+    results: dict[str, list[Result]] = {fault.name: [] for fault in faults}
+    wrong = []
+    with stage_crew() as stage, tempfile.TemporaryDirectory() as folder:
+        for number in range(args.rounds):
+            for index, fault in enumerate(faults):
+                result = play(stage(Path(folder) / f"{number}-{index}"), fault)
+                results[fault.name].append(result)
+                hold = "" if result.hold_s is None else f"{result.hold_s:.2f} s"
+                agrees = fault.matches(result.said) and result.exit_code == fault.exit_code
+                mark = "" if agrees else "  NOT AS EXPECTED"
+                wrong += [fault.name] if mark else []
+                print(f"{fault.name}: {hold} {result.exit_code} {result.said}{mark}", flush=True)
+    summary = {
+        "what": "from a fault to the receipt of the command at which the arm rests",
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        "rounds": args.rounds,
+        "faults": {fault.name: measured(fault, results[fault.name]) for fault in faults},
+    }
+    if not args.only:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    if wrong:
+        print(f"not as expected: {', '.join(wrong)}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -31,6 +31,7 @@ class RunContext:
         origins: dotted config key -> ``file:line``.
         config_file: the file that was named on the command line.
         task: ``--task``: an id from the config or an instruction in words.
+        task_file: ``--tasks``: a file with one of these a line.
         nproc: ``--nproc``: how many processes work on this.
         reporter: where progress goes.
     """
@@ -42,6 +43,7 @@ class RunContext:
     origins: Mapping[str, str] = field(default_factory=dict)
     config_file: str | None = None
     task: str | None = None
+    task_file: str | None = None
     nproc: int = 1
     reporter: Reporter = field(default_factory=SilentReporter)
 

@@ -156,6 +156,7 @@ class Bench:
         self,
         cls: type[BaseInferenceRunner] = BaseInferenceRunner,
         task: str | None = "1",
+        task_file: str | None = None,
         config: dict[str, Any] | None = None,
         **arguments: Any,
     ) -> BaseInferenceRunner:
@@ -164,6 +165,7 @@ class Bench:
             section="inference",
             work_dir=self.work_dir,
             task=task,
+            task_file=task_file,
             reporter=self.notes,
         )
         given: dict[str, Any] = {

@@ -223,21 +223,6 @@ def test_a_state_that_can_be_read_alone_is_read_at_every_command(bench):
     np.testing.assert_allclose(row["state"], np.array(row["command"]) + 0.001)
 
 
-def test_people_at_a_terminal_are_asked_until_they_end_it(bench, monkeypatch):
-    answers = iter(["2", "nonsense", "1", ""])
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr("builtins.input", lambda text: next(answers))
-
-    result = bench.run(task=None, max_publish_step=5)
-
-    assert result["episodes"] == 2
-    assert [bench.episode(n)["instruction"] for n in ("001-2", "002-1")] == [
-        "lift the red cube",
-        "wave at the camera",
-    ]
-    assert any("unknown task 'nonsense'" in line for line in bench.notes.lines)
-
-
 class Recorder:
     """A hook that takes everything down."""
 

@@ -1,11 +1,11 @@
-"""Ids, instructions, and what is neither."""
+"""Ids, instructions, files of them, and what is neither."""
 
 from __future__ import annotations
 
 import pytest
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.infer.tasks import Task, resolve_task, tasks
+from fluxvla_core.infer.tasks import Task, check_descriptions, read_tasks, resolve_task
 
 KNOWN = {"1": "wave at the camera", "cube": "lift the red cube"}
 
@@ -30,22 +30,40 @@ def test_without_known_tasks_the_message_says_so():
         resolve_task("1", {})
 
 
-def test_a_given_task_is_the_only_one():
-    assert list(tasks("1", KNOWN, terminal=True)) == [Task("1", "wave at the camera")]
+def test_a_file_has_a_task_a_line(tmp_path):
+    file = tmp_path / "tasks.txt"
+    file.write_text("# the morning\ncube\n\n  stir the soup   # slowly\nwave at the camera\n")
+
+    assert [task.name for task in read_tasks(file, KNOWN)] == ["cube", "stir the soup", "1"]
 
 
-def test_a_person_is_asked_until_an_empty_answer():
-    said = []
-    answers = iter(["1", "77", "open the drawer", ""])
+def test_a_line_that_is_no_task_is_named_and_none_of_the_file_counts(tmp_path):
+    file = tmp_path / "tasks.txt"
+    file.write_text("cube\n\ncbue\n")
 
-    found = list(tasks(None, KNOWN, ask=lambda text: next(answers), say=said.append, terminal=True))
+    with pytest.raises(UsageError) as caught:
+        read_tasks(file, KNOWN)
+    assert str(caught.value).startswith(f"{file}:3: unknown task 'cbue'; nothing was moved\nknown")
+    assert "cube: lift the red cube" in str(caught.value)
 
-    assert [task.instruction for task in found] == ["wave at the camera", "open the drawer"]
-    assert said.count("  1: wave at the camera") == 4
-    assert any("unknown task '77'" in line for line in said)
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"# nothing\n\n", "the file has no task in it; nothing was moved"),
+        (b"\xff\xfe", "the tasks cannot be read: 'utf-8' codec"),
+        (None, "the tasks cannot be read: .*No such file"),
+    ],
+)
+def test_a_file_that_is_none(tmp_path, content, message):
+    file = tmp_path / "tasks.txt"
+    if content is not None:
+        file.write_bytes(content)
+
+    with pytest.raises(UsageError, match=message):
+        read_tasks(file, KNOWN)
 
 
-def test_without_a_terminal_and_without_tasks_words_are_asked_for():
-    with pytest.raises(UsageError, match="no task was given") as caught:
-        next(tasks(None, {}, terminal=False))
-    assert "--task with an instruction in words" in str(caught.value)
+def test_the_word_that_allows_motion_again_is_no_task():
+    with pytest.raises(UsageError, match="'rearm' means something else; rename the task"):
+        check_descriptions({"rearm": "put the arms back on"})

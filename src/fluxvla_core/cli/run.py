@@ -36,6 +36,7 @@ class Run:
             "--resume", metavar="auto|PATH", help="go on from the newest, or this, checkpoint"
         )
         parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
+        parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
         parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
         parser.once("--nproc", type=positive, default=1, metavar="N", help="processes (default 1)")
         add_plugin_files(parser)
@@ -77,8 +78,10 @@ class Run:
 
 def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
     """Options that this kind of section has no use for are slips."""
-    if plan.trains and args.task is not None:
+    if plan.trains and (args.task is not None or args.tasks is not None):
         raise UsageError(f"--task says what a robot is to do, and section {plan.section!r} trains")
+    if args.task is not None and args.tasks is not None:
+        raise UsageError("--task and --tasks both say what to do: give one of them")
     if not plan.trains and args.resume is not None:
         raise UsageError(f"--resume is for training, and section {plan.section!r} does not train")
     if args.resume not in (None, "auto") and not Path(args.resume).exists():
@@ -115,6 +118,7 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
         origins=plan.config.origins,
         config_file=plan.config.file,
         task=args.task,
+        task_file=args.tasks,
         nproc=ranks.world_size() or args.nproc,
     )
     if ranks.rank() != 0:

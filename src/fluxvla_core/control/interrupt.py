@@ -1,13 +1,13 @@
-"""Ctrl-C and SIGTERM while a robot moves: answered at the next beat, then a safe stop."""
+"""Ctrl-C, SIGTERM, a closed terminal while a robot moves: answered at the next beat by a stop."""
 
 from __future__ import annotations
 
 import signal
-import threading
+from contextlib import ExitStack
 from types import FrameType, TracebackType
-from typing import Any
 
 from fluxvla_core.errors import RunFailed
+from fluxvla_core.signals import handling
 
 
 class Interrupted(BaseException):
@@ -19,18 +19,21 @@ class Interrupted(BaseException):
 
     @property
     def name(self) -> str:
-        """``SIGINT`` or ``SIGTERM``."""
+        """``SIGINT``, ``SIGTERM`` or ``SIGHUP``."""
         return signal.Signals(self.number).name
 
     def final(self) -> BaseException:
-        """What the command ends with: interrupted (130) by Ctrl-C, failed (1) by SIGTERM."""
+        """What the command ends with: interrupted (130) by Ctrl-C, else failed (1)."""
         if self.number == signal.SIGINT:
             return KeyboardInterrupt("stopped by Ctrl-C; the robot was stopped")
-        return RunFailed("stopped by SIGTERM; the robot was stopped")
+        return RunFailed(f"stopped by {self.name}; the robot was stopped")
 
 
 class Interrupts:
-    """Takes SIGINT and SIGTERM over while entered; only the main thread can.
+    """Takes SIGINT, SIGTERM and SIGHUP over while entered; only the main thread can.
+
+    SIGHUP comes when the terminal goes away, with the network that a person is logged in through:
+    by default it would end the process with the arm in motion. ``nohup`` keeps it from coming.
 
     While ``deferred`` is set, the first signal waits for ``check``, which the loop calls at every
     beat, so that no command is cut in half. Otherwise, and for a second signal that finds the first
@@ -43,12 +46,13 @@ class Interrupts:
         self.stopping = False
         self.signals: list[int] = []
         self._pending: int | None = None
-        self._previous: dict[int, Any] = {}
+        self._taken = ExitStack()
 
     def __enter__(self) -> Interrupts:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        self._taken.enter_context(handling(self._handle, *numbers))
         return self
 
     def __exit__(
@@ -57,9 +61,7 @@ class Interrupts:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for number, previous in self._previous.items():
-            signal.signal(number, previous)
-        self._previous.clear()
+        self._taken.close()
 
     def check(self) -> None:
         """Raise what waits.
@@ -70,6 +72,16 @@ class Interrupts:
         if self._pending is not None and not self.stopping:
             number, self._pending = self._pending, None
             raise Interrupted(number)
+
+    def resume(self) -> None:
+        """A stop is over and the run goes on: signals count again.
+
+        Raises:
+            Interrupted: one came during the stop.
+        """
+        self.stopping = False
+        if self.signals:
+            raise Interrupted(self.signals[-1])
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.signals.append(number)

@@ -23,6 +23,12 @@ class Worker:
             queue.SimpleQueue()
         )
         self._thread: threading.Thread | None = None
+        self._newest: Future[Any] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job runs or waits."""
+        return self._newest is not None and not self._newest.done()
 
     def submit(self, job: Callable[[], T]) -> Future[T]:
         """Have ``job`` run; its result, or what it raised, is in the future."""
@@ -30,6 +36,7 @@ class Worker:
             self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
             self._thread.start()
         future: Future[T] = Future()
+        self._newest = future
         self._jobs.put((future, job))
         return future
 

@@ -32,7 +32,9 @@ from fluxvla_core.hooks import build_hooks
 from fluxvla_core.infer.episode import Episode
 from fluxvla_core.infer.plan import Plan
 from fluxvla_core.infer.robot import Robot
-from fluxvla_core.infer.tasks import Task, check_descriptions, resolve_task, tasks
+from fluxvla_core.infer.session import Session
+from fluxvla_core.infer.sources import TaskSource, task_source
+from fluxvla_core.infer.tasks import Task, check_descriptions
 from fluxvla_core.record.ros_messages import typestore
 from fluxvla_core.record.trace import next_folder
 from fluxvla_core.safety.ramp import check_pose
@@ -55,6 +57,8 @@ class BaseInferenceRunner:
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         policy: table or object of the Policy contract, instead of a checkpoint.
         task_descriptions: id -> instruction; what ``--task ID`` may name.
+        task_topic: ROS 2 topic (``std_msgs/String``) that tasks come from if the command line
+            names none; by default a person at the terminal is asked.
         state_dim: checked against the robot's state, if given.
         action_chunk: how many of a chunk's actions may be used; all by default.
         publish_rate: commands a second; the embodiment's rate by default.
@@ -98,6 +102,7 @@ class BaseInferenceRunner:
         denormalize_action: Any = None,
         policy: Any = None,
         task_descriptions: Mapping[str, str] | None = None,
+        task_topic: str | None = None,
         state_dim: int | None = None,
         action_chunk: int | None = None,
         publish_rate: float | None = None,
@@ -126,6 +131,7 @@ class BaseInferenceRunner:
         self.denormalize_action = denormalize_action
         self.policy: Any = build_policy_from_cfg(policy, context)
         self.task_descriptions = check_descriptions(task_descriptions)
+        self.task_topic = task_topic
         self.action_chunk = action_chunk
         self.execute_horizon = execute_horizon
         self.max_publish_step = max_publish_step
@@ -184,8 +190,8 @@ class BaseInferenceRunner:
         """
         if self.record is not None:
             typestore()  # before anything moves: what recording needs is installed
-        if self.context.task is not None:
-            resolve_task(self.context.task, self.task_descriptions)
+        if self.context.task is not None or self.context.task_file is not None:
+            self._task_source()
         if self.policy is None:
             from fluxvla_core.infer.local_policy import find_checkpoint, load_policy
 
@@ -218,32 +224,31 @@ class BaseInferenceRunner:
             check_pose(self.prepare_pose, self.embodiment)
 
     def run(self) -> dict[str, Any]:
-        """Connect, run the task that was given, or those that a person asks for, and stop.
+        """Connect, do the tasks of the command line, of a person or of a topic, and stop.
 
         Returns:
             The last episode's task, outcome, success and steps, and how many there were.
 
         Raises:
+            UsageError: there is no task, and nobody to ask for one; nothing was connected.
             KeyboardInterrupt: Ctrl-C; the robot was stopped.
             RunFailed: SIGTERM; the robot was stopped.
             Exception: what ended the run; the robot was stopped.
         """
         hooks = build_hooks(self.context)
         worker = Worker("fluxvla-policy")
-        ended, result = "failed", {"episodes": 0}
+        ended, source = "failed", self._task_source()
         self._work = (hooks, worker)
         with Interrupts() as interrupts:
             self._interrupts = interrupts
+            self._session = Session(
+                source, self.task_descriptions, self._run_episode, self.latch, interrupts, worker
+            )
             try:
                 hooks.call("run_started")
+                source.open()
                 self.robot.connect()
-                say = self.context.reporter.info
-                asked = tasks(self.context.task, self.task_descriptions, _ask, say)
-                for task in asked:
-                    summary = self._run_episode(task)
-                    self._episodes += 1
-                    kept = ("task", "outcome", "success", "steps")
-                    result = {"episodes": self._episodes, **{k: summary[k] for k in kept}}
+                result = self._session.run()
                 ended = "ok"
             except Interrupted as signal:
                 ended = "interrupted"
@@ -251,6 +256,7 @@ class BaseInferenceRunner:
             finally:
                 interrupts.stopping = True
                 self._shut_down(worker)
+                source.close()
                 hooks.call("run_finished", outcome=ended)
         return result
 
@@ -317,7 +323,12 @@ class BaseInferenceRunner:
             hooks=hooks,
             context=self.context,
         )
-        return Episode(plan, task, self._episodes, folder).run()
+        episode = Episode(plan, task, self._episodes, folder)
+        summary = episode.run()
+        self._episodes += 1
+        if not self.robot.lockstep:
+            self._session.episode = episode
+        return summary
 
     def _look(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
@@ -353,6 +364,10 @@ class BaseInferenceRunner:
                     next="set the camera to the size, or at least the aspect, of the recordings",
                 )
             self.context.reporter.warn(f"{sizes}; they are scaled")
+
+    def _task_source(self) -> TaskSource:
+        domain_id = getattr(self.ros_operator, "domain_id", None)
+        return task_source(self.context, self.task_descriptions, self.task_topic, domain_id)
 
     def _checked_joining(self, value: Any) -> Any:
         if value is None:
@@ -392,10 +407,3 @@ class BaseInferenceRunner:
     def _wrong(self, key: str, what: str) -> ConfigError:
         section = self.context.section
         return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))
-
-
-def _ask(question: str) -> str:
-    try:
-        return input(question)
-    except EOFError:
-        return ""

@@ -100,10 +100,21 @@ class Episode:
             self._stop(self._rule(error), problem)
             raise
         finally:
-            plan.interrupts.deferred = False
+            # A signal that comes now waits until the record is complete.
             summary = self._close(outcome, problem)
             plan.hooks.call("episode_finished", reason=problem or outcome)
+            self._phase = "over"
+            plan.interrupts.deferred = False
         return summary
+
+    def hold(self) -> None:
+        """Send the last command once more, at the next beat: after an episode that ended well.
+
+        Raises:
+            SafetyStop: the latch was tripped.
+            OperatorError: the robot does not take it.
+        """
+        self._path.hold()
 
     def _begin(self) -> None:
         """Read where the arm is, and bring it to the start pose."""
@@ -255,6 +266,8 @@ class Episode:
     def _on_sent(self, sent: Sent | None) -> None:
         """The beat after each command: recorded always, supervised while it may still stop."""
         plan, record = self._plan, self._record
+        if self._phase == "over":
+            return
         supervised = self._phase in ("ramp", "run")
         try:
             state, problem = plan.robot.state(), None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from fluxvla_core.errors import UsageError
+
+REARM = "rearm"
+"""What a person says after a stop, so that the robot may move again."""
 
 
 @dataclass(frozen=True)
@@ -43,59 +46,45 @@ def resolve_task(given: str, known: Mapping[str, str]) -> Task:
     )
 
 
-def tasks(
-    given: str | None,
-    known: Mapping[str, str],
-    ask: Callable[[str], str] = input,
-    say: Callable[[str], None] = print,
-    terminal: bool | None = None,
-) -> Iterator[Task]:
-    """The tasks of a run: the one that was given, or what a person at the terminal asks for.
-
-    Args:
-        given: ``--task``, or None.
-        known: id -> instruction.
-        ask: reads one line.
-        say: shows one line.
-        terminal: whether somebody can answer; by default whether stdin is a terminal.
+def read_tasks(path: str | Path, known: Mapping[str, str]) -> list[Task]:
+    """The tasks of a file, one a line: an id or an instruction; ``#`` begins a comment.
 
     Raises:
-        UsageError: the task is unknown, or there is none and nobody to ask.
+        UsageError: the file cannot be read, is empty, or has a line that is no task; no line of it
+            counts then.
     """
-    if given is not None:
-        yield resolve_task(given, known)
-        return
-    if not (sys.stdin.isatty() if terminal is None else terminal):
-        ids = f"one of {', '.join(known)}, or an" if known else "an"
-        raise UsageError(
-            "no task was given, and there is no terminal to ask at; nothing was moved",
-            next=f"--task with {ids} instruction in words",
-        )
-    while True:
-        for key, instruction in known.items():
-            say(f"  {key}: {instruction}")
-        line = ask("task id or instruction (empty ends): ").strip()
-        if not line:
-            return
-        try:
-            task = resolve_task(line, known)
-        except UsageError as error:
-            say(str(error))
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"the tasks cannot be read: {error}", where=str(path)) from error
+    found = []
+    for number, line in enumerate(lines, 1):
+        text = line.partition("#")[0].strip()
+        if not text:
             continue
-        yield task
+        try:
+            found.append(resolve_task(text, known))
+        except UsageError as error:
+            raise UsageError(error.what, where=f"{path}:{number}", next=error.next) from error
+    if not found:
+        raise UsageError("the file has no task in it; nothing was moved", where=str(path))
+    return found
 
 
 def check_descriptions(known: Mapping[str, str] | None) -> dict[str, str]:
     """``task_descriptions`` as id -> instruction; ids are compared as text.
 
     Raises:
-        UsageError: an instruction is empty, or an id is empty or has a blank in it.
+        UsageError: an instruction is empty, or an id is empty, has a blank in it, or is the word
+            that allows motion again after a stop.
     """
     checked: dict[str, str] = {}
     for key, instruction in (known or {}).items():
         name = str(key)
         if not name or " " in name:
             raise UsageError(f"task_descriptions: an id is one word, got {name!r}")
+        if name == REARM:
+            raise UsageError(f"task_descriptions: {REARM!r} means something else; rename the task")
         if not isinstance(instruction, str) or not instruction.strip():
             raise UsageError(f"task_descriptions: task {name!r} has no instruction")
         checked[name] = " ".join(instruction.split())

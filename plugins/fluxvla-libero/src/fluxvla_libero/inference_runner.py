@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.evaluate.drawing import check_render
 from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.infer.tasks import Task, check_descriptions, tasks
+from fluxvla_core.infer.sources import task_source, tasks
+from fluxvla_core.infer.tasks import Task, check_descriptions
 from fluxvla_core.record.trace import EpisodeTrace, next_folder
 from fluxvla_libero.embodiment import CONTROL_HZ, SCENE_CAMERAS, check_policy, libero_spec
 from fluxvla_libero.eval_runner import TRIALS
@@ -145,7 +147,8 @@ class LiberoInferenceRunner:
         known = self.task_descriptions or {
             str(task.index): task.language for task in suite_tasks(self.suite)
         }
-        return [self._episode(task) for task in tasks(self.context.task, known)]
+        source = task_source(self.context, known)
+        return [self._episode(task) for task in tasks(source, known, lambda: time.sleep(0.05))]
 
     def _episode(self, asked: Task) -> dict[str, Any]:
         from fluxvla_libero.rollout import Episode, rollout

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from fluxvla_core.cli.parser import Parser
+from fluxvla_core.errors import UsageError
 
 DIR = "a LeRobot dataset: the folder that holds meta/"
 
@@ -88,20 +89,41 @@ class Stats:
 class Convert:
     api = "1.0"
     help = (
-        "Write a dataset of LeRobot v2.0 or v2.1 as v3.0. Video is copied, not encoded again; "
-        "statistics are computed anew."
+        "Write a dataset of LeRobot v3.0: from one of v2.0 or v2.1, whose video is copied, not "
+        "encoded again, or from episodes that were recorded with fluxvla run --record."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("dataset", metavar="DIR", help=f"{DIR}; stays as it is")
+        parser.add_argument(
+            "sources", metavar="DIR", nargs="+", help="an older dataset, or recordings; stay"
+        )
         parser.add_argument("out", metavar="OUT", help="the new dataset's folder")
+        parser.once(
+            "--fps", type=float, metavar="HZ", help="of recordings; default: the robot's rate"
+        )
+        parser.add_argument(
+            "--successes", action="store_true", help="of recordings: those that succeeded, only"
+        )
         _log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.data.convert import convert
+        from fluxvla_core.record.to_dataset import recordings_to_dataset
 
+        datasets = [source for source in args.sources if (Path(source) / "meta").is_dir()]
         with _reporter(args.log_format, sys.stdout) as reporter:
-            reporter.artifact("dataset", convert(args.dataset, args.out, reporter))
+            if not datasets:
+                found = recordings_to_dataset(
+                    args.sources, args.out, args.fps, args.successes, reporter
+                )
+            elif len(args.sources) > 1 or args.fps is not None or args.successes:
+                raise UsageError(
+                    f"{datasets[0]} is a dataset: one is converted, alone, as it is",
+                    next="fluxvla data convert DIR OUT",
+                )
+            else:
+                found = convert(datasets[0], args.out, reporter)
+            reporter.artifact("dataset", found)
         return 0
 
 

@@ -29,6 +29,7 @@ nox.options.sessions = ["tests"]
 nox.options.default_venv_backend = "none"
 
 EXTRAS = "data,train,report"
+TESTED_EXTRAS = f"{EXTRAS},lora,tensorboard,trackio,wandb"
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow"]
 ALONE = ["-m", "realtime and not slow"]
@@ -122,7 +123,7 @@ def dev_env(session: nox.Session) -> envs.Env:
     def install(changed: list[str], fresh: bool) -> None:
         words: list[str] = []
         for dist in (d for d in dists if d.name in changed):
-            extras = f"[{EXTRAS}]" if dist.path == ROOT else ""
+            extras = f"[{TESTED_EXTRAS}]" if dist.path == ROOT else ""
             words += ["-e", f"{dist.path}{extras}"]
         session.log(f"installing in editable mode: {', '.join(changed)}")
         env.pip_install("--no-build-isolation", *words, constraints=project.CONSTRAINTS)

@@ -71,7 +71,7 @@ def test_a_fresh_run_begins_an_empty_file(tmp_path):
 def test_an_unknown_tracker_is_refused_with_a_suggestion():
     with pytest.raises(ConfigError, match=r"there is no tracker 'jsonll'; did you mean 'jsonl'\?"):
         check_trackers(("jsonll",))
-    with pytest.raises(ConfigError, match="there are jsonl, tensorboard, wandb"):
+    with pytest.raises(ConfigError, match="there are jsonl, tensorboard, trackio, wandb"):
         check_trackers(("xyz",))
 
 
@@ -81,7 +81,7 @@ def test_a_tracker_without_its_package_is_refused_before_training(monkeypatch):
         check_trackers(("wandb",), "c.py:3: runner.metric.active_trackers")
     assert str(caught.value) == (
         "c.py:3: runner.metric.active_trackers: tracker 'wandb' needs the package wandb, which is "
-        "not installed\n  next: pip install wandb"
+        "not installed\n  next: pip install 'fluxvla-core[wandb]'"
     )
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -101,11 +103,46 @@ class WandbTracker:
         self._run.finish()
 
 
+class TrackioTracker:
+    """Trackio, which keeps runs on this machine (in ``TRACKIO_DIR``); ``trackio show`` has them.
+
+    ``TRACKIO_PROJECT`` names the project.
+    """
+
+    def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
+        # It greets people on standard output, where a program may be reading JSON.
+        with redirect_stdout(sys.stderr):
+            import trackio
+
+            self._trackio: Any = trackio
+            trackio.init(
+                project=os.environ.get("TRACKIO_PROJECT", "fluxvla"),
+                name=run_id,
+                config=json.loads(json.dumps(dict(hparams), default=str)),
+                resume="allow",
+                embed=False,
+                auto_log_cpu=False,
+                auto_log_gpu=False,
+            )
+
+    def log(self, step: int, values: Values) -> None:
+        self._trackio.log({f"train/{name}": value for name, value in values.items()}, step=step)
+
+    def sync(self) -> None:
+        return
+
+    def close(self) -> None:
+        with redirect_stdout(sys.stderr):
+            self._trackio.finish()
+
+
 _KINDS: Mapping[str, tuple[Callable[..., Tracker], str | None]] = {
     "jsonl": (JsonlTracker, None),
     "tensorboard": (TensorboardTracker, "tensorboard"),
+    "trackio": (TrackioTracker, "trackio"),
     "wandb": (WandbTracker, "wandb"),
 }
+"""Name -> the tracker, and the package that it needs; an extra of fluxvla-core has its name."""
 
 
 def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
@@ -127,7 +164,7 @@ def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
             raise ConfigError(
                 f"tracker {name!r} needs the package {package}, which is not installed",
                 where=where,
-                next=f"pip install {package}",
+                next=f"pip install 'fluxvla-core[{name}]'",
             )
 
 

@@ -24,7 +24,7 @@ class VLAMetric:
     and ``state_dict``/``load_state_dict`` (JSON values) can take its place.
 
     Args:
-        active_trackers: of ``jsonl``, ``tensorboard``, ``wandb``.
+        active_trackers: of ``jsonl``, ``tensorboard``, ``trackio``, ``wandb``.
         run_dir: where trackers write; the work dir by default.
         run_id: name of the run; the work dir's name by default.
         hparams: what is recorded as the run's settings; the config by default.

@@ -216,7 +216,8 @@ train_dataloader = dict(per_device_batch_size=8, per_device_num_workers=0, datas
 runner = dict(
     type="OneProcessRunner", max_steps=3, learning_rate=1e-3,
     collator=dict(type="DictCollator", keys=["images", "states", "actions", "action_masks"],
-                  meta_keys=["img_masks", "sample_ids", "task_description", "info", "stats", "timestamp"]),
+                  meta_keys=["img_masks", "sample_ids", "task_description", "info", "stats",
+                             "timestamp"]),
     metric=dict(type="VLAMetric", active_trackers=("jsonl",)))
 """
 

@@ -29,7 +29,7 @@ nox.options.sessions = ["tests"]
 nox.options.default_venv_backend = "none"
 
 EXTRAS = "data,train,report"
-TESTED_EXTRAS = f"{EXTRAS},lora,tensorboard,trackio,wandb"
+TESTED_EXTRAS = f"{EXTRAS},record,lora,tensorboard,trackio,wandb"
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow"]
 ALONE = ["-m", "realtime and not slow"]

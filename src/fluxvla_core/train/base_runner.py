@@ -273,6 +273,16 @@ class BaseTrainRunner(TrainRun):
         """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
         return nullcontext()
 
+    def _backward(self, loss: Tensor) -> None:
+        """Backward pass of one batch; ``loss`` is divided by the number of batches already."""
+        loss.backward()  # type: ignore[no-untyped-call]
+
+    def _update(self) -> Tensor | None:
+        """Clip, and let the optimizer step; the gradients' norm before, on the device."""
+        norm = self.clip_grad_norm()
+        self.optimizer.step()
+        return norm
+
     def _warm_up(self, batch: dict[str, Any]) -> None:
         """Called with the first batch, before the first step; must leave no trace."""
 

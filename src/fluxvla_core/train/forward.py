@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.train.units import blocks_of
 
 IDS = "sample_ids"
 
@@ -96,7 +97,7 @@ def checkpoint_activations(model: nn.Module) -> None:
     """
     from torch.utils.checkpoint import checkpoint
 
-    units: list[nn.Module] = getattr(model, "fsdp_units", list)()
+    units = blocks_of(model)
     if not units:
         raise ConfigError(
             f"enable_gradient_checkpointing: {type(model).__name__} names no units to recompute",
@@ -115,7 +116,7 @@ def compile_units(model: nn.Module) -> None:
     Raises:
         ConfigError: the model names no units.
     """
-    units: list[nn.Module] = getattr(model, "fsdp_units", list)()
+    units = blocks_of(model)
     if not units:
         raise ConfigError(
             f"compile_blocks: {type(model).__name__} names no blocks to compile",

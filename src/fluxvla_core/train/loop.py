@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from typing import Any
 
-import torch
-
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.train.batches import StepSampler
@@ -168,13 +166,12 @@ class StepLoop:
             waited += time.perf_counter() - asked
             with run._sync_gradients(last=part == parts - 1):
                 loss = run._training_step(batch)
-                torch.autograd.backward(loss / parts if parts > 1 else loss)
+                run._backward(loss / parts if parts > 1 else loss)
             losses.append(loss.detach())
             ids.append(batch.get(IDS))
             each.append(run.sample_losses)
-        norm = run.clip_grad_norm()
         rate = run.optimizer.param_groups[0]["lr"]
-        run.optimizer.step()
+        norm = run._update()
         run.lr_scheduler.step()
         run.optimizer.zero_grad(set_to_none=True)
         if run.ema is not None:

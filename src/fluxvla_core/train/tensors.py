@@ -109,8 +109,9 @@ class TensorFile:
         Raises:
             CheckpointError: a dtype that the format does not have.
         """
-        kept = {key: local(tensors[key]) for key in _ordered(tensors, tensors)}
-        return cls(name, _header(kept, describe_parts(tensors)), tuple(kept.values()), True)
+        named = {key: tensors[key] for key in _ordered(tensors, tensors)}
+        kept = {key: local(tensor) for key, tensor in named.items()}
+        return cls(name, _header(kept, describe_parts(named)), tuple(kept.values()), True)
 
     def gathered(self) -> TensorFile:
         """The same with whole tensors; all ranks call it, those that do not write get none."""

@@ -19,9 +19,9 @@ STRATEGIES = ("full-shard", "shard-grad-op", "hybrid-shard", "no-shard")
 class FSDPTrainRunner(BaseTrainRunner):
     """Fully sharded data-parallel training with torch's ``fully_shard`` (FSDP2).
 
-    The blocks of the model's ``fsdp_units()`` are gathered one by one; frozen parameters stay
-    whole on every process. In mixed precision blocks are gathered in bf16, which halves the
-    traffic; gradients are reduced in fp32.
+    The blocks of the model's ``fsdp_units()`` are gathered one by one, those in a tuple together;
+    frozen parameters stay whole on every process. In mixed precision blocks are gathered in
+    bf16, which halves the traffic; gradients are reduced in fp32.
 
     Args:
         sharding_strategy: ``full-shard``; ``shard-grad-op`` (weights stay gathered from the
@@ -50,6 +50,8 @@ class FSDPTrainRunner(BaseTrainRunner):
         """Split the model's units, then what is left of it, over the mesh."""
         from torch.distributed.fsdp import fully_shard
 
+        from fluxvla_core.train.units import units_of
+
         vla = vla.to(self.world.device)
         shared: dict[str, Any] = {
             "mesh": self._mesh(),
@@ -57,10 +59,10 @@ class FSDPTrainRunner(BaseTrainRunner):
             "ignored_params": {p for p in vla.parameters() if not p.requires_grad},
         }
         reshard = self.sharding_strategy in ("full-shard", "hybrid-shard")
-        units: list[nn.Module] = getattr(vla, "fsdp_units", list)()
-        for unit in units:
-            if any(p.requires_grad for p in unit.parameters()):
-                fully_shard(unit, reshard_after_forward=reshard, **shared)
+        for unit in units_of(vla):
+            modules = [m for m in unit if any(p.requires_grad for p in m.parameters())]
+            if modules:
+                fully_shard(modules, reshard_after_forward=reshard, **shared)
         # Whatever is in no unit is gathered first and used until the end: no use in letting go.
         fully_shard(vla, reshard_after_forward=False, **shared)
         return vla

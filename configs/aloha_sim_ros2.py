@@ -11,7 +11,8 @@ and in another the policy, from the work dir that the training made:
 
 How often it succeeds, over as many cube positions, in real time:
 
-    fluxvla run --config configs/aloha_sim_ros2.py --section eval --work-dir work_dirs/aloha_sim_transfer
+    fluxvla run --config configs/aloha_sim_ros2.py --section eval \
+        --work-dir work_dirs/aloha_sim_transfer
 
 On a machine that cannot simulate and think in real time, ``--real-time-factor 0.5`` there and
 ``--set inference.operator.real_time_factor=0.5`` here slow both down alike. On a real robot

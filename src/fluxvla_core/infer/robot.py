@@ -87,7 +87,8 @@ class Robot:
     def success(self) -> bool | None:
         """Whether the task is done as of now, where the operator can tell (``task_success``)."""
         tell = getattr(self.operator, "task_success", None)
-        return None if tell is None else bool(tell())
+        found = None if tell is None else tell()
+        return None if found is None else bool(found)
 
     def done(self) -> bool:
         """Whether the episode can end here, where the operator can tell (``task_done``)."""

@@ -152,8 +152,8 @@ class InSimulation(RosOperator):
         """JSON values about how the last episode was simulated, for whoever reports its outcome.
 
         ``real_time_factor`` is what was stated, ``real_time_kept`` the share of it that the
-        simulator reached from the episode's begin until it was judged. Below 0.95 a warning is logged: the control loop
-        was faster than its robot then.
+        simulator reached from the episode's begin until it was judged. Below 0.95 a warning is
+        logged: the control loop was faster than its robot then.
         """
         kept = None
         if self._begun is not None and self._judged is not None:

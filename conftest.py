@@ -19,6 +19,11 @@ if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+# How long an example takes says something about the machine, not about the project.
+settings.register_profile("fluxvla", deadline=None)
+settings.load_profile("fluxvla")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -90,13 +90,14 @@ def test_train_dataloader_is_needed_and_checked():
         "  my.py:3: train_dataloader.per_device_num_worker: unknown key; did you mean "
         "'per_device_num_workers'?\n"
         "  train_dataloader.x: unknown key; known: per_device_batch_size, "
-        "per_device_num_workers, dataset"
+        "per_device_num_workers, shuffle_episodes, dataset"
     )
-    config["train_dataloader"] = {"per_device_num_workers": -1}
+    config["train_dataloader"] = {"per_device_num_workers": -1, "shuffle_episodes": 1}
     with pytest.raises(ConfigError) as caught:
         build(config)
     assert "per_device_batch_size: must be a whole number above 0, got None" in str(caught.value)
     assert "per_device_num_workers: must be a whole number from 0 up, got -1" in str(caught.value)
+    assert "shuffle_episodes: must be a whole number above 1, or None, got 1" in str(caught.value)
 
 
 def test_no_model():

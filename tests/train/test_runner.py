@@ -8,6 +8,7 @@ import signal
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -258,6 +259,31 @@ def test_another_models_checkpoint_is_refused(tmp_path):
 )
 def test_another_runs_checkpoint_is_refused(tmp_path, settings, message):
     assert message in resume_error(tmp_path, **settings)
+
+
+def test_a_few_episodes_at_a_time(tmp_path):
+    """The loop sees them, and a resumed run cannot change how many."""
+    seen = []
+
+    class Episodes(TinyDataset):
+        episode_ends = np.arange(1, 9) * 4
+
+        def get_sample(self, index, epoch):
+            seen.append(index // 4)
+            return super().get_sample(index, epoch)
+
+    def train(dataset, together, resume=None):
+        runner = make(tmp_path, resume, max_steps=4)
+        object.__setattr__(runner.loader_options, "shuffle_episodes", together)
+        runner.run_setup(32)
+        runner.run(dataset)
+
+    train(Episodes(32), 2)
+    assert [len(set(seen[i : i + 8])) for i in (0, 8)] == [2, 2]
+    with pytest.raises(CheckpointError, match="value of shuffle_episodes is 3, the checkpoint's run had 2"):
+        train(Episodes(32), 3, "auto")
+    with pytest.raises(ConfigError, match="TinyDataset does not say where its episodes end"):
+        train(TinyDataset(32), 2, "auto")
 
 
 def test_an_optimizer_that_is_not_taken_is_an_error(tmp_path, monkeypatch):

@@ -22,7 +22,12 @@ INJECTED = ("cfg", "context")
 """Constructor parameters that are filled in when the run starts; a config may not set them."""
 
 LOADERS = ("train_dataloader", "val_dataloader")
-LOADER_KEYS = ("per_device_batch_size", "per_device_num_workers", "dataset")
+LOADER_KEYS = (
+    "per_device_batch_size",
+    "per_device_num_workers",
+    "shuffle_episodes",
+    "dataset",
+)
 """What the core's own train runners read of ``train_dataloader``."""
 
 _NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, "requires", "hooks")

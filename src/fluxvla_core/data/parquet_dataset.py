@@ -134,6 +134,17 @@ class ParquetDataset:
         return self._embodiment
 
     @property
+    def episode_ends(self) -> npt.NDArray[np.int64]:
+        """``(E,)`` for each episode in use the index after its last sample."""
+        before = np.concatenate([[0], self._ends[:-1]])
+        parts = []
+        for recorded, offset in zip(self.recordings, before, strict=True):
+            of_episode = recorded.episode[recorded.rows]
+            last = np.flatnonzero(of_episode[1:] != of_episode[:-1]) + 1
+            parts.append(np.append(last, len(of_episode)) + offset)
+        return np.concatenate(parts)
+
+    @property
     def tasks(self) -> tuple[str, ...]:
         """The instructions of the frames in use."""
         texts = [r.meta.tasks[i] for r in self.recordings for i in np.unique(r.task[r.rows])]

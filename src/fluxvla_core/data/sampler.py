@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.data.rng import order_rng
+from fluxvla_core.data.order import EpisodeShards, epoch_order
 from fluxvla_core.errors import ConfigError
 
 
@@ -46,6 +46,7 @@ class EpochSampler:
             the first samples of the same epoch's order, so that every sample is seen, every rank
             has equally many full batches, and no rank waits for another.
         start: the first position that is yielded; the beginning of epoch 0 by default.
+        shards: mix a few episodes at a time instead of all samples.
 
     Raises:
         ConfigError: the dataset is empty, or too small for one batch under ``drop_last``.
@@ -61,6 +62,7 @@ class EpochSampler:
         shuffle: bool = True,
         drop_last: bool = False,
         start: Position | None = None,
+        shards: EpisodeShards | None = None,
     ) -> None:
         if length < 1:
             raise ConfigError("the dataset holds no samples")
@@ -76,6 +78,7 @@ class EpochSampler:
         self.shuffle = shuffle
         self.drop_last = drop_last
         self.start = start or Position(0, 0)
+        self.shards = shards
         if self.batches_per_epoch == 0:
             raise ConfigError(
                 f"{length} samples do not fill one global batch of {self.global_batch}",
@@ -95,7 +98,7 @@ class EpochSampler:
     def order(self, epoch: int) -> npt.NDArray[np.int64]:
         """Indices of the whole epoch over all ranks: ``(batches_per_epoch * global_batch,)``."""
         if self.shuffle:
-            order = order_rng(self.seed, epoch).permutation(self.length)
+            order = epoch_order(self.length, self.seed, epoch, self.shards)
         else:
             order = np.arange(self.length)
         return np.resize(order, self.batches_per_epoch * self.global_batch).astype(np.int64)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fluxvla_core.data.order import EpisodeShards
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 
 
@@ -33,6 +34,7 @@ class StepPlan:
         accumulation: micro-batches per step.
         world: number of ranks.
         seed: of the order.
+        shards: mix a few episodes at a time instead of all samples.
     """
 
     length: int
@@ -40,6 +42,7 @@ class StepPlan:
     accumulation: int
     world: int
     seed: int
+    shards: EpisodeShards | None = None
 
     @property
     def step_samples(self) -> int:
@@ -74,7 +77,7 @@ class StepSampler:
         self.start = start or Cursor()
         # One rank's view of the whole order; cutting it up is done here, by position in samples,
         # so that a run can go on with another number of ranks.
-        self._order = EpochSampler(plan.length, 1, seed=plan.seed)
+        self._order = EpochSampler(plan.length, 1, seed=plan.seed, shards=plan.shards)
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, skip = self.start.epoch, self.start.samples

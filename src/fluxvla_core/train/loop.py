@@ -29,7 +29,8 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     options, world, context = run.options, run.world, run.context
     if not world.first:
         run.hooks = HookCaller(context)
-    run.dataset, run.plan = dataset, run._plan(len(dataset))
+    run.dataset = dataset
+    run.plan = run._plan(len(dataset), run._shards(dataset))
     run._saver = Saver(world, options.async_save, run.optimizer)
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))
     run.left_out = left_out(run.model)

@@ -145,10 +145,14 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class LoaderOptions:
-    """``train_dataloader`` of the config, without its dataset."""
+    """``train_dataloader`` of the config, without its dataset.
+
+    ``shuffle_episodes`` mixes so many episodes at a time; None mixes all samples.
+    """
 
     per_device_batch_size: int
     per_device_num_workers: int = 0
+    shuffle_episodes: int | None = None
 
     @classmethod
     def for_validation(
@@ -199,11 +203,13 @@ class LoaderOptions:
                 near = difflib.get_close_matches(key, known, 1)
                 hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
                 found.append((key, f"unknown key{hint}"))
-        size, workers = table.get(known[0]), table.get(known[1], 0)
+        size, workers, together = table.get(known[0]), table.get(known[1], 0), table.get(known[2])
         if not _count(size, 1):
             found.append((known[0], f"must be a whole number above 0, got {size!r}"))
         if not _count(workers, 0):
             found.append((known[1], f"must be a whole number from 0 up, got {workers!r}"))
+        if together is not None and not _count(together, 2):
+            found.append((known[2], f"must be a whole number above 1, or None, got {together!r}"))
         if found:
             raise ConfigError.from_problems(
                 tuple(
@@ -211,7 +217,7 @@ class LoaderOptions:
                     for k, what in found
                 )
             )
-        return cls(int(table[known[0]]), int(workers))
+        return cls(int(table[known[0]]), int(workers), together)
 
 
 def _count(value: object, least: int) -> bool:

@@ -99,6 +99,7 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
     for key, ours, what in (
         ("seed", plan.seed, "seed"),
         ("n_train_examples", plan.length, "number of samples in the dataset"),
+        ("shuffle_episodes", plan.shards and plan.shards.together, "value of shuffle_episodes"),
     ):
         if saved[key] != ours:
             raise CheckpointError(

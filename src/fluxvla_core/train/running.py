@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.train.options import LoaderOptions, TrainOptions
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
+    from fluxvla_core.data.order import EpisodeShards
     from fluxvla_core.hooks import HookCaller
     from fluxvla_core.train.batches import StepPlan
     from fluxvla_core.train.checkpoint import Checkpoint
@@ -175,7 +177,7 @@ class TrainRun:
         wanted = self.context.resume or self.options.resume_from
         self._checkpoint = choose(self._world, self.context, wanted)
 
-    def _plan(self, samples: int) -> StepPlan:
+    def _plan(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
         from fluxvla_core.train.batches import StepPlan
 
         return StepPlan(
@@ -184,7 +186,30 @@ class TrainRun:
             self.options.grad_accumulation_steps,
             self.world.size,
             self.options.seed,
+            shards,
         )
+
+    def _shards(self, dataset: Any) -> EpisodeShards | None:
+        """How ``shuffle_episodes`` of the ``train_dataloader`` cuts the dataset.
+
+        Raises:
+            ConfigError: the dataset does not say where its episodes end.
+        """
+        from fluxvla_core.data.order import EpisodeShards
+
+        together = self.loader_options.shuffle_episodes
+        if together is None:
+            return None
+        where = self.context.where("train_dataloader.shuffle_episodes")
+        ends = getattr(dataset, "episode_ends", None)
+        if ends is None:
+            raise ConfigError(
+                f"{type(dataset).__name__} does not say where its episodes end, so "
+                "shuffle_episodes cannot be used with it",
+                where=where,
+                next="remove shuffle_episodes: all samples are then mixed",
+            )
+        return EpisodeShards(ends, together)
 
     def _total(self, plan: StepPlan) -> int:
         return self.max_steps or plan.steps_per_epoch * (self.max_epochs or 0)

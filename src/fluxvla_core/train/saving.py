@@ -174,6 +174,7 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         "n_train_examples": run.plan.length,
         "step_samples": run.plan.step_samples,
         "world_size": run.plan.world,
+        "shuffle_episodes": run.loader_options.shuffle_episodes,
         "left_out": without.to_dict(),
     }
     return Snapshot(

@@ -280,7 +280,8 @@ def test_a_few_episodes_at_a_time(tmp_path):
 
     train(Episodes(32), 2)
     assert [len(set(seen[i : i + 8])) for i in (0, 8)] == [2, 2]
-    with pytest.raises(CheckpointError, match="value of shuffle_episodes is 3, the checkpoint's run had 2"):
+    refused = "value of shuffle_episodes is 3, the checkpoint's run had 2"
+    with pytest.raises(CheckpointError, match=refused):
         train(Episodes(32), 3, "auto")
     with pytest.raises(ConfigError, match="TinyDataset does not say where its episodes end"):
         train(TinyDataset(32), 2, "auto")

@@ -21,11 +21,12 @@ _GRACE_S = 60  # for a checkpoint, between asking ranks to stop and killing them
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-def launch(nproc: int, words: Sequence[str]) -> int:
+def launch(nproc: int, words: Sequence[str], restarts: int = 0) -> int:
     """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
 
-    Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped, and the
-    words and the exit code of the one that failed first are this command's.
+    Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped. Up to
+    ``restarts`` times all are started again, from the newest checkpoint; after that the words and
+    the exit code of the one that failed first are this command's.
 
     Raises:
         UsageError: torch is not installed, or this process is itself a rank.
@@ -63,7 +64,7 @@ def launch(nproc: int, words: Sequence[str]) -> int:
                 rdzv_backend="c10d",
                 rdzv_endpoint="127.0.0.1:0",
                 local_addr="127.0.0.1",
-                max_restarts=0,
+                max_restarts=restarts,
                 shutdown_timeout=_GRACE_S,
                 logs_specs=DefaultLogsSpecs(log_dir=folder),
             )

@@ -67,6 +67,14 @@ def positive(text: str) -> int:
     return number
 
 
+def natural(text: str) -> int:
+    """A whole number from 0."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text} is less than 0")
+    return number
+
+
 def add_overrides(parser: argparse.ArgumentParser) -> None:
     """``--set k=v`` (repeatable) and its alias ``--cfg-options k=v k=v ...``."""
     parser.add_argument(

@@ -30,6 +30,33 @@ def world_size() -> int | None:
     return int(text) if text else None
 
 
+def attempt() -> int:
+    """How often this job's processes were started again before (torchrun counts them)."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+
+
+def resume(asked: str | None, work_dir: Path) -> str | None:
+    """What a training goes on from: ``--resume``, and after a restart what there is by then."""
+    if attempt() == 0:
+        return asked
+    from fluxvla_core.train.checkpoint import folders
+
+    return "auto" if asked is None or folders(work_dir) else asked
+
+
+def restarted() -> list[str]:
+    """What to say first after a restart: which one it is, and why there was need for one."""
+    if attempt() == 0:
+        return []
+    said = failures(Path(os.environ[ERROR_DIR]), attempt() - 1) if launched() else {}
+    found = [failure for failure in said.values() if not failure.asked]
+    why = "a process ended without a word"
+    if found:
+        first = root_cause(found)
+        why = f"rank {first.rank} failed:\n{first.text.rstrip()}"
+    return [f"restart {attempt()}: {why}"]
+
+
 def leave(code: int) -> NoReturn:
     """End this rank's process at once, with everything it said written out.
 
@@ -75,7 +102,7 @@ def record(text: str, code: int, *, expected: bool) -> bool:
     # that is gone.
     asked = "stopped by SIGTERM" in text or "lost another rank" in text
     failure = Failure(rank(), time.monotonic(), text, code, expected, asked)
-    path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.json"
+    path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.{attempt()}.json"
     try:
         path.write_text(json.dumps(asdict(failure)))
     except OSError:  # the launcher is gone, or the disk is full: the terminal is what is left
@@ -83,9 +110,12 @@ def record(text: str, code: int, *, expected: bool) -> bool:
     return True
 
 
-def failures(folder: Path) -> dict[int, Failure]:
-    """What ranks recorded, by rank."""
-    found = [Failure(**json.loads(path.read_text())) for path in folder.glob("rank-*.json")]
+def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
+    """What ranks recorded, by rank, in the ``which``-th attempt; in the last one by default."""
+    paths = {path: int(path.name.split(".")[1]) for path in folder.glob("rank-*.*.json")}
+    if which is None:
+        which = max(paths.values(), default=0)
+    found = [Failure(**json.loads(p.read_text())) for p, n in paths.items() if n == which]
     return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
 
 

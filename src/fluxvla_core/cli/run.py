@@ -6,17 +6,17 @@ import argparse
 import errno
 import json
 import signal
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.cli import ranks
-from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, positive
+from fluxvla_core.cli import following, ranks
+from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, natural, positive
 from fluxvla_core.cli.plan import Plan, make_plan, prepare_work_dir, refuse_overwriting
 from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.signals import handling
 from fluxvla_core.plugins.files import load_plugin_files
 
 
@@ -39,6 +39,18 @@ class Run:
         parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
         parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
         parser.once("--nproc", type=positive, default=1, metavar="N", help="processes (default 1)")
+        parser.once(
+            "--max-restarts",
+            type=natural,
+            default=0,
+            metavar="N",
+            help="when a process of a training ends, start all again from the newest checkpoint",
+        )
+        parser.add_argument(
+            "--eval-after-train",
+            action="store_true",
+            help="then run the section 'eval', in a fresh process",
+        )
         add_plugin_files(parser)
         parser.add_argument(
             "--dry-run", action="store_true", help="check, print what would run, and stop"
@@ -59,21 +71,26 @@ class Run:
         settings = {"record": args.record} if args.record is not None else {}
         plan = make_plan(args.config, args.section, args.overrides, args.work_dir, settings)
         _check_fit(args, plan)
+        after = following.plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
             print(_outline(plan, args.log_format))
             return 0
         if ranks.rank() == 0 and not ranks.launched():
             prepare_work_dir(plan.work_dir)
-            if plan.trains and args.resume is None:
+            if plan.trains and ranks.resume(args.resume, plan.work_dir) is None:
                 refuse_overwriting(plan.work_dir)
-        if plan.trains and args.nproc > 1:
+        if plan.trains and (args.nproc > 1 or args.max_restarts):
             from fluxvla_core.cli.launch import launch
 
             with _terminable():
-                return launch(args.nproc, _words(args))
-        with _terminable(), _disk_full(plan.work_dir):
-            _execute(plan, args)
-        return 0
+                code = launch(args.nproc, _words(args), args.max_restarts)
+        else:
+            with _terminable(), _disk_full(plan.work_dir):
+                _execute(plan, args)
+            code = 0
+        if code == 0 and after is not None and ranks.rank() == 0:
+            following.evaluate(after)
+        return code
 
 
 def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
@@ -84,6 +101,12 @@ def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
         raise UsageError("--task and --tasks both say what to do: give one of them")
     if not plan.trains and args.resume is not None:
         raise UsageError(f"--resume is for training, and section {plan.section!r} does not train")
+    for flag in ("max_restarts", "eval_after_train"):
+        if getattr(args, flag) and not plan.trains:
+            raise UsageError(
+                f"--{flag.replace('_', '-')} is for training, and section {plan.section!r} does "
+                "not train"
+            )
     if args.resume not in (None, "auto") and not Path(args.resume).exists():
         raise UsageError(
             f"--resume {args.resume}: there is no such checkpoint",
@@ -114,7 +137,7 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
         config=freeze(plan.config.tree),
         section=plan.section,
         work_dir=plan.work_dir,
-        resume=args.resume,
+        resume=ranks.resume(args.resume, plan.work_dir) if plan.trains else None,
         origins=plan.config.origins,
         config_file=plan.config.file,
         task=args.task,
@@ -128,6 +151,8 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
     reporter = make_reporter(args.log_format)
     try:
         reporter.event("start", section=plan.section, work_dir=plan.work_dir)
+        for text in ranks.restarted():
+            reporter.warn(text)
         context = replace(context, reporter=reporter)
         result = _run_section(plan, build_runner_from_cfg, context)
         if isinstance(result, Mapping):
@@ -156,8 +181,16 @@ def _run_section(plan: Plan, build: Any, context: Any) -> Any:
     from fluxvla_core.build import build_dataset_from_cfg
 
     dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
-    runner.run_setup(n_train_examples=len(dataset))
-    return runner.run(dataset)
+    try:
+        runner.run_setup(n_train_examples=len(dataset))
+        return runner.run(dataset)
+    except (RuntimeError, MemoryError) as error:
+        from fluxvla_core.train.memory import explain
+
+        known = explain(error)
+        if known is None:
+            raise
+        raise known from error
 
 
 def _leave_records(plan: Plan) -> None:
@@ -224,16 +257,11 @@ def _terminable() -> Iterator[None]:
     def handle(number: int, frame: Any) -> None:
         raise _Terminated
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGTERM, handle)
     try:
-        yield
+        with handling(handle, signal.SIGTERM):
+            yield
     except _Terminated:
         raise RunFailed("stopped by SIGTERM") from None
-    finally:
-        signal.signal(signal.SIGTERM, previous)
 
 
 @contextmanager

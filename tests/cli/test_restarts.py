@@ -1,0 +1,163 @@
+"""``--max-restarts``: a job whose process dies goes on by itself, and ends as if none had."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fluxvla_core.cli import ranks
+
+from .conftest import Fluxvla, Write
+
+pytest.importorskip("torch")
+
+PLUGIN = '''\
+import os, signal, time
+from pathlib import Path
+from fluxvla_core import COLLATORS, DATASETS
+from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.testing import training
+
+
+@DATASETS.register_module()
+class Tiny(training.TinyDataset):
+    def __init__(self, length=37):
+        super().__init__(length)
+
+
+@COLLATORS.register_module()
+class Ending(DictCollator):
+    """Ends rank 1 on the way to its ``batch``-th batch, in the first ``lives`` attempts.
+
+    It waits for a checkpoint, which may still be on its way.
+    """
+
+    def __init__(self, batch=5, how="killed", lives=1):
+        super().__init__(training.KEYS)
+        self.left, self.how, self.lives = batch, how, lives
+
+    def __call__(self, samples):
+        self.left -= 1
+        attempt = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+        if self.left == 0 and attempt < self.lives and os.environ.get("RANK") == "1":
+            while not list(Path().glob("*/checkpoints/step-*/manifest.json")):
+                time.sleep(0.01)
+            if self.how == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise ValueError("a bad sample")
+        return super().__call__(samples)
+'''
+CONFIG = """\
+model = dict(type="TinyVLA")
+train_dataloader = dict(per_device_batch_size=2, dataset=dict(type="Tiny"))
+runner = dict(type="DDPTrainRunner", max_steps=9, save_iter_interval=3, max_keep_ckpts=0,
+              learning_rate=1e-2, collator=dict(type="Ending", how="killed", lives=1))
+"""
+
+
+@pytest.fixture
+def tiny(write: Write) -> None:
+    write("tiny.py", PLUGIN)
+    write("tiny_config.py", CONFIG)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The work dir of a run in which nothing ends before its time."""
+    place = tmp_path_factory.mktemp("whole")
+    (place / "tiny.py").write_text(PLUGIN)
+    (place / "tiny_config.py").write_text(CONFIG)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        code, _, err = start("work", "--nproc", "2", "--set", "runner.collator.lives=0")
+    assert (code, err) == (0, "")
+    return place / "work"
+
+
+def start(work_dir: str, *words: str, module: tuple[str, ...] = ()) -> tuple[int, str, str]:
+    command = [sys.executable, "-m", *(module or ("fluxvla_core",)), "run"]
+    command += ["--config", "tiny_config.py", "--plugin", "tiny.py", "--work-dir", work_dir]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    ended = subprocess.run(
+        [*command, *words], capture_output=True, text=True, timeout=300, env=environment
+    )
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+def differing(a: Path, b: Path) -> list[str]:
+    from fluxvla_core.testing.training import differences
+
+    # The two runs' configs differ in how often the collator ends them.
+    found = differences(a, b)
+    return [name for name in found if not name.endswith("config.resolved.json")]
+
+
+def test_a_killed_rank_costs_nothing_but_time(tiny: None, whole: Path) -> None:
+    code, out, err = start("cut", "--nproc", "2", "--max-restarts", "1")
+    assert (code, err) == (0, "")
+    assert "warning: restart 1: a process ended without a word" in out
+    assert "resuming from cut/checkpoints/step-000000003 (step 3)" in out
+    assert differing(whole, Path("cut")) == []
+
+
+def test_an_error_is_told_at_the_restart_and_again_when_there_is_none_left(tiny: None) -> None:
+    words = ("--set", "runner.collator.how='raises'", "--set", "runner.collator.lives=2")
+    code, out, err = start("work", "--nproc", "2", "--max-restarts", "1", *words)
+    assert code == 1
+    assert "warning: restart 1: rank 1 failed:\nTraceback" in out
+    assert "ValueError: a bad sample" in out
+    assert err.startswith("rank 1 failed:\nTraceback")
+    assert err.rstrip().endswith("ValueError: a bad sample")
+
+
+def test_torchrun_starts_ranks_and_restarts_them_too(tiny: None, whole: Path) -> None:
+    module = ("torch.distributed.run", "--nproc-per-node", "2", "--standalone")
+    module += ("--max-restarts", "1", "-m", "fluxvla_core")
+    code, out, err = start("cut", module=module)
+    assert code == 0, err
+    assert out.count("resuming from cut/checkpoints/step-000000003 (step 3)") == 1
+    assert differing(whole, Path("cut")) == []
+
+
+# -- in this process -------------------------------------------------------------------------
+
+
+def test_what_a_restart_resumes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ranks.resume(None, tmp_path) is None
+    assert ranks.resume("there", tmp_path) == "there"
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert ranks.resume(None, tmp_path) == "auto"
+    assert ranks.resume("there", tmp_path) == "there"
+    saved = tmp_path / "checkpoints" / "step-000000003"
+    saved.mkdir(parents=True)
+    (saved / "manifest.json").write_text("{}")
+    assert ranks.resume("there", tmp_path) == "auto"
+
+
+def test_why_there_was_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ranks.restarted() == []
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    monkeypatch.setenv("RANK", "1")
+    ranks.record("a.mp4: bad data\n", 2, expected=True)
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert ranks.restarted() == ["restart 1: rank 1 failed:\na.mp4: bad data"]
+    monkeypatch.setenv("RANK", "0")
+    ranks.record("rank 0 of 2 lost another rank during step 3", 1, expected=True)
+    assert list(ranks.failures(tmp_path)) == [0]
+    assert list(ranks.failures(tmp_path, 0)) == [1]
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "2")
+    assert ranks.restarted() == ["restart 2: a process ended without a word"]
+    monkeypatch.delenv(ranks.ERROR_DIR)
+    assert ranks.restarted() == ["restart 2: a process ended without a word"]
+
+
+def test_only_a_training_restarts(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "eval", "--max-restarts", "2")
+    assert ended.code == 2
+    assert "--max-restarts is for training, and section 'eval' does not train" in ended.err
+    ended = run("--config", "c.py", "--section", "runner", "--max-restarts", "-1")
+    assert "argument --max-restarts: -1 is less than 0" in ended.err

@@ -1,0 +1,182 @@
+"""One side of ``evaluation.py``: control steps a second in gym-aloha's transfer task.
+
+    python _evaluation_side.py engine|bare|lerobot PROCESSES STEPS EPISODES RENDER
+
+Prints JSON. ``lerobot`` runs in an environment of its own and imports nothing of the rest. Every
+side has one thread a process, looks at the top camera in 480 x 640 at each step, and commands the
+pose that it sees: a policy that costs nothing. Episodes are cut off after STEPS steps; what is
+built and loaded before the first of them is left out.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+TASK = "transfer_cube"
+HEIGHT, WIDTH = 480, 640
+
+
+def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
+    """The evaluation engine: workers, ledger, records."""
+    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
+    from fluxvla_core.evaluate.ledger import EpisodeKey
+    from fluxvla_core.evaluate.policies import Source
+    from fluxvla_core.evaluate.pool import WorkerPool
+    from fluxvla_core.evaluate.rollout import Course
+    from fluxvla_core.evaluate.worker import Settings
+    from fluxvla_core.plugins.files import load_plugin_files
+
+    load_plugin_files([__file__])
+    settings = Settings(
+        environment={"type": "AlohaSimEnvironment", "render": render},
+        tasks=(TASK,),
+        sources={"policy": Source({"type": "Still"})},
+        course=Course(max_steps=steps),
+    )
+    keys = [EpisodeKey("policy", TASK, seed) for seed in range(episodes)]
+    warm = [EpisodeKey("policy", TASK, 10**6 + n) for n in range(processes)]
+    with WorkerPool(_Worker(settings), processes) as pool, tempfile.TemporaryDirectory() as folder:
+        for _ in pool.run(warm):
+            continue
+        ledger = open_ledger(Path(folder) / "episodes.jsonl", {}, SilentReporter())
+        began = time.perf_counter()
+        records = run_in_pool(pool, keys, ledger, SilentReporter())
+        seconds = time.perf_counter() - began
+    assert all(record["steps"] == steps for record in records)
+    memory = max(record["timing"]["memory_mb"] for record in records)
+    return {"steps_per_s": steps * episodes / seconds, "worker_mb": memory}
+
+
+class _Worker:
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    def __call__(self) -> Any:
+        from fluxvla_core.evaluate.worker import EpisodeWorker
+
+        return EpisodeWorker(self.settings)
+
+
+def bare(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
+    """The same environment in a loop, in as many processes, with nothing around it."""
+    context = multiprocessing.get_context("spawn")
+    ready, go = context.Barrier(processes + 1), context.Barrier(processes + 1)
+    share = episodes // processes
+    workers = [
+        context.Process(target=_loop, args=(n, share, steps, render, ready, go))
+        for n in range(processes)
+    ]
+    for worker in workers:
+        worker.start()
+    ready.wait()
+    began = time.perf_counter()
+    go.wait()
+    for worker in workers:
+        worker.join()
+    seconds = time.perf_counter() - began
+    return {"steps_per_s": steps * share * processes / seconds}
+
+
+def _loop(first: int, episodes: int, steps: int, render: str, ready: Any, go: Any) -> None:
+    from fluxvla_sim.environment import AlohaSimEnvironment
+
+    from fluxvla_core.spec.embodiment import Camera
+
+    environment = AlohaSimEnvironment(render=render)
+    cameras = [Camera("top", HEIGHT, WIDTH)]
+    environment.reset(10**6, TASK)
+    environment.observe(cameras)
+    ready.wait()
+    go.wait()
+    for seed in range(first * episodes, (first + 1) * episodes):
+        environment.reset(seed, TASK)
+        for _ in range(steps):
+            environment.observe(cameras)
+            environment.step(environment.state)
+    os._exit(0)  # what the simulator tidies up is not what is measured
+
+
+def lerobot(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
+    """``lerobot-eval``'s own rollout over its asynchronous vector environment."""
+    import torch
+
+    operators = torch.library.Library("torchvision", "DEF")
+    operators.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    operators.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    from lerobot.envs.configs import AlohaEnv
+    from lerobot.envs.factory import make_env
+    from lerobot.scripts import lerobot_eval
+
+    # 0.4.4 looks for each environment's task in ``env.envs``, which asynchronous ones do not have:
+    # its command can only use them one after the other. With these two it gets its processes.
+    lerobot_eval.check_env_attributes_and_types = lambda env: None
+    lerobot_eval.add_envs_task = lambda env, observation: observation
+
+    class Still(torch.nn.Module):
+        def reset(self) -> None:
+            return
+
+        def select_action(self, observation: Any) -> Any:
+            return observation["observation.state"]
+
+    def same(values: Any) -> Any:
+        return values
+
+    torch.set_num_threads(1)
+    config = AlohaEnv(task="AlohaTransferCube-v0", episode_length=steps)
+    env = make_env(config, n_envs=processes, use_async_envs=True)["aloha"][0]
+    env.reset(seed=list(range(processes)))
+    rounds = max(1, episodes // processes)
+    began = time.perf_counter()
+    for number in range(rounds):
+        seeds = [number * processes + n for n in range(processes)]
+        found = lerobot_eval.rollout(env, Still(), same, same, same, same, seeds=seeds)
+        assert found["done"].shape == (processes, steps)
+    seconds = time.perf_counter() - began
+    children = [child.pid for child in multiprocessing.active_children()]
+    memory = max(_peak_mb(pid) for pid in children if pid is not None)
+    env.close()
+    return {"steps_per_s": steps * rounds * processes / seconds, "worker_mb": memory}
+
+
+def _peak_mb(pid: int) -> float:
+    lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
+    return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith("VmHWM"))
+
+
+SIDES = {"engine": engine, "bare": bare, "lerobot": lerobot}
+
+
+def main() -> int:
+    side, processes, steps, episodes, render = sys.argv[1:]
+    print(json.dumps(SIDES[side](int(processes), int(steps), int(episodes), render)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
+
+if __name__.startswith("fluxvla_plugin_"):
+    # This file is also the plugin that brings the policy which costs nothing.
+    from fluxvla_core import POLICIES
+
+    @POLICIES.register_module()
+    class Still:
+        """Wants to be where it is."""
+
+        cameras = ("top",)
+        action_rate_hz = 50.0
+
+        def reset(self, seed: int) -> None:
+            return
+
+        def predict_action(self, observation: Any) -> Any:
+            return observation["qpos"][None]

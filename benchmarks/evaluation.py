@@ -1,0 +1,171 @@
+"""How fast policies are evaluated, beside LeRobot's evaluation and beside bare stepping.
+
+    python benchmarks/evaluation.py [--rounds 3] [--checkpoint DIR]
+
+gym-aloha's transfer task with a policy that costs nothing, in as many processes as there are cores
+(at most 4), the top camera looked at in 480 x 640 at every step: the engine with stock pictures
+(shadows, multisampling) and with its own cheap ones, ``lerobot-eval``'s rollout over its
+asynchronous vector environments, and the engine's environment in a bare loop in as many processes.
+Renderer (EGL), MuJoCo and resolution are the same on all sides; LeRobot's environment always draws
+three cameras, and is given the processes that its own command cannot use. The sides take turns;
+figures are medians over the rounds. An episode is 300 steps.
+
+With ``--checkpoint`` also: a model in each worker against one model for all of them, in batches.
+
+Goals: 1.5 times LeRobot's episodes a minute with stock pictures, 0.9 of bare stepping. Writes
+``benchmarks/results/evaluation.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tools import lerobot_env, rendering, shell  # noqa: E402
+
+SIDE = Path(__file__).with_name("_evaluation_side.py")
+RESULTS = Path(__file__).with_name("results") / "evaluation.json"
+EPISODE = 300
+NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0", "pyserial", "diffusers")
+"""What LeRobot's evaluation imports, beside what its dataset code does."""
+GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
+# side -> words of _evaluation_side.py: side, steps, episodes for each process, pictures
+SIDES = {
+    "lerobot": ("lerobot", 20, 1, "reference"),
+    "engine, stock pictures": ("engine", 20, 2, "reference"),
+    "engine": ("engine", 100, 2, "cheap"),
+    "bare": ("bare", 100, 2, "cheap"),
+}
+
+
+def measure(python: Path | str, words: Mapping[str, Any], variables: Mapping[str, str]) -> Any:
+    """One side's figures."""
+    threads = {"OMP_NUM_THREADS": "1", **rendering.VARIABLES}
+    command = [python, SIDE, *map(str, words.values())]
+    output = shell.run(command, env={**variables, **threads}, quiet=True, echo=False)
+    return json.loads(output.strip().splitlines()[-1])
+
+
+def lerobot_python(given: str | None) -> tuple[Path | str, dict[str, str]]:
+    """LeRobot's Python with the simulator in it, and its variables.
+
+    Raises:
+        StepFailed, OSError: it cannot be installed.
+    """
+    if given is not None:
+        return given, {**os.environ, "HF_HUB_OFFLINE": "1"}
+    env = lerobot_env.prepare(
+        lambda text: print(text, file=sys.stderr), ROOT / ".nox" / "lerobot-eval"
+    )
+    pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
+    env.run(*pip, *NEEDS, quiet=True, echo=False)
+    return env.python, {**os.environ, **env.variables()}
+
+
+def placements(checkpoint: str, workers: int, episodes: int) -> dict[str, float]:
+    """Control steps a second of a checkpoint's policy: in each worker, or one for all of them."""
+    from fluxvla_core.build import RunContext
+    from fluxvla_core.evaluate.runner import EvalRunner
+
+    found = {}
+    for serve in (False, True):
+        for batch in (1, 2, 4) if serve else (1,):
+            with tempfile.TemporaryDirectory() as folder:
+                runner = EvalRunner(
+                    context=RunContext(work_dir=Path(folder), section="eval"),
+                    environment={"type": "AlohaSimEnvironment"},
+                    ckpt_path=checkpoint,
+                    tasks=["lift_hold"],
+                    episodes=episodes,
+                    replan_every=5,
+                    workers=workers,
+                    batch_size=batch,
+                    serve_policy=serve,
+                    record_videos=0,
+                )
+                runner.run_setup()
+                name = f"one model, batches of {batch}" if serve else "a model in each worker"
+                found[name] = round(runner.run()["timing"]["steps_per_s"], 1)
+    return found
+
+
+def main() -> int:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--processes", type=int, default=min(4, os.cpu_count() or 1))
+    parser.add_argument("--lerobot", metavar="PYTHON", help="instead of installing one")
+    parser.add_argument("--checkpoint", metavar="DIR")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    args = parser.parse_args()
+    pythons: dict[str, tuple[Path | str, dict[str, str]]] = {}
+    try:
+        pythons["lerobot"] = lerobot_python(args.lerobot)
+    except (shell.StepFailed, OSError) as error:
+        print(f"without LeRobot, which cannot be installed: {error}", file=sys.stderr)
+    runs: dict[str, list[Any]] = {}
+    for _ in range(args.rounds):
+        for name, (side, steps, each, render) in SIDES.items():
+            if side == "lerobot" and side not in pythons:
+                continue
+            python, variables = pythons.get(side, (sys.executable, dict(os.environ)))
+            words = {
+                "side": side,
+                "processes": args.processes,
+                "steps": steps,
+                "episodes": each * args.processes,
+                "render": render,
+            }
+            runs.setdefault(name, []).append(measure(python, words, variables))
+            print(f"{name}: {runs[name][-1]}", file=sys.stderr)
+    pace = {n: statistics.median(r["steps_per_s"] for r in found) for n, found in runs.items()}
+    figures: dict[str, Any] = {
+        "share_of_bare": round(
+            statistics.median(
+                e["steps_per_s"] / b["steps_per_s"]
+                for e, b in zip(runs["engine"], runs["bare"], strict=True)
+            ),
+            3,
+        )
+    }
+    if "lerobot" in runs:
+        for name in ("engine, stock pictures", "engine"):
+            key = "times_lerobot" if name != "engine" else "times_lerobot_cheap_pictures"
+            figures[key] = round(pace[name] / pace["lerobot"], 2)
+    summary = {
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        "processes": args.processes,
+        "rounds": args.rounds,
+        "steps_per_s": {name: round(value, 2) for name, value in pace.items()},
+        "episodes_per_min": {n: round(60 * value / EPISODE, 2) for n, value in pace.items()},
+        "worker_mb": {
+            name: max(r["worker_mb"] for r in found)
+            for name, found in runs.items()
+            if "worker_mb" in found[0]
+        },
+        **figures,
+        "goals": GOALS,
+        "goals_met": {n: figures[n] >= goal for n, goal in GOALS.items() if n in figures},
+    }
+    if args.checkpoint:
+        summary["policy_steps_per_s"] = placements(args.checkpoint, args.processes, 8)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(summary, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,8 +1,10 @@
 r"""LIBERO-Object, three tasks, one policy: the instruction alone says which object is meant.
 
     pip install 'fluxvla-libero[libero]'
-    fluxvla collect-libero --out work_dirs/libero_object/dataset --tasks 0 2 4 --mixed \
-        --episodes 144 --cameras agentview --height 128 --width 128 --noise 0.3 --render coarse
+    fluxvla data collect --env LiberoEnvironment --out work_dirs/libero_object/dataset \
+        --episodes 144 --cameras agentview --height 128 --width 128 --set 'env.tasks=[0, 2, 4]' \
+        --set env.mixed=true --set env.begin='"random"' --set env.render='"coarse"' \
+        --set policy.noise=0.3
     fluxvla run --config configs/libero_object.py --section runner
     fluxvla run --config configs/libero_object.py --section eval
     fluxvla run --config configs/libero_object.py --section inference --task 4

@@ -10,13 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fluxvla_libero import require
-from fluxvla_libero.collect import SPARE_STRIDE, Collection
-from fluxvla_libero.eval_runner import LiberoEvalRunner, count_behaviours, instruction_test
-from fluxvla_libero.eval_worker import wrong_task
-from fluxvla_libero.expert import plan
+from fluxvla_libero.environment import LiberoEnvironment
+from fluxvla_libero.eval_runner import LiberoEvalRunner
+from fluxvla_libero.expert import LiberoExpert, plan
 from fluxvla_libero.inference_runner import LiberoInferenceRunner
-from fluxvla_libero.rollout import _checked
-from fluxvla_libero.suites import SUITES, SuiteTask, max_steps
+from fluxvla_libero.suites import NUM_STEPS_WAIT, SUITES, max_steps
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.config.load import load_config
@@ -39,7 +37,17 @@ ROOT = Path(__file__).resolve().parents[3]
 )
 def test_each_suite_has_the_step_limit_of_the_standard_protocol(suite, steps):
     assert max_steps(suite) == steps
-    assert LiberoEvalRunner(task_suite_name=suite)._settings.max_steps == steps
+
+
+def test_the_protocol_waits_ten_steps_and_shows_two_cameras_of_224_pixels():
+    assert NUM_STEPS_WAIT == 10
+    table = LiberoEvalRunner()._environment
+    assert table["num_steps_wait"] == 10
+    cameras = LiberoEnvironment()._cameras
+    assert [(c.name, c.height, c.width) for c in cameras] == [
+        ("agentview", 224, 224),
+        ("robot0_eye_in_hand", 224, 224),
+    ]
 
 
 def test_an_unknown_suite_is_answered_with_those_there_are():
@@ -52,19 +60,18 @@ def test_an_unknown_suite_is_answered_with_those_there_are():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"task_suite_name": "libero"}, "task_suite_name: there is no suite 'libero'"),
-        ({"policy": "random"}, "policy: 'random' is none of checkpoint, expert, untrained"),
-        ({"render": "nice"}, "render: 'nice' is none of cheap, coarse, reference"),
-        ({"num_trials_per_task": 51}, "num_trials_per_task: must be 1 to 50, got 51"),
-        ({"num_trials_per_task": 0}, "num_trials_per_task: must be 1 to 50, got 0"),
-        ({"eval_chunk_size": 0}, "eval_chunk_size: must be at least 1, got 0"),
-        ({"num_steps_wait": -1}, "num_steps_wait: must be at least 0, got -1"),
-        ({"max_steps": -5}, "max_steps: must be at least 1, got -5"),
-        ({"workers": 0}, "workers: must be at least 1, got 0"),
-        ({"seed": -1}, "seed: must be at least 0, got -1"),
-        ({"resize_size": 8}, "resize_size: must be at least 16, got 8"),
-        ({"record_videos": -1}, "record_videos: must be at least 0, got -1"),
-        ({"video_fps": 7}, "video_fps: must divide 20, got 7"),
+        ({"task_suite_name": "libero"}, "task_suite_name is wrong: there is no suite 'libero'"),
+        ({"render": "nice"}, "render 'nice' is none of cheap, coarse, reference"),
+        ({"num_trials_per_task": 51}, "num_trials_per_task must be 1 to 50, got 51"),
+        ({"num_trials_per_task": 0}, "num_trials_per_task must be 1 to 50, got 0"),
+        ({"eval_chunk_size": 0}, "eval_chunk_size must be at least 1, got 0"),
+        ({"num_steps_wait": -1}, "num_steps_wait must be at least 0, got -1"),
+        ({"max_steps": -5}, "max_steps must be at least 1, got -5"),
+        ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"resize_size": 8}, "resize_size must be at least 16, got 8"),
+        ({"record_videos": -1}, "record_videos must be at least 0, got -1"),
+        ({"video_fps": 21}, "video_fps must be at most 20, got 21"),
     ],
 )
 def test_impossible_values_are_refused_where_they_are_set(tmp_path, arguments, message):
@@ -80,7 +87,6 @@ def test_impossible_values_are_refused_where_they_are_set(tmp_path, arguments, m
     ("arguments", "message"),
     [
         ({"task_suite_name": "libero"}, "there is no suite 'libero'"),
-        ({"policy": "random"}, "policy 'random' is none of"),
         ({"render": "nice"}, "render 'nice' is none of cheap, coarse, reference"),
         ({"init_state": 50}, "init_state must be 0 to 49, got 50"),
         ({"record_fps": 3}, "record_fps must divide 20, got 3"),
@@ -111,22 +117,14 @@ def test_the_specifications_parameters_are_taken(tmp_path):
     }
     runner = build_runner_from_cfg(table, RunContext(work_dir=tmp_path, nproc=3))
     assert runner.workers == 3
-    assert runner._settings.loading.precision == "bf16"
-    assert runner._settings.size == (224, 224)
-    assert runner._what()["settings"]["model_family"] == "pi0"
-
-
-def test_what_the_outcomes_follow_from_does_not_hold_what_they_do_not(tmp_path):
-    def what(**arguments):
-        return LiberoEvalRunner(context=RunContext(work_dir=tmp_path), **arguments)._what()
-
-    assert what(workers=1, record_videos=0, num_trials_per_task=3) == what(workers=2)
-    for other in ({"render": "reference"}, {"eval_chunk_size": 3}, {"seed": 8}, {"max_steps": 9}):
-        assert what(**other) != what()
+    assert runner._source.precision == "bf16"
+    assert runner._size == (224, 224)
+    assert runner._course.policy_seed == 7
+    assert runner.model_family == "pi0"
 
 
 def test_running_before_setting_up_is_refused(tmp_path):
-    runner = LiberoEvalRunner(context=RunContext(work_dir=tmp_path), policy="expert")
+    runner = LiberoInferenceRunner(context=RunContext(work_dir=tmp_path), policy="expert")
     with pytest.raises(UsageError, match=r"call run_setup\(\) before run\(\)"):
         runner.run()
 
@@ -151,10 +149,28 @@ def test_a_libero_that_cannot_be_imported_is_named(monkeypatch):
         require.require_libero()
 
 
+def test_a_libero_that_was_never_set_up_is_not_asked_in_the_dark(monkeypatch, tmp_path):
+    """The classic LIBERO asks where its files are while it is imported."""
+    package = tmp_path / "libero" / "libero"
+    package.mkdir(parents=True)
+    (tmp_path / "libero" / "__init__.py").touch()
+    (package / "__init__.py").write_text("input('Do you want to specify a custom path?')")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "libero"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(require, "use_egl", lambda: None)
+    stdin = sys.stdin
+    with pytest.raises(RunFailed, match="LIBERO was never set up here") as caught:
+        require.require_libero()
+    assert "python -c 'import libero.libero', and answer" in str(caught.value)
+    assert sys.stdin is stdin
+    monkeypatch.delitem(sys.modules, "libero")
+
+
 def test_importing_runners_imports_no_simulator():
     code = (
         "import sys, fluxvla_libero.eval_runner, fluxvla_libero.inference_runner\n"
-        "import fluxvla_libero.collect_command\n"
+        "import fluxvla_libero.environment, fluxvla_libero.expert\n"
         "print([m for m in ('torch', 'mujoco', 'libero', 'robosuite') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -166,71 +182,6 @@ def test_the_shipped_config_says_only_what_there_is():
 
     config = load_config(ROOT / "configs" / "libero_object.py")
     assert check_config(config).problems == ()
-
-
-def task(index, suite="libero_object"):
-    return SuiteTask(suite, index, f"task_{index}", f"do {index}", Path(f"{index}.bddl"))
-
-
-def test_the_wrong_instruction_is_the_next_task_that_could_be_done():
-    judged = tuple(task(i) for i in range(5))
-    names = ("task_0", "task_2", "task_4")
-    asked = [wrong_task(task(i), names, judged).index for i in (0, 2, 4)]
-    assert asked == [2, 4, 0]
-    assert wrong_task(task(0), ("task_0",), judged).index == 1, "else any of the suite"
-
-
-def test_a_scene_with_one_task_has_no_wrong_instruction():
-    same_words = SuiteTask("libero_object", 3, "other_name", "do 0", Path("x.bddl"))
-    with pytest.raises(ConfigError, match="no other task of libero_object can be done"):
-        wrong_task(task(0), ("task_0",), (task(0), same_words))
-
-
-def record(group, seed, success, said="do it", **behaviours):
-    return {
-        "group": group,
-        "task": "a",
-        "seed": seed,
-        "status": "done",
-        "success": success,
-        "instruction": said,
-        "behaviours": behaviours,
-    }
-
-
-def test_the_instruction_test_pairs_right_and_wrong_words():
-    records = [record("policy", s, True) for s in range(6)]
-    assert instruction_test(records) is None
-    records += [record("swapped", s, s == 0) for s in range(6)]
-    found = instruction_test(records)
-    assert (found["pairs"], found["only_a"], found["only_b"]) == (6, 5, 0)
-    assert found["p_a_better"] == pytest.approx(1 / 32)
-
-
-def test_behaviours_are_counted_by_what_was_said():
-    records = [
-        record("swapped", 0, False, "x", a=False, b=True),
-        record("swapped", 1, False, "x", a=False, b=False),
-        record("swapped", 2, True, "y", a=True, b=True),
-        {"status": "error"},
-    ]
-    counted = count_behaviours(records)["swapped"]
-    assert counted["x"] == {"episodes": 2, "neither": 1, "b": 1}
-    assert counted["y"] == {"episodes": 1, "neither": 0, "a": 1, "b": 1}
-
-
-@pytest.mark.parametrize(
-    ("chunk", "message"),
-    [
-        (np.zeros((3, 6)), r"shape \(3, 6\); \(T, 7\) is needed"),
-        (np.zeros(7), r"shape \(7,\)"),
-        (np.zeros((0, 7)), r"shape \(0, 7\)"),
-        (np.full((2, 7), np.nan), "not finite"),
-    ],
-)
-def test_impossible_chunks_end_the_episode(chunk, message):
-    with pytest.raises(RunFailed, match=message):
-        _checked(chunk)
 
 
 def test_the_experts_way_leads_from_above_the_object_into_the_container():
@@ -248,15 +199,24 @@ def test_the_experts_way_leads_from_above_the_object_into_the_container():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"episodes": 0}, "episodes must be at least 1, got 0"),
-        ({"camera_names": ("top",)}, "cameras must be of agentview, robot0_eye_in_hand"),
-        ({"camera_names": ()}, "cameras must be of"),
+        ({"suite": "libero"}, "there is no suite 'libero'"),
+        ({"cameras": ("top",)}, "no camera 'top'; they have agentview, agentview_image, image"),
         ({"height": 8}, "pictures of 8x224 are too small"),
-        ({"noise": 2.0}, "noise must be from 0 to 1, got 2"),
         ({"render": "nice"}, "render 'nice' is none of cheap, coarse, reference"),
-        ({"seed": SPARE_STRIDE}, "seed must be from 0 to"),
+        ({"begin": "anywhere"}, "begin 'anywhere' is none of fixed, random"),
+        ({"num_steps_wait": -1}, "num_steps_wait must be at least 0, got -1"),
     ],
 )
-def test_impossible_collections_are_refused(arguments, message):
+def test_impossible_environments_are_refused(arguments, message):
     with pytest.raises(ConfigError, match=message):
-        Collection(**{"episodes": 3, **arguments})
+        LiberoEnvironment(**arguments)
+
+
+def test_an_expert_acts_in_libero_only_and_with_noise_up_to_one():
+    with pytest.raises(ConfigError, match="noise must be from 0 to 1, got 2"):
+        LiberoExpert(noise=2)
+    expert = LiberoExpert()
+    with pytest.raises(ConfigError, match="in LiberoEnvironment only, not in object"):
+        expert.enter(object())
+    with pytest.raises(ConfigError, match="must be told where it acts"):
+        expert.predict_action({})

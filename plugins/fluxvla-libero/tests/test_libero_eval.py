@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-from dataclasses import replace
+import urllib.request
 
 import av
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
-from fluxvla_libero.collect import Collection, pairs
-from fluxvla_libero.collect_command import CollectLiberoCommand
-from fluxvla_libero.demonstrations import demonstrate
 from fluxvla_libero.embodiment import libero_spec
+from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import LiberoEvalRunner
-from fluxvla_libero.expert import Expert, ExpertPolicy
+from fluxvla_libero.expert import Expert, LiberoExpert
 from fluxvla_libero.inference_runner import LiberoInferenceRunner
-from fluxvla_libero.rollout import Episode, rollout
-from fluxvla_libero.suites import init_states, suite_tasks
+from fluxvla_libero.suites import suite_tasks
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.errors import ConfigError, SpecMismatch, UsageError
+from fluxvla_core.evaluate.demonstrating import demonstrate
+from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
+from fluxvla_core.spec.embodiment import Camera
 
 SALAD = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
+KETCHUP = "pick_up_the_ketchup_and_place_it_in_the_basket"
 
 
-def runner(work_dir, listener, **arguments):
-    context = RunContext(work_dir=work_dir, section="eval", reporter=listener)
-    settings = {"policy": "expert", "tasks": [2], "num_trials_per_task": 2, **arguments}
-    made = LiberoEvalRunner(context=context, **settings)
-    made.run_setup()
-    return made
-
-
-def outcomes(work_dir):
-    lines = (work_dir / "eval" / "episodes.jsonl").read_text().splitlines()[1:]
-    records = [json.loads(line) for line in lines]
-    for record in records:
-        del record["timing"]
-    return sorted(records, key=lambda r: (r["group"], r["task"], r["seed"]))
+@pytest.fixture(scope="module")
+def environment(scene):
+    """LIBERO-Object, in the scene of the salad dressing, which is there already."""
+    made = LiberoEnvironment(render="coarse")
+    made._scene = scene
+    yield made
+    made._scene = None
 
 
 class Replay:
@@ -60,120 +51,208 @@ class Replay:
         return self.actions
 
 
-def test_recorded_actions_replayed_give_the_recorded_success(scene):
-    task, state = scene.task, init_states("libero_object", 2)[0]
+def act(environment, policy, seed=0, course=None, told=None, watch=None):
+    task = find_task(environment.spec.tasks, SALAD)
+    told = None if told is None else find_task(environment.spec.tasks, told)
+    return run_episode(environment, policy, task, seed, course or Course(), told, watch)
+
+
+def test_recorded_actions_replayed_give_the_recorded_success(environment):
     actions = []
 
-    def watch(action):
-        if action is not None:
-            actions.append(action)
+    def watch(world, steps):
+        if steps:
+            actions.append(world.action)
 
-    episode = Episode(state, 7, task, (), 1000, 280)
-    recorded = rollout(scene, ExpertPolicy(), episode, watch)
+    recorded = act(environment, LiberoExpert(), watch=watch)
+    assert recorded["success"]
+    assert recorded["steps"] == len(actions) < 280
     replay = Replay(np.array(actions))
-    replayed = rollout(scene, replay, episode)
-    assert recorded.success
-    assert recorded.behaviours == {task.name: True}
-    assert (replayed.success, replayed.steps) == (True, recorded.steps)
-    assert replayed.state_hash == recorded.state_hash
-    assert replayed.calls == 1
-    assert replay.seed == 7
-    assert replay.observation["task_description"] == task.language
+    replayed = act(environment, replay, course=Course(policy_seed=7))
+    assert (replayed["success"], replayed["steps"]) == (True, recorded["steps"])
+    assert replayed["state_hash"] == recorded["state_hash"]
+    assert (replayed["calls"], replay.seed) == (1, 7)
+    assert replay.observation["task_description"].startswith("pick up the salad dressing")
     # The other way round the gripper is never closed on anything.
     flipped = np.array(actions) * [1, 1, 1, 1, 1, 1, -1]
-    episode = replace(episode, max_steps=len(actions))
-    assert not rollout(scene, Replay(flipped), episode).success
+    assert not act(environment, Replay(flipped), course=Course(max_steps=len(actions)))["success"]
 
 
-def test_an_episode_ends_at_the_step_limit_and_counts_what_libero_cuts(scene):
-    episode = Episode(init_states("libero_object", 2)[0], 7, scene.task, (), 3, 8)
-    found = rollout(scene, Replay(np.full((5, 7), 1.5)), episode)
-    assert (found.success, found.steps, found.calls, found.clamped) == (False, 8, 3, 8)
+def test_an_episode_ends_at_the_step_limit_and_counts_what_libero_cuts(environment):
+    found = act(environment, Replay(np.full((5, 7), 1.5)), course=Course((), 3, 8))
+    assert not found["success"]
+    assert (found["steps"], found["calls"], found["clamped"]) == (8, 3, 8)
+
+
+def test_each_trial_begins_in_its_fixed_state_and_ten_steps_later(environment):
+    environment.reset(0, SALAD)
+    first, settled = environment.state_hash(), environment.scene.data.time
+    environment.reset(1, SALAD)
+    assert environment.state_hash() != first
+    environment.reset(0, SALAD)
+    assert environment.state_hash() == first
+    assert environment.scene.steps == 0, "waiting does not count"
+    bare = LiberoEnvironment(num_steps_wait=0)
+    bare._scene = environment.scene
+    bare.reset(0, SALAD)
+    assert settled - environment.scene.data.time == pytest.approx(0.5)
+    with pytest.raises(ConfigError, match="50 fixed states for each task; there is no episode 50"):
+        environment.reset(50, SALAD)
+    with pytest.raises(ConfigError, match="'juggle' is none of this environment's tasks"):
+        environment.reset(0, "juggle")
+    anywhere = LiberoEnvironment(begin="random")
+    anywhere._scene = environment.scene
+    anywhere.reset(10_000, SALAD)
+    assert environment.state_hash() != first
+
+
+def test_what_is_told_is_done_and_counted(environment):
+    """Told to take the ketchup, the expert does that, and not the scene's own task."""
+    assert KETCHUP in environment.others(SALAD)
+    assert SALAD not in environment.others(SALAD)
+    found = act(environment, LiberoExpert(), told=KETCHUP)
+    assert (found["success"], found["behaviours"][KETCHUP]) == (False, True)
+    assert found["instruction"] == "pick up the ketchup and place it in the basket"
+    environment.reset(0, SALAD)
+    with pytest.raises(ConfigError, match=r"'pick_up_the_butter.* cannot be done in the scene of"):
+        environment.tell("pick_up_the_butter_and_place_it_in_the_basket")
+
+
+def test_pictures_come_by_every_name_and_in_every_size(environment):
+    environment.reset(0, SALAD)
+    cameras = [Camera("image", 32, 48), Camera("wrist_image", 40, 40)]
+    seen = environment.observe(cameras)
+    assert {name: p.shape for name, p in seen["images"].items()} == {
+        "image": (32, 48, 3),
+        "wrist_image": (40, 40, 3),
+    }
+    assert (seen["qpos"].shape, seen["qpos"].dtype) == ((8,), np.float32)
+    with pytest.raises(SpecMismatch, match="no camera 'front'"):
+        environment.observe([Camera("front", 32, 32)])
+
+
+def test_mixed_tasks_are_named_by_what_and_where(libero):
+    one = LiberoEnvironment(tasks=[2, 6])
+    assert [task.name for task in one.spec.tasks] == [
+        t.name for t in suite_tasks("libero_object") if t.index in (2, 6)
+    ]
+    mixed = LiberoEnvironment(tasks=[2, 4, 6], mixed=True)
+    pairs = [(scene.index, task.index) for scene, task in mixed.pairs.values()]
+    assert pairs == [(2, 2), (2, 4), (4, 2), (4, 4), (6, 4), (6, 6)]
+    names = [task.name for task in mixed.spec.tasks]
+    assert names[1] == f"{KETCHUP}-in-scene-2"
+    assert mixed.others(names[1]) == (names[0],)
+    assert mixed.spec.tasks[1].max_steps == 280
 
 
 def test_the_expert_refuses_what_it_cannot_do(scene):
-    goal = suite_tasks("libero_goal")[0]
     with pytest.raises(ConfigError, match="the scripted expert cannot do"):
-        Expert(scene, goal)
-    policy = ExpertPolicy()
-    policy.enter(scene)
-    policy.reset(0)
-    with pytest.raises(ConfigError, match="the expert does not know 'juggle'"):
-        policy.predict_action({"task_description": "juggle"})
+        Expert(scene, suite_tasks("libero_goal")[0])
 
 
-def test_results_are_the_same_for_any_number_of_workers(tmp_path, libero, listener, save):
-    settings = {"policy": "checkpoint", "baseline": True, "max_steps": 6, "eval_chunk_size": 3}
-    for workers in (1, 2):
-        path = save(tmp_path / str(workers))
-        run = runner(
-            tmp_path / str(workers), listener, workers=workers, record_videos=0, **settings
-        )
-        found = run.run()
-        assert found["checkpoint"]["path"] == str(path)
-    assert outcomes(tmp_path / "1") == outcomes(tmp_path / "2")
-    trained, _, untrained, _ = outcomes(tmp_path / "1")
-    assert (trained["calls"], trained["steps"]) == (2, 6)
-    assert trained["state_hash"] != untrained["state_hash"], "the weights matter"
+def test_a_demonstration_follows_from_its_seed_and_teaches_without_the_noise(environment):
+    environment = LiberoEnvironment(tasks=[2, 4], mixed=True, begin="random")
+    task = find_task(environment.spec.tasks, f"{KETCHUP}-in-scene-2")
+    eye = [Camera("agentview", 16, 16)]
+    recorded = []
+    for noise in (0.3, 0.3, 0.0):
+        expert = LiberoExpert(noise)
+        recorded.append(demonstrate(environment, expert, task, 3, eye if noise else ()))
+    (one, done), (two, _), (clean, _) = recorded
+    assert done
+    np.testing.assert_array_equal(one.states, two.states)
+    np.testing.assert_array_equal(one.actions, two.actions)
+    np.testing.assert_array_equal(one.images["agentview"], two.images["agentview"])
+    assert len(one.states) == len(one.images["agentview"]) > 50
+    np.testing.assert_array_equal(one.actions[0], clean.actions[0])
+    assert not np.array_equal(one.states[5], clean.states[5]), "the noise is in what is done"
+    assert set(one.actions[:, 6]) == {-1.0, 1.0}
+    assert np.abs(one.actions).max() <= 1.0
+    assert one.instruction == "pick up the ketchup and place it in the basket"
+    environment.close()
 
 
-def test_the_expert_does_what_it_is_told_and_everything_is_written_down(tmp_path, libero, listener):
+def runner(work_dir, listener, **arguments):
+    context = RunContext(work_dir=work_dir, section="eval", reporter=listener)
+    settings = {"policy": "expert", "tasks": [2], "render": "coarse", **arguments}
+    made = LiberoEvalRunner(context=context, **settings)
+    made.run_setup()
+    return made
+
+
+def test_everything_is_evaluated_and_written_down(tmp_path, libero, listener):
     settings = {"instruction_swap": True, "num_trials_per_task": 1, "workers": 1}
     found = runner(tmp_path, listener, record_videos=1, video_fps=1, **settings).run()
     assert found == json.loads((tmp_path / "eval" / "results.json").read_text())
     assert found["groups"]["policy"]["tasks"][SALAD]["successes"] == 1
-    # Told to take the ketchup, the expert does that, and not the scene's own task.
     assert found["groups"]["swapped"]["all"]["rate"] == 0.0
-    ketchup = suite_tasks("libero_object")[4]
-    row = found["behaviours"]["swapped"][ketchup.language]
-    assert row == {"episodes": 1, "neither": 0, ketchup.name: 1}
+    said = found["behaviours"]["swapped"]["pick up the ketchup and place it in the basket"]
+    assert (said["episodes"], said["neither"], said[KETCHUP]) == (1, 0, 1)
     assert found["instruction_test"]["only_a"] == 1
-    assert found["settings"]["render"] == "cheap"
-    assert found["settings"]["max_steps"] == 280
-    assert any(line.startswith("right instruction against wrong one") for line in listener.lines)
+    stated = found["settings"]
+    assert (stated["render"], stated["num_steps_wait"], stated["begin"]) == ("coarse", 10, "fixed")
+    assert (stated["task_suite_name"], stated["policy_seed"]) == ("libero_object", 7)
     assert not any("went another way" in line for line in listener.lines)
     (video,) = found["videos"]
     with av.open(str(tmp_path / "eval" / video["path"])) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert frames[0].shape == (256, 512, 3)
     assert len(frames) > 5
-    kept = (tmp_path / "eval" / "episodes.jsonl").read_text()
-    again = runner(tmp_path, listener, record_videos=0, **settings).run()
-    assert again["groups"] == found["groups"]
-    assert again["timing"]["episodes"] == 0, "a finished evaluation is not run again"
-    assert (tmp_path / "eval" / "episodes.jsonl").read_text() == kept
 
 
-def test_a_checkpoint_that_does_not_fit_ends_the_evaluation(tmp_path, libero, listener, save):
-    save(tmp_path, rate=10.0)
-    with pytest.raises(SpecMismatch, match="deltas are for steps of 1/10 s"):
-        runner(tmp_path, listener, policy="checkpoint").run()
-    assert outcomes(tmp_path) == [], "no episode counts"
+@pytest.mark.slow
+def test_results_are_the_same_for_any_number_of_workers(tmp_path, libero, listener, save):
+    def outcomes(workers):
+        work_dir = tmp_path / str(workers)
+        save(work_dir)
+        settings = {"policy": "checkpoint", "baseline": True, "max_steps": 6}
+        runner(
+            work_dir, listener, workers=workers, record_videos=0, num_trials_per_task=4, **settings
+        ).run()
+        lines = (work_dir / "eval" / "episodes.jsonl").read_text().splitlines()[1:]
+        records = [json.loads(line) for line in lines]
+        for record in records:
+            del record["timing"]
+        return sorted(records, key=lambda r: (r["group"], r["task"], r["seed"]))
+
+    one = outcomes(1)
+    assert one == outcomes(2) == outcomes(4)
+    assert len({record["state_hash"] for record in one}) == 8, "the weights matter"
 
 
 def infer(work_dir, listener, task, **arguments):
     context = RunContext(work_dir=work_dir, section="inference", task=task, reporter=listener)
     settings = {"policy": "expert", "record_fps": 2, "video_size": 64, **arguments}
-    made = LiberoInferenceRunner(context=context, **settings)
+    made = LiberoInferenceRunner(context=context, render="coarse", **settings)
     made.run_setup()
     return made.run()
 
 
-def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener):
-    (summary,) = infer(tmp_path, listener, "2", init_state=1)
+def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener, monkeypatch):
+    pictures = []
+
+    def look(view_info):
+        if view_info.startswith("live at "):
+            stream = urllib.request.urlopen(view_info.removeprefix("live at "), timeout=60)
+            pictures.append(stream)
+        listener.lines.append(view_info)
+
+    monkeypatch.setattr(listener, "info", look)
+    (summary,) = infer(tmp_path, listener, "2", init_state=1, live_port=0)
     assert summary["success"] is True
     assert summary["instruction"] == "pick up the salad dressing and place it in the basket"
     folder = tmp_path / "inference" / "001-2"
     on_disk = json.loads((folder / "episode.json").read_text())
     assert on_disk["state_hash"] == summary["state_hash"]
-    assert sorted(p.name for p in folder.glob("*.mp4")) == [
-        "agentview.mp4",
-        "robot0_eye_in_hand.mp4",
-    ]
+    videos = sorted(path.name for path in folder.glob("*.mp4"))
+    assert videos == ["agentview.mp4", "robot0_eye_in_hand.mp4"]
     lines = [json.loads(line) for line in (folder / "trace.jsonl").read_text().splitlines()]
     assert len(lines) == summary["steps"]
     assert len(lines[0]["command"]) == 7
     assert f"success after {summary['steps']} steps" in listener.lines
+    shown = pictures[0].read()
+    assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
+    assert shown.count(b"\xff\xd8\xff") >= 1, "JPEG"
 
 
 def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, listener, save):
@@ -186,41 +265,5 @@ def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, list
     assert "nobody can judge it after 2 steps" in listener.lines
     with pytest.raises(UsageError, match="cannot be done in the scene of"):
         infer(tmp_path, listener, "6", scene=2, **limited)
-
-
-def test_what_is_asked_for_in_which_scene(libero):
-    one = Collection(2, tasks=(2, 6))
-    assert [(s.index, t.index) for s, t in pairs(one)] == [(2, 2), (6, 6)]
-    mixed = Collection(2, tasks=(2, 4, 6), mixed=True)
-    found = [(s.index, t.index) for s, t in pairs(mixed)]
-    assert found == [(2, 2), (2, 4), (4, 2), (4, 4), (6, 4), (6, 6)]
-
-
-def test_noise_and_placement_of_a_demonstration_follow_from_its_seed(scene):
-    ketchup = suite_tasks("libero_object")[4]
-    one, two = (demonstrate(scene, ketchup, 3, (), 0.3) for _ in range(2))
-    np.testing.assert_array_equal(one.states, two.states)
-    np.testing.assert_array_equal(one.actions, two.actions)
-    assert one.seed == 3
-
-
-def test_the_command_collects_a_dataset_to_train_on(tmp_path, libero, capsys):
-    parser = argparse.ArgumentParser()
-    command = CollectLiberoCommand()
-    command.add_arguments(parser)
-    with pytest.raises(UsageError, match="--workers must be at least 1, got 0"):
-        command.run(parser.parse_args(["--out", str(tmp_path / "x"), "--workers", "0"]))
-    words = ["--out", str(tmp_path / "x"), "--episodes", "1", "--tasks", "2", "--workers", "1"]
-    words += ["--cameras", "agentview", "--height", "16", "--width", "16", "--log-format", "json"]
-    assert command.run(parser.parse_args(words)) == 0
-    assert "1 episodes, " in capsys.readouterr().out
-    dataset = ParquetDataset(str(tmp_path / "x"), [], ["agentview"], action_window_size=4)
-    assert len(dataset) > 50
-    assert dataset.fps == 20
-    assert dataset.embodiment.action_mode == "delta"
-    assert dataset.embodiment.joints == libero_spec().joints
-    assert dataset.tasks == ("pick up the salad dressing and place it in the basket",)
-    table = pq.read_table(tmp_path / "x" / "data/chunk-000/file-000.parquet").to_pydict()
-    actions = np.array(table["action"])
-    assert np.abs(actions).max() <= 1.0
-    assert set(actions[:, 6]) == {-1.0, 1.0}
+    with pytest.raises(UsageError, match="no task was given"):
+        infer(tmp_path, listener, None, scene=2, **limited)

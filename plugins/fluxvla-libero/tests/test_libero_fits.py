@@ -1,6 +1,6 @@
 """Which policies LIBERO takes: refused ones are refused before anything is simulated.
 
-None of these tests needs LIBERO itself.
+Only the last of these tests needs LIBERO itself.
 """
 
 from __future__ import annotations
@@ -11,18 +11,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fluxvla_libero.embodiment import (
+    CAMERAS,
     CLOSED,
     OPEN,
     PICTURE,
     axis_angle,
-    check_policy,
     libero_spec,
 )
-from fluxvla_libero.eval_worker import LiberoEvalWorker, Settings
-from fluxvla_libero.policies import Loading, make_policy
+from fluxvla_libero.environment import environment_table
 
+from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import FluxError, SpecMismatch
 from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.policies import Source, fit, make_policy
+from fluxvla_core.evaluate.rollout import Course
+from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 
@@ -73,48 +76,40 @@ MISMATCHES = [
     ),
     pytest.param(
         {"rate": 10.0},
-        "deltas are for steps of 1/10 s, LIBERO's for 1/20 s",
+        "actions are for steps of 1/10 s, libero_object's for 1/20 s",
         id="another rate",
     ),
 ]
 
 
-def settings(path, **loading):
-    return Settings(
-        suite="libero_object",
-        tasks=("pick",),
-        policy="checkpoint",
-        loading=Loading(ckpt_path=str(path), **loading),
-        seed=7,
-        replan_every=4,
-        max_steps=280,
-    )
+SIDES = [Camera(name, PICTURE, PICTURE) for name in CAMERAS]
+HERE = EnvironmentSpec("libero_object", libero_spec(SIDES), (TaskSpec("pick", "pick it", 280),))
+
+
+def source(path, **values):
+    return Source("checkpoint", str(path), **values)
 
 
 @pytest.mark.parametrize(("arguments", "message"), MISMATCHES)
 def test_a_checkpoint_that_means_something_else_is_refused(tmp_path, save, arguments, message):
     path = save(tmp_path / "work", **arguments)
-    worker = LiberoEvalWorker(settings(path))
     with pytest.raises(SpecMismatch) as caught:
-        worker(EpisodeKey("policy", "pick", 0))
+        fit(make_policy(source(path)), HERE)
     assert message in str(caught.value)
-    assert worker._scene is None, "nothing was built, let alone moved"
 
 
 def test_a_wrong_statistics_key_is_refused(tmp_path, save):
     path = save(tmp_path / "work")
-    worker = LiberoEvalWorker(settings(path, norm_stats_key="libero_object_no_noops"))
     with pytest.raises(SpecMismatch, match="no statistics 'libero_object_no_noops'") as caught:
-        worker(EpisodeKey("policy", "pick", 0))
+        make_policy(source(path, norm_stats_key="libero_object_no_noops"))
     assert "it has private" in str(caught.value)
     assert "norm_stats_key" in str(caught.value)
-    assert worker._scene is None
 
 
 def test_a_statistics_key_of_the_checkpoint_is_used(tmp_path, save):
     path = save(tmp_path / "work", key="libero_object_no_noops")
-    named = make_policy("checkpoint", Loading(str(path), norm_stats_key="libero_object_no_noops"))
-    plain = make_policy("checkpoint", Loading(str(path)))
+    named = make_policy(source(path, norm_stats_key="libero_object_no_noops"))
+    plain = make_policy(source(path))
     seen = {
         "qpos": np.zeros(8, np.float32),
         "images": {"agentview": np.zeros((32, 48, 3), np.uint8)},
@@ -123,41 +118,30 @@ def test_a_statistics_key_of_the_checkpoint_is_used(tmp_path, save):
     np.testing.assert_array_equal(named.predict_action(seen), plain.predict_action(seen))
 
 
-def test_an_untrained_policy_is_the_same_pipeline_with_other_weights(tmp_path, save):
-    path = save(tmp_path / "work")
-    trained, untrained = (
-        make_policy(name, Loading(str(path))) for name in ("checkpoint", "untrained")
-    )
-    assert trained.model.gain.item() == 1.0
-    again = make_policy("untrained", Loading(str(path)))
-    assert untrained.model.gain.item() == again.model.gain.item() != 1.0
-    assert check_policy(untrained) == check_policy(trained)
-
-
 def test_an_aloha_policy_is_refused_with_every_difference():
     from fluxvla_core.spec.embodiment import Joint
 
     arm = tuple(Joint(f"left_{n}", "rad", -1, 1, 1, 1) for n in "abcdef")
     aloha = EmbodimentSpec("aloha", arm, (Camera("agentview", 9, 9),), 50.0)
     with pytest.raises(SpecMismatch) as caught:
-        check_policy(policy(aloha))
+        fit(policy(aloha), HERE)
     for what in ("joints and their order", "action mode", "frame", "rotation"):
         assert what in str(caught.value)
-    assert "the policy (aloha) and LIBERO (libero_panda)" in str(caught.value)
+    assert "the policy (aloha) and libero_object (libero_panda)" in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["agentview", "image", "agentview_image"])
 def test_names_of_public_datasets_are_understood(name):
     spec = libero_spec([Camera(name, 128, 100), Camera("wrist_image", 90, 90)])
-    cameras = check_policy(policy(spec, (name, "wrist_image")))
+    cameras = fit(policy(spec, (name, "wrist_image")), HERE)
     assert cameras == (Camera(name, 128, 100), Camera("wrist_image", 90, 90))
 
 
 def test_pictures_have_the_size_that_is_asked_for():
     spec = libero_spec([Camera("agentview", 128, 128)])
-    assert check_policy(policy(spec), (224, 224)) == (Camera("agentview", 224, 224),)
+    assert fit(policy(spec), HERE, (224, 224)) == (Camera("agentview", 224, 224),)
     unsized = replace(spec, cameras=())
-    assert check_policy(policy(unsized)) == (Camera("agentview", PICTURE, PICTURE),)
+    assert fit(policy(unsized), HERE) == (Camera("agentview", PICTURE, PICTURE),)
 
 
 def test_liberos_own_spec_survives_json():
@@ -187,4 +171,16 @@ def test_axis_angle_follows_the_quaternions_sign(quaternion, expected):
 
 def test_a_missing_checkpoint_is_no_policy(tmp_path):
     with pytest.raises(FluxError, match="checkpoint"):
-        make_policy("checkpoint", Loading(str(tmp_path / "nowhere")))
+        make_policy(source(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISMATCHES)
+def test_it_is_refused_before_a_scene_is_built(libero, tmp_path, save, arguments, message):
+    path = save(tmp_path / "work", **arguments)
+    table = environment_table(cameras=tuple(CAMERAS))
+    worker = EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, Course()))
+    task = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
+    with pytest.raises(SpecMismatch) as caught:
+        worker(EpisodeKey("policy", task, 0))
+    assert message in str(caught.value)
+    assert worker.environment._scene is None, "nothing was built, let alone moved"

@@ -7,7 +7,15 @@ import pytest
 from fluxvla_libero.embodiment import NO_OP, axis_angle
 from fluxvla_libero.require import quiet
 from fluxvla_libero.scene import ENV_SEED, SHOWN_GROUPS, LiberoScene
-from fluxvla_libero.suites import can_be_done_in, choose_tasks, goal, init_states, suite_tasks
+from fluxvla_libero.suites import (
+    MAX_STEPS,
+    SUITES,
+    can_be_done_in,
+    choose_tasks,
+    goal,
+    init_states,
+    suite_tasks,
+)
 
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.evaluate.drawing import Drawing
@@ -161,6 +169,20 @@ def test_suites_have_their_tasks_goals_and_states(libero):
     assert len(suite_tasks("libero_90")) == 90
     reworded = suite_tasks("libero_object_lan")[0].language
     assert reworded != tasks[0].language
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_suite_is_whole(libero, suite):
+    if suite not in libero.benchmark.get_benchmark_dict():
+        assert suite not in MAX_STEPS, "only LIBERO-PRO's may be missing, from the classic LIBERO"
+        with pytest.raises(ConfigError, match=f"the installed LIBERO has no suite '{suite}'"):
+            suite_tasks(suite)
+        return
+    tasks = suite_tasks(suite)
+    assert len(tasks) == (90 if suite == "libero_90" else 10)
+    assert len({task.name for task in tasks}) == len(tasks)
+    assert all(task.bddl.is_file() and task.language and goal(task) for task in tasks)
+    assert len(init_states(suite, len(tasks) - 1)) == 50
 
 
 def test_tasks_are_chosen_by_index_and_name(libero):

@@ -17,7 +17,8 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-libero": {
-        "commands": ("collect-libero",),
+        "environments": ("LiberoEnvironment",),
+        "policies": ("LiberoExpert",),
         "runners": ("LiberoEvalRunner", "LiberoInferenceRunner"),
     },
     "fluxvla-metaworld": {

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint, check_match
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -78,36 +77,6 @@ def libero_spec(cameras: Sequence[Camera] | None = None) -> EmbodimentSpec:
 def _delta(name: str, kind: str) -> Joint:
     ends = (OPEN, CLOSED) if kind == "gripper" else (None, None)
     return Joint(name, "normalized", -1.0, 1.0, 40.0, 1600.0, kind, *ends)
-
-
-def check_policy(policy: Any, size: tuple[int, int] | None = None) -> tuple[Camera, ...]:
-    """Refuse a policy whose numbers mean something else than LIBERO's.
-
-    Args:
-        size: height and width of the pictures; by default as the policy was trained.
-
-    Returns:
-        The cameras that it looks at, by the names that it gives them.
-
-    Raises:
-        SpecMismatch: other joints, units, frame, rotation, gripper polarity, absolute actions,
-            another rate, or a camera that the scene does not have.
-    """
-    names = tuple(policy.cameras)
-    trained = {camera.name: camera for camera in policy.embodiment.cameras}
-    known = [Camera(name, PICTURE, PICTURE) for name in CAMERAS]
-    check_match(policy.embodiment, libero_spec(known), "the policy", "LIBERO", cameras=names)
-    if policy.action_rate_hz != CONTROL_HZ:
-        raise SpecMismatch(
-            f"the policy's deltas are for steps of 1/{policy.action_rate_hz:g} s, "
-            f"LIBERO's for 1/{CONTROL_HZ:g} s",
-            cause="it was trained on data of another frame rate",
-            next="train on data recorded at 20 frames a second",
-        )
-    cameras = [trained.get(name, Camera(name, PICTURE, PICTURE)) for name in names]
-    if size is not None:
-        cameras = [replace(camera, height=size[0], width=size[1]) for camera in cameras]
-    return tuple(cameras)
 
 
 def axis_angle(quaternion: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -7,18 +7,19 @@ distance that is left: so it also finds back when something pushes it off its wa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_libero.embodiment import CLOSED, CONTROL_HZ, OPEN, libero_spec
-from fluxvla_libero.scene import LiberoScene
-from fluxvla_libero.suites import SuiteTask, goal, suite_tasks
+from fluxvla_libero.environment import LiberoEnvironment
+from fluxvla_libero.suites import SuiteTask, goal
 
 if TYPE_CHECKING:
     from fluxvla_core.contracts.frame import Observation
+    from fluxvla_libero.scene import LiberoScene
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +29,8 @@ _MAX_ROTATION = 0.5
 _PATIENCE = 60  # steps after which a waypoint is given up
 _GRASP_DEPTH = 0.035  # m below the object's top
 _CLEARANCE = 0.03  # m between the object and the container's rim when it is let go
+_CAREFUL = 0.25  # share of the noise where the gripper is close to something
+_SMOOTH = 0.8  # how much of the noise stays from one step to the next
 
 
 @dataclass(frozen=True)
@@ -107,43 +110,71 @@ class Expert:
         return self._waypoints[min(self._index, len(self._waypoints) - 1)]
 
 
-class ExpertPolicy:
+class LiberoExpert:
     """The expert as a policy: one action at a time, for the instruction's task.
 
-    Its success through the evaluation is an upper bound for any policy, and a check of it.
+    Its success through an evaluation is an upper bound for any policy, and a check of it.
+
+    Args:
+        noise: standard deviation of smooth disturbances of the executed positions' deltas, of
+            which 1 is the largest. What it means to do, the labels of a demonstration, stays
+            without, and so leads back to its way (Laskey et al., "DART", CoRL 2017).
+
+    Raises:
+        ConfigError: the noise is not from 0 to 1.
     """
 
-    cameras: tuple[str, ...] = ()
-    action_rate_hz = CONTROL_HZ
-    horizon = 1
+    api: ClassVar[str] = "1.0"
+    cameras: ClassVar[tuple[str, ...]] = ()
+    action_rate_hz: ClassVar[float] = CONTROL_HZ
+    horizon: ClassVar[int] = 1
 
-    def __init__(self) -> None:
+    def __init__(self, noise: float = 0.0) -> None:
+        if not 0 <= noise <= 1:
+            raise ConfigError(f"noise must be from 0 to 1, got {noise}")
         self.embodiment = libero_spec(())
-        self._scene: LiberoScene | None = None
+        self.executed: Array | None = None
+        self._noise = noise
+        self._environment: LiberoEnvironment | None = None
         self._expert: Expert | None = None
+        self._disturbance = np.zeros(3)
+        self._rng = np.random.default_rng(0)
 
-    def enter(self, scene: LiberoScene) -> None:
-        """Say where it acts."""
-        self._scene = scene
-
-    def reset(self, seed: int) -> None:
-        self._expert = None
-
-    def predict_action(self, observation: Observation) -> Array:
-        """``(1, 7)``.
+    def enter(self, environment: Any) -> None:
+        """Say where it acts.
 
         Raises:
-            ConfigError: the instruction is none of the suite's, or no task for the expert.
+            ConfigError: that is not LIBERO.
         """
-        assert self._scene is not None
+        if not isinstance(environment, LiberoEnvironment):
+            raise ConfigError(
+                f"LIBERO's expert acts in LiberoEnvironment only, "
+                f"not in {type(environment).__name__}"
+            )
+        self._environment = environment
+
+    def reset(self, seed: int) -> None:
+        self._expert = self.executed = None
+        self._disturbance = np.zeros(3)
+        self._rng = np.random.default_rng(seed)
+
+    def predict_action(self, observation: Observation) -> Array:
+        """``(1, 7)``; ``executed`` holds the same with the disturbance.
+
+        Raises:
+            ConfigError: it was not told where it acts, or it cannot do the task.
+        """
+        if self._environment is None:
+            raise ConfigError("LiberoExpert must be told where it acts: call enter() first")
         if self._expert is None:
-            said = observation["task_description"]
-            suite = self._scene.task.suite
-            named = [task for task in suite_tasks(suite) if task.language == said]
-            if not named:
-                raise ConfigError(f"the expert does not know {said!r}, no instruction of {suite}")
-            self._expert = Expert(self._scene, named[0])
-        return self._expert.act()[None]
+            self._expert = Expert(self._environment.scene, self._environment.task)
+        size = self._noise if self._expert.free else _CAREFUL * self._noise
+        fresh = self._rng.normal(size=3) * np.sqrt(1 - _SMOOTH**2)
+        self._disturbance = _SMOOTH * self._disturbance + fresh
+        action = np.clip(self._expert.act(), -1.0, 1.0)[None]
+        self.executed = action.copy()
+        self.executed[:, :3] = np.clip(action[:, :3] + size * self._disturbance, -1.0, 1.0)
+        return action
 
 
 def plan(low: Array, high: Array, rim_low: Array, rim_high: Array) -> list[Waypoint]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import logging
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
@@ -28,7 +29,7 @@ def require_libero() -> ModuleType:
 
     Raises:
         MissingPlugin: it is not installed.
-        RunFailed: it is, and cannot be imported; or EGL is wanted and missing.
+        RunFailed: it is, and cannot be imported, or was never set up; or EGL is wanted and missing.
     """
     if not is_installed():
         raise MissingPlugin(
@@ -42,6 +43,11 @@ def require_libero() -> ModuleType:
             import libero.libero
             import libero.libero.benchmark
             import libero.libero.envs
+    except EOFError as error:
+        raise RunFailed(
+            "LIBERO was never set up here: it asks where its files are when it is first imported",
+            next="python -c 'import libero.libero', and answer",
+        ) from error
     except Exception as error:
         raise RunFailed(
             f"LIBERO is installed and cannot be imported: {type(error).__name__}: {error}",
@@ -53,12 +59,15 @@ def require_libero() -> ModuleType:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without what LIBERO and robosuite print while they are imported and set up."""
+    """Without what LIBERO and robosuite print while they are imported and set up, and without an
+    answer to what LIBERO would ask then: nobody would see the question."""
     log = logging.getLogger("robosuite_logs")
-    before = log.level
+    before, stdin = log.level, sys.stdin
     log.setLevel(logging.ERROR)
+    sys.stdin = io.StringIO()
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             yield
     finally:
         log.setLevel(before)
+        sys.stdin = stdin

@@ -16,8 +16,8 @@ from fluxvla_core.cli import following, ranks
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, natural, positive
 from fluxvla_core.cli.plan import Plan, make_plan, prepare_work_dir, refuse_overwriting
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.signals import handling
 from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.signals import handling
 
 
 class Run:

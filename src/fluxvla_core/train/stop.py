@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
+from contextlib import ExitStack
 from types import FrameType, TracebackType
-from typing import Any
 
 from fluxvla_core.errors import FluxError, RunFailed
+from fluxvla_core.signals import handling
 from fluxvla_core.train.distributed import World, agree
 
 NOTICE_S = 0.5
@@ -30,14 +30,11 @@ class StopRequest:
         self._process = os.getpid()
         self._signal = 0
         self._since = 0.0
-        self._previous: dict[int, Any] = {}
+        self._taken = ExitStack()
         self._every = 1
 
     def __enter__(self) -> StopRequest:
-        # Only the main thread may set handlers; elsewhere whoever runs that decides.
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
+        self._taken.enter_context(handling(self._handle, signal.SIGINT, signal.SIGTERM))
         return self
 
     def __exit__(
@@ -46,9 +43,7 @@ class StopRequest:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for number, previous in self._previous.items():
-            signal.signal(number, previous)
-        self._previous = {}
+        self._taken.close()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self._process:

@@ -90,7 +90,12 @@ def evaluation(work_dir: Path, episodes: int = 20) -> None:
 
 def inference(work_dir: Path, commands: int = 200) -> None:
     folder = work_dir / "inference" / "001-lift"
-    events: list[dict[str, Any]] = [{"event": "chunk", "t": 100.0, "ms": {"policy": 12.0}}]
+    joints = [{"name": name, "unit": "rad", "lower": -3.0, "upper": 3.0} for name in JOINTS]
+    start = {"event": "start", "t": 99.9, "began": 1.7e9, "embodiment": {"joints": joints}}
+    events: list[dict[str, Any]] = [
+        {**start, "instruction": "lift the cube & hold it"},
+        {"event": "chunk", "t": 100.0, "ms": {"policy": 12.0}},
+    ]
     for number in range(commands):
         angle = [math.sin(number / 40 + joint) for joint in range(len(JOINTS))]
         clamp = {"joint": "left_waist", "wanted": 2.0, "given": angle[0], "reason": "velocity"}
@@ -98,7 +103,7 @@ def inference(work_dir: Path, commands: int = 200) -> None:
             {
                 "event": "command",
                 "t": 100.0 + number * 0.02,
-                "phase": "policy",
+                "phase": "run",
                 "wanted": angle,
                 "command": angle,
                 "state": [0.95 * value for value in angle],

@@ -7,6 +7,7 @@ import html.parser
 import json
 import math
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,40 @@ def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
     assert not page.shows("No metrics.jsonl")
     assert not page.shows("Not evaluated yet")
     assert "fluxvla-aloha 0.1.0, fluxvla-aloha" not in " ".join(page.text)
+
+
+def test_a_folder_of_recordings(tmp_path: Path, complete: Path) -> None:
+    root = tmp_path / "recordings"
+    for number in range(6):
+        shutil.copytree(complete / "inference" / "001-lift", root / f"{number + 1:03d}-lift")
+    trace = root / "002-lift" / "trace.jsonl"
+    stop = {"event": "stop", "t": 104.0, "rule": "chunk", "problem": "not finite", "seconds": 0.1}
+    trace.write_text(trace.read_text() + json.dumps(stop) + "\n")
+    page = page_of(root, tmp_path)
+    for words in (
+        "On the robot: 6 episodes",
+        "6 of 6 judged ones succeeded",
+        "18 commands; 1 safe stop",
+        "The newest 4 follow.",
+        "What happened when",
+        "Latency by stage",
+    ):
+        assert page.shows(words), words
+    assert not page.shows("Not evaluated yet")
+    assert not page.shows("No metrics.jsonl")
+    assert not page.shows("No environment.json")
+
+
+def test_one_recording_with_a_stop(tmp_path: Path, complete: Path) -> None:
+    root = tmp_path / "001-lift"
+    shutil.copytree(complete / "inference" / "001-lift", root)
+    summary = json.loads((root / "episode.json").read_text())
+    summary |= {"outcome": "failed", "problem": "the chunk is not finite", "success": None}
+    (root / "episode.json").write_text(json.dumps(summary))
+    page = page_of(root, tmp_path)
+    assert page.shows("On the robot: lift the cube & hold it")
+    assert page.shows("failed the chunk is not finite")
+    assert page.shows("nobody judged")
 
 
 def test_it_stands_alone(complete: Path, tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fluxvla_core.report.episodes import clamp_counts, joint_traces, phases, read_episodes, stops
 from fluxvla_core.report.files import Reader, number, text_rows
-from fluxvla_core.report.read import clamp_counts, joint_traces, read_facts
+from fluxvla_core.report.read import read_facts
 from fluxvla_core.report.scores import read_evaluations
 
 
@@ -96,7 +98,7 @@ def test_results_without_rates_or_with_missing_videos_show_what_there_is(tmp_pat
 
 
 def test_joints_of_a_trace_with_other_states() -> None:
-    events = [
+    events: list[dict[str, Any]] = [
         {"event": "trip", "t": 0.0},
         {"event": "command", "t": 5.0, "command": [1.0], "state": [1.0, 2.0], "clamps": None},
         {"event": "command", "t": 5.5, "command": [1.0, 2.0], "state": [0.0]},
@@ -106,6 +108,57 @@ def test_joints_of_a_trace_with_other_states() -> None:
     assert math.isnan(trace.states[0])
     assert joint_traces([], events, {}) == []
     assert joint_traces(["a", "b", "c"], events, {}) == []
+
+
+def test_a_state_that_was_not_read_at_a_command_is_the_one_before() -> None:
+    events: list[dict[str, Any]] = [
+        {"event": "observation", "t": 4.0, "state": [0.5]},
+        {"event": "command", "t": 5.0, "command": [1.0], "wanted": [2.0], "state": None},
+        {"event": "command", "t": 5.1, "command": [1.1], "state": [1.0]},
+    ]
+    facts = {"a": {"unit": "rad", "lower": -1, "upper": 3}}
+    (trace,) = joint_traces(["a"], events, facts)
+    assert trace.states == [0.5, 1.0]
+    assert trace.wanted[0] == 2.0
+    assert math.isnan(trace.wanted[1])
+    assert (trace.unit, trace.limits) == ("rad", (-1.0, 3.0))
+
+
+def test_phases_and_stops_are_on_the_clock_of_the_first_command() -> None:
+    events = [
+        *({"event": "command", "t": 10 + 0.1 * n, "phase": "ramp"} for n in range(3)),
+        *({"event": "command", "t": 10.3 + 0.1 * n, "phase": "run"} for n in range(2)),
+        {"event": "stop", "t": 10.9, "seconds": 0.4, "rule": "chunk", "problem": "nan"},
+    ]
+    assert [(p.name, round(p.start, 3), round(p.end, 3)) for p in phases(events, 10.0)] == [
+        ("ramp", 0.0, 0.2),
+        ("run", 0.2, 0.4),
+    ]
+    (stop,) = stops(events, 10.0)
+    assert (round(stop.at, 3), stop.name, stop.text) == (0.5, "chunk", "nan")
+
+
+def test_a_record_that_was_cut_short_is_counted_from_what_there_is(complete: Path) -> None:
+    root = complete.parent / "cut"
+    folder = root / "inference" / "001-lift"
+    folder.mkdir(parents=True)
+    whole = (complete / "inference" / "001-lift" / "trace.jsonl").read_text()
+    (folder / "trace.jsonl").write_text(whole[: len(whole) // 2])
+    (episode,) = read_episodes(Reader(root), root)
+    assert episode.outcome == "cut short"
+    assert 80 < len(episode.joints[0].times) < 120
+    assert episode.problem == "the record ends without an end"
+    assert episode.timings["policy"]["count"] == 1
+
+
+def test_a_damaged_bag_is_named_and_hurts_nothing_else(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    (tmp_path / "001-x").mkdir()
+    (tmp_path / "001-x" / "001-x.mcap").write_bytes(b"not a bag")
+    reader = Reader(tmp_path)
+    (episode,) = read_episodes(reader, tmp_path)
+    assert (episode.name, episode.joints) == ("001-x", [])
+    assert reader.problems == ["001-x/001-x.mcap: this is no MCAP file"]
 
 
 def test_small_helpers() -> None:

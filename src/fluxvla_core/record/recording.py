@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from fluxvla_core.errors import DataError
 from fluxvla_core.record import ros_messages as ros
 from fluxvla_core.record import tally
 from fluxvla_core.record.logs import LINES
-from fluxvla_core.record.mcap import Entry, McapFile
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.record.mcap import McapFile
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 Array = npt.NDArray[np.float64]
 Event = dict[str, Any]
@@ -207,35 +208,58 @@ def read_lines(path: Path) -> tuple[list[Event], bool]:
     return events, whole and bool(events) and events[-1].get("event") == tally.END
 
 
-def _read(path: Path) -> Recorded:
-    bag = bag_of(path) if path.is_dir() else path
-    if bag is None:
-        events, whole = read_lines(path / LINES)
-        return Recorded(path, events, {}, whole)
-    file, unpacker = McapFile(bag), ros.Unpacker(ros.typestore())
-    events = []
-    pictures: list[Entry] = []
-    offset: int | None = None
-    for entry in file.entries():
+@dataclass(frozen=True)
+class Bag:
+    """What a bag's file holds: events, and where its pictures are (topic, ns, place)."""
+
+    file: McapFile
+    unpacker: ros.Unpacker
+    events: list[Event]
+    pictures: list[tuple[str, int, tuple[int, int, int]]]
+    offset: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether it was finished."""
+        return self.file.whole
+
+
+def read_bag(path: Path) -> Bag:
+    """Go through an MCAP file, whole or cut short.
+
+    Raises:
+        DataError: it is no MCAP file, or damaged before its end.
+        RunFailed: rosbags is not installed.
+    """
+    unpacker = ros.Unpacker(ros.typestore())
+    found = Bag(McapFile(path), unpacker, [], [], 0)
+    offset = 0
+    for entry in found.file.entries():
         if entry.kind == ros.IMAGE:
-            pictures.append(Entry(entry.topic, entry.kind, entry.ns, memoryview(b""), entry.place))
+            found.pictures.append((entry.topic, entry.ns, entry.place))
             continue
         event = unpacker.add(entry.topic, entry.kind, entry.ns, entry.data)
-        if event is None:
-            continue
-        events.append(event)
-        if offset is None:
-            offset = entry.ns - ros.nanoseconds(event["t"])
-    whole = file.whole
-    recorded = Recorded(path, events, {}, whole)
-    cameras = recorded.embodiment.camera_names
+        if event is not None:
+            offset = offset or entry.ns - ros.nanoseconds(event["t"])
+            found.events.append(event)
+    return replace(found, offset=offset)
+
+
+def _read(path: Path) -> Recorded:
+    file = bag_of(path) if path.is_dir() else path
+    if file is None:
+        events, whole = read_lines(path / LINES)
+        return Recorded(path, events, {}, whole)
+    bag = read_bag(file)
+    cameras = Recorded(path, bag.events, {}, bag.whole).embodiment.camera_names
     by_topic = {ros.camera_topic(camera): camera for camera in cameras}
-    found = {camera: Pictures(file, unpacker) for camera in cameras}
-    for entry in pictures:
-        camera = by_topic.get(entry.topic)
+    found: dict[str, Pictures] = {}
+    for topic, ns, place in bag.pictures:
+        camera = by_topic.get(topic)
         if camera is not None:
-            found[camera].add((entry.ns - (offset or 0)) / 1e9, entry.place)
-    return Recorded(path, events, {c: p for c, p in found.items() if len(p)}, whole)
+            kept = found.setdefault(camera, Pictures(bag.file, bag.unpacker))
+            kept.add((ns - bag.offset) / 1e9, place)
+    return Recorded(path, bag.events, found, bag.whole)
 
 
 def age_at(event: Event, stream: str) -> float:
@@ -250,8 +274,6 @@ def check_same_embodiment(recordings: Iterable[Recorded]) -> EmbodimentSpec:
     Raises:
         SpecMismatch: two of them are of different robots; names both.
     """
-    from fluxvla_core.spec.embodiment import check_match
-
     first, *others = recordings
     for other in others:
         who = (f"recording {first.path.name}", f"recording {other.path.name}")

@@ -88,7 +88,8 @@ class Evaluation:
 class JointTrace:
     """One joint over an episode: what was commanded, what was measured, where a limit acted.
 
-    ``times`` s from the episode's start; ``clamped`` holds the times and the commands given.
+    ``times`` s from the first command; ``wanted`` is the target before the limits, ``clamped``
+    holds the times and the commands given, ``limits`` the lowest and the highest position.
     """
 
     name: str
@@ -97,6 +98,26 @@ class JointTrace:
     commands: Sequence[float]
     states: Sequence[float]
     clamped: Sequence[tuple[float, float]] = ()
+    wanted: Sequence[float] = ()
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Span:
+    """A named stretch of an episode, s from its first command."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Something that happened, s from the first command, and what to say of it."""
+
+    at: float
+    name: str
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -109,6 +130,10 @@ class Episode:
         outcome: how it ended; ``success`` is None when nobody judged it.
         joints: in the robot's order; empty when no command was sent.
         timings: stage -> ``count``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``max_ms``.
+        problem: why it ended before its time; empty if it did not.
+        phases: what the commands were for: ``ramp``, ``run``, ``hold``, ``stop``.
+        chunks: when the policy's answers arrived, s from the first command.
+        stops: the safe stops and trips.
         notes: rows for its table.
     """
 
@@ -119,7 +144,21 @@ class Episode:
     joints: Sequence[JointTrace]
     timings: Mapping[str, Mapping[str, Any]]
     videos: Sequence[Video] = ()
+    problem: str = ""
+    phases: Sequence[Span] = ()
+    chunks: Sequence[float] = ()
+    stops: Sequence[Moment] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        """From the first command to the last."""
+        return max((joint.times[-1] for joint in self.joints if joint.times), default=0.0)
+
+    @property
+    def clamped(self) -> int:
+        """How many commands a limit changed."""
+        return len({time for joint in self.joints for time, _ in joint.clamped})
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.report.facts import Evaluation, Facts, JointTrace, Training, Video
+from fluxvla_core.report.episode_view import episode_view, total_ms
+from fluxvla_core.report.facts import Episode, Evaluation, Facts, Training, Video
 from fluxvla_core.report.files import text_rows
 from fluxvla_core.report.read import read_facts
 from fluxvla_core.report.scale import duration, short
 from fluxvla_core.report.svg import Interval, Series, duration_bar, interval_chart, line_chart
+from fluxvla_core.report.timeline import milliseconds
 
 # Videos are put into the page up to this many bytes in all; the rest is linked to.
 EMBEDDED_BYTES = 32_000_000
@@ -28,8 +30,8 @@ CURVES = (
     ("grad_norm", "Gradient norm", True),
     ("samples_per_s", "Samples per second", False),
 )
-# Joint plots show at least this much (rad, m or gripper units).
-LEAST_RANGE = 0.1
+# Episodes that are shown as a whole, the newest ones; all are in the list.
+SHOWN_EPISODES = 4
 SMOOTHED = ("loss", "grad_norm", "samples_per_s")
 
 
@@ -95,15 +97,8 @@ def render(facts: Facts, beside: Path, title: str = "") -> str:
         tiles=tiles(facts),
         curves=[] if facts.training is None else curves(facts.training),
         evaluations=[_evaluation(e, shelf) for e in facts.evaluations],
-        episodes=[
-            {
-                "facts": e,
-                "joints": [joint_chart(joint) for joint in e.joints],
-                "rows": text_rows(e.notes.items()),
-                "videos": [shelf.put(v) for v in e.videos],
-            }
-            for e in facts.episodes[-4:]
-        ],
+        episodes=[episode_view(e, shelf.put) for e in facts.episodes[-SHOWN_EPISODES:]],
+        recordings_only=is_recordings_only(facts),
         stages=duration_bar([(s.name, s.seconds) for s in facts.stages], title="Where time went"),
         environment_rows=environment_rows(facts.environment),
         config_text=json.dumps(facts.config.get("config", {}), indent=2),
@@ -157,6 +152,8 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
         )
     if facts.training is not None:
         found.append(_training_tile(facts.training))
+    if is_recordings_only(facts):
+        found += _episode_tiles(facts.episodes)
     if facts.dataset:
         data = facts.dataset
         found.append(
@@ -175,6 +172,47 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
                 "name": "from nothing to this page",
                 "figure": duration(total) if total < 60 else f"{total / 60:.0f} min",
                 "detail": f"in {len(facts.stages)} stages",
+            }
+        )
+    return found
+
+
+def is_recordings_only(facts: Facts) -> bool:
+    """Whether this is a folder of recordings: what else a run has is not missing there."""
+    return bool(facts.episodes) and facts.training is None and not facts.config
+
+
+def _episode_tiles(episodes: Sequence[Episode]) -> list[dict[str, str]]:
+    judged = [e.success for e in episodes if e.success is not None]
+    commands = sum(len(e.joints[0].times) for e in episodes if e.joints)
+    clamped = sum(e.clamped for e in episodes)
+    stops = sum(len(e.stops) for e in episodes)
+    found = [
+        {
+            "name": "episodes" if len(episodes) > 1 else "episode",
+            "figure": str(len(episodes)) if len(episodes) > 1 else episodes[0].outcome,
+            "detail": f"{sum(judged)} of {len(judged)} judged ones succeeded"
+            if judged
+            else "nobody judged",
+        },
+        {
+            "name": "commands",
+            "figure": f"{commands:,}",
+            "detail": f"in {duration(sum(e.seconds for e in episodes))}",
+        },
+        {
+            "name": "clamped by a limit",
+            "figure": f"{clamped / commands:.0%}" if commands else "–",
+            "detail": f"{clamped} commands; {stops} safe stop{'' if stops == 1 else 's'}",
+        },
+    ]
+    totals = [total for e in episodes if (total := total_ms(e)) is not None]
+    if totals:
+        found.append(
+            {
+                "name": "reading to command",
+                "figure": milliseconds(totals[-1]),
+                "detail": "sum of the stages' medians",
             }
         )
     return found
@@ -219,19 +257,6 @@ def running_mean(values: Sequence[float], share: float = 0.03) -> list[float]:
             mean = value if math.isnan(mean) else mean + weight * (value - mean)
         means.append(mean)
     return means
-
-
-def joint_chart(joint: JointTrace) -> dict[str, Any]:
-    """One joint's commands, states and clamps, with its name and unit."""
-    times, values = [t for t, _ in joint.clamped], [v for _, v in joint.clamped]
-    series = [
-        Series("state", joint.times, joint.states, css="s1"),
-        Series("command", joint.times, joint.commands, css="s0"),
-        Series("clamped", times, values, css="bad", kind="dots"),
-    ]
-    title = f"{joint.name}: command and state"
-    chart = line_chart(series, x_label="s", title=title, least=LEAST_RANGE, width=340, height=150)
-    return {"name": joint.name, "unit": joint.unit, "svg": chart, "clamps": len(times)}
 
 
 def _evaluation(evaluation: Evaluation, shelf: Shelf) -> dict[str, Any]:

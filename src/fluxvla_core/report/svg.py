@@ -25,7 +25,7 @@ class Series:
         name: for the legend; empty: not in it.
         xs, ys: equally many values; a point that is not finite interrupts the line.
         css: the colour's class.
-        kind: ``line``, ``faint`` (a thin, pale line) or ``dots``.
+        kind: ``line``, ``faint`` (a thin, pale line), ``dashed`` or ``dots``.
     """
 
     name: str
@@ -47,6 +47,25 @@ class Interval:
     css: str = "s0"
 
 
+@dataclass(frozen=True)
+class Shade:
+    """A stretch of the x axis to shade, with a name that shows under the pointer."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place on the x axis (``vertical``) or on the y axis to draw a line at."""
+
+    at: float
+    name: str
+    css: str = "bad"
+    vertical: bool = True
+
+
 def line_chart(
     series: Sequence[Series],
     *,
@@ -56,17 +75,23 @@ def line_chart(
     least: float = 0.0,
     width: int = 520,
     height: int = 210,
+    shades: Sequence[Shade] = (),
+    marks: Sequence[Mark] = (),
 ) -> str:
     """Lines and dots over common axes; the title is what a screen reader says.
 
-    The y axis is by decades if ``log``, and shows at least a range of ``least``.
+    The y axis is by decades if ``log``, and shows at least a range of ``least``. Marks outside of
+    the axes are left out.
     """
     x_axis = axis([x for s in series for x in s.xs], count=6, tight=True)
     y_axis = axis([y for s in series for y in s.ys], log=log, count=5, least=least)
     inner = _Inner(x_axis, y_axis, width, height)
-    body = [_frame(inner, x_label)]
+    body = [_shade(inner, shade) for shade in shades]
+    body.append(_frame(inner, x_label))
+    body += [_mark(inner, mark) for mark in marks if not mark.vertical]
     body += [_draw(inner, s) for s in series]
-    return _svg(width, height, title, "".join(body))
+    body += [_mark(inner, mark) for mark in marks if mark.vertical]
+    return wrapped(width, height, title, "".join(body))
 
 
 def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 860) -> str:
@@ -92,7 +117,7 @@ def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 860) ->
             f'<text class="tick" x="{width}" y="{y + 4:.1f}" text-anchor="end">'
             f"{escape(row.note)}</text>"
         )
-    return _svg(width, height, title, "".join(parts))
+    return wrapped(width, height, title, "".join(parts))
 
 
 def duration_bar(parts: Sequence[tuple[str, float]], *, title: str, width: int = 860) -> str:
@@ -117,7 +142,7 @@ def duration_bar(parts: Sequence[tuple[str, float]], *, title: str, width: int =
             f'height="10" rx="2"/></g><text class="label" x="{at + 16:.1f}" y="{y - 1}">'
             f"{escape(name)} · {duration(seconds)}</text>"
         )
-    return _svg(width, height, title, "".join(body))
+    return wrapped(width, height, title, "".join(body))
 
 
 def thinned(xs: Sequence[float], ys: Sequence[float], most: int = MOST_POINTS) -> list[int]:
@@ -175,6 +200,30 @@ def _frame(inner: _Inner, x_label: str) -> str:
     return "".join(parts)
 
 
+def _shade(inner: _Inner, shade: Shade) -> str:
+    (x1, _), (x2, _) = inner.at(shade.start, inner.y.low), inner.at(shade.end, inner.y.low)
+    return (
+        f'<rect class="shade" x="{x1:.1f}" y="{TOP}" width="{max(0.0, x2 - x1):.1f}" '
+        f'height="{inner.height - TOP - BOTTOM}"><title>{escape(shade.name)}</title></rect>'
+    )
+
+
+def _mark(inner: _Inner, mark: Mark) -> str:
+    on = inner.x if mark.vertical else inner.y
+    if not on.low <= mark.at <= on.high:
+        return ""
+    if mark.vertical:
+        x, _ = inner.at(mark.at, inner.y.low)
+        ends = f'x1="{x:.1f}" y1="{TOP}" x2="{x:.1f}" y2="{inner.height - BOTTOM}"'
+    else:
+        _, y = inner.at(inner.x.low, mark.at)
+        ends = f'x1="{LEFT}" y1="{y:.1f}" x2="{inner.width - RIGHT}" y2="{y:.1f}"'
+    return (
+        f'<g class="{mark.css}"><line class="mark" {ends}><title>{escape(mark.name)}</title>'
+        "</line></g>"
+    )
+
+
 def _draw(inner: _Inner, series: Series) -> str:
     xs = [float(x) for x in series.xs]
     ys = [float(y) for y in series.ys]
@@ -192,11 +241,12 @@ def _draw(inner: _Inner, series: Series) -> str:
         if place is not None:
             path.append(f"{'M' if pen_up else 'L'}{place[0]:.1f} {place[1]:.1f}")
         pen_up = place is None
-    css = "line faint" if series.kind == "faint" else "line"
+    css = f"line {series.kind}" if series.kind in ("faint", "dashed") else "line"
     return f'<g class="{series.css}"><path class="{css}" d="{"".join(path)}"/></g>'
 
 
-def _svg(width: int, height: int, title: str, body: str) -> str:
+def wrapped(width: int, height: int, title: str, body: str) -> str:
+    """A chart of its parts; the title is what a screen reader says."""
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" preserveAspectRatio="xMidYMid meet">'
         f"<title>{escape(title)}</title>{body}</svg>"

@@ -296,7 +296,8 @@ def play(stage: Stage, fault: Fault) -> Result:
     check_limits(positions if fault.braked else positions[: -_resting(commands)])
     hold = None
     if fault.outcome == STOP and began:
-        fell_ill = stage.policy.spoiled or began[0]
+        strangers = [h["at"] for h in stage.ear.on(COMMAND) if tuple(h["name"]) != NAMES]
+        fell_ill = min(strangers, default=stage.policy.spoiled or began[0])
         hold = max(commands[-_resting(commands)][0] - fell_ill, 0.0)
     return Result(hold, said, ended - start, code, _record(stage.folder), positions)
 

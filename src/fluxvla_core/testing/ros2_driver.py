@@ -27,7 +27,7 @@ from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 from fluxvla_core.ros2.require import message_class
 
-_START_S = 20.0
+_START_S = 120.0
 
 
 class Driver:

@@ -76,6 +76,20 @@ def test_other_streams_are_well():
     assert [m.number for _, m in ill("x=drop").apply("s", message(1))] == [1]
 
 
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("s=drop:0", "the share that is dropped is above 0 and at most 1"),
+        ("s=drop:1.5", "the share that is dropped is above 0 and at most 1"),
+        ("s=delay:-1", "a delay is a positive number of seconds"),
+        ("s=freeze:2", "freeze takes no amount; drop, delay, clock do"),
+    ],
+)
+def test_an_amount_that_means_nothing_is_refused(text, what):
+    with pytest.raises(UsageError, match=what):
+        Fault.parse(text)
+
+
 class Publisher:
     def __init__(self):
         self.sent = []

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,14 +16,22 @@ from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
 from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_sim.aloha.arms import HOME
+from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
+from fluxvla_sim.aloha.world import CUBE
+from fluxvla_sim.ros2 import operators
 from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
+from fluxvla_sim.ros2.clock import SlowedClock
 from fluxvla_sim.ros2.command import timed_fault
+from fluxvla_sim.ros2.judge import Judge
+from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
 from fluxvla_sim.ur.scene import HOME as UR_HOME
 from fluxvla_ur.embodiment import JOINTS
 from fluxvla_ur.operator import UROperator
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import UsageError
+from fluxvla_core.control.clock import in_lockstep
+from fluxvla_core.errors import ConfigError, NotReady, UsageError
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.faults import Fault
 from fluxvla_core.ros2.require import message_class
@@ -121,6 +130,7 @@ def says(operator, what=""):
     return None
 
 
+@pytest.mark.realtime
 class TestAloha:
     def test_it_is_driven_reset_and_made_ill_through_topics(self, simulate, connect, topics):
         simulate("aloha", "--ros2", "--cameras", "top")
@@ -206,6 +216,7 @@ def runner(tmp_path, second_time=lambda: None, max_age_s=PATIENT["max_age_s"], *
     )
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("async_execution", [False, True])
 def test_a_policy_drives_the_robot_through_the_loop(simulate, tmp_path, async_execution):
     simulate("aloha", "--ros2", "--cameras", "top")
@@ -218,6 +229,7 @@ def test_a_policy_drives_the_robot_through_the_loop(simulate, tmp_path, async_ex
     assert run.ros_operator.last_action[0] > 0.2
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("stream", ["top", "left arm"])
 def test_a_stream_that_dies_stops_the_arm_and_is_named(simulate, topics, tmp_path, stream):
     simulate("aloha", "--ros2", "--cameras", "top")
@@ -231,6 +243,7 @@ def test_a_stream_that_dies_stops_the_arm_and_is_named(simulate, topics, tmp_pat
     assert (trip.rule, "is silent" in trip.what) == ("freshness", True)
 
 
+@pytest.mark.realtime
 class TestUR5e:
     @pytest.mark.parametrize(
         "controller", ["forward_position_controller", "scaled_joint_trajectory_controller"]
@@ -246,6 +259,190 @@ class TestUR5e:
         allowed = np.array([0.04] * 6 + [0.15])
         drive(operator, target, lambda state: (abs(state - target) < allowed).all())
         assert topics.facts()["tasks"]["lift_cube"]["success"] is False
+
+
+@pytest.mark.realtime
+class TestInSimulation:
+    """The operators that know that their robot is simulated."""
+
+    def test_episodes_begin_from_seeds(self, simulate, connect, topics):
+        simulate("aloha", "--ros2", "--cameras", "top", "--real-time-factor", "0.5")
+        operator = connect(AlohaSimROSOperator, seed=20, real_time_factor=0.5, **ALOHA)
+        stale = operator.get_frame()
+        operator.begin_episode("pick up the cube with the right arm and hold it", 1)
+        frame = operator.get_frame()
+        assert operator.facts()["seed"] == 21
+        assert (frame.images["top"] != stale.images["top"]).any(), "the cube is elsewhere"
+        # Receipt stamps are on the operator's own, slower clock.
+        assert 0.0 <= operator.clock.now() - frame.stamps["top"] < 5.0
+
+        operator.send_action(HOME)
+        wait_for(lambda: operator.facts()["steps"] > 3)
+        assert (operator.task_success(), operator.task_done()) == (False, False)
+        found = operator.episode_facts()
+        assert found["real_time_factor"] == 0.5
+        assert 0.0 < found["real_time_kept"] < 1.5
+
+        operator.begin_episode("hand the cube over to the left arm", 0)
+        assert (operator.facts()["seed"], operator.facts()["steps"]) == (20, 0)
+        assert operator.last_action is None, "or a stop would send the arm back there"
+
+    def test_two_clocks_that_differ_are_refused(self, simulate, connect):
+        simulate("aloha", "--ros2", "--cameras", "top")
+        with pytest.raises(ConfigError, match=r"runs at 1 of real time, this operator is set to 0"):
+            connect(AlohaSimROSOperator, real_time_factor=0.5, **ALOHA)
+
+    def test_a_new_episode_that_nobody_sees_is_not_begun(
+        self, simulate, connect, topics, monkeypatch
+    ):
+        simulate("ur5e", "--ros2", "--cameras", "front")
+        operator = connect(URSimROSOperator, publish_rate=50.0, **UR)
+        operator.begin_episode("pick up the red cube", 4)
+        assert operator.task_success() is False
+        topics.tell("/sim/fault", "front=freeze")
+        wait_for(lambda: len({operator._stamp("front") for _ in [time.sleep(0.3)] * 2}) == 1)
+        monkeypatch.setattr(operators, "RESET_S", 3.0)
+        with pytest.raises(NotReady, match="the simulator shows nothing of the new episode"):
+            operator.begin_episode("pick up the red cube", 5)
+
+
+class TestWhatTheSimulatorTells:
+    FACTS = (
+        '{"tasks": {"a": {"instruction": "Do this", "success": true, "done": true},'
+        ' "b": {"instruction": "do that", "success": false, "done": false}}, "time": %s}'
+    )
+
+    @pytest.fixture
+    def operator(self, monkeypatch):
+        operator = AlohaSimROSOperator(real_time_factor=0.5)
+        self.time, self.receipt = 10.0, 100.0
+
+        def newest(name):
+            message = SimpleNamespace(data=self.FACTS % self.time)
+            return SimpleNamespace(message=message, receipt=self.receipt)
+
+        monkeypatch.setattr(operator, "newest", newest)
+        return operator
+
+    @pytest.mark.parametrize(
+        ("said", "success", "done"),
+        [("do  THIS", True, True), ("do that", False, False), ("dance", None, False)],
+    )
+    def test_success_is_that_of_the_instruction(self, operator, said, success, done):
+        operator._instruction = said
+        assert operator.task_success() is success
+        assert operator.task_done() is done
+
+    @pytest.mark.parametrize(("simulated", "kept"), [(5.0, 1.0), (2.0, 0.4)])
+    def test_time_that_was_not_kept_is_told(self, operator, caplog, simulated, kept):
+        assert operator.episode_facts() == {"real_time_factor": 0.5, "real_time_kept": None}
+        operator._begun = operator._simulated()
+        self.time, self.receipt = self.time + simulated, self.receipt + 10.0
+        operator.task_success()
+        assert operator.episode_facts() == {"real_time_factor": 0.5, "real_time_kept": kept}
+        warned = "the simulator kept 40 % of the time that it stated" in caplog.text
+        assert warned == (kept < 0.95)
+
+    def test_silence_is_no_answer(self, operator, monkeypatch):
+        monkeypatch.setattr(operator, "newest", lambda name: None)
+        with pytest.raises(NotReady, match=r"the simulator \(/sim/facts\) has said nothing yet"):
+            operator.task_success()
+
+    @pytest.mark.parametrize("factor", [0.0, 2.0])
+    def test_a_factor_that_is_none_is_refused(self, factor):
+        with pytest.raises(ConfigError, match="real_time_factor must be above 0 and at most 1"):
+            URSimROSOperator(real_time_factor=factor)
+
+    def test_ages_are_in_simulated_seconds(self):
+        operator = URSimROSOperator(real_time_factor=0.25, max_age_s=0.5, max_skew_s=0.1)
+        assert (operator.max_age_s, operator.max_skew_s) == (2.0, 0.4)
+
+
+@pytest.mark.realtime
+def test_every_fault_reaches_whoever_listens(simulate, topics):
+    simulate("aloha", "--ros2", "--cameras", "top")
+    connection = Connection("listener")
+    kind = message_class("sensor_msgs.msg:JointState")
+    kept = deque(maxlen=12)
+    # Not a stream of ours: that leaves out what comes twice or late.
+    connection.node.create_subscription(kind, "/puppet/joint_left", lambda m: kept.append(m), 12)
+
+    def stamps():
+        found = [message.header.stamp for message in list(kept)]
+        return [stamp.sec + stamp.nanosec * 1e-9 for stamp in found]
+
+    def late():
+        return time.time() - stamps()[-1]
+
+    def silent():
+        kept.clear()
+        time.sleep(1.0)
+        return not kept
+
+    def full(check):
+        return lambda: len(kept) == 12 and check()
+
+    shows = {
+        "freeze": full(lambda: len(set(stamps())) == 1),
+        "drop": silent,
+        "delay:3": full(lambda: late() > 2.5),
+        "nan": full(lambda: np.isnan(kept[-1].position).all()),
+        "duplicate": full(lambda: len(set(stamps())) <= 7),
+        "out_of_order": full(lambda: (np.diff(stamps()) < 0).sum() >= 5),
+        "clock:-100": full(lambda: late() > 90),
+    }
+    try:
+        wait_for(lambda: kept)
+        for fault, check in shows.items():
+            topics.tell("/sim/fault", f"left arm={fault}")
+            wait_for(check)
+        topics.tell("/sim/fault", "left arm=well")
+        wait_for(full(lambda: late() < 2.0 and (np.diff(stamps()) > 0).all()))
+    finally:
+        connection.close()
+
+
+class TestJudge:
+    def test_an_episode_is_settled_after_its_last_step(self):
+        judge, scene = Judge(CUBE), AlohaScene()
+        judge.reset(7)
+        scene.reset(7)
+        for _ in range(299):
+            judge.after(scene)
+        told = judge.tell()
+        assert (told["seed"], told["resets"], told["steps"]) == (7, 1, 299)
+        assert not told["tasks"]["lift_hold"]["done"]
+        for _ in range(5):
+            judge.after(scene)
+        told = judge.tell()
+        assert told["steps"] == 300
+        assert [t["done"] for t in told["tasks"].values()] == [True, True]
+        assert [t["success"] for t in told["tasks"].values()] == [False, False]
+        for command in Expert(scene.model).plan("lift_hold", sample_cube(8)):
+            if judge.tell()["seed"] != 8:
+                scene.reset(8)
+                judge.reset(8)
+            scene.step(command)
+            judge.after(scene)
+        told = judge.tell()["tasks"]
+        assert told["lift_hold"] == {
+            "instruction": "pick up the cube with the right arm and hold it",
+            "success": True,
+            "done": True,
+        }
+        assert not told["transfer_cube"]["success"]
+        judge.reset(9)
+        assert (judge.tell()["resets"], judge.tell()["steps"]) == (3, 0)
+
+
+def test_a_slowed_clock_is_slower():
+    clock = SlowedClock(0.25)
+    begin, began = clock.now(), time.monotonic()
+    clock.sleep_until(begin + 0.05)
+    assert clock.now() - begin >= 0.05
+    assert time.monotonic() - began >= 0.2
+    clock.sleep_until(begin)
+    assert not in_lockstep(clock)
 
 
 class TestBodies:
@@ -310,6 +507,12 @@ class TestCommandLine:
         [
             (["aloha"], "a simulated robot is reached over ROS 2 here"),
             (["aloha", "--ros2", "--fault", "x=drop"], "the robot has no stream 'x'; it has left"),
+            (["aloha", "--ros2", "--fault", "top=nan"], "top is a camera: a picture's numbers"),
+            (["ur5e", "--ros2", "--fault", "gripper=clock:1"], "gripper is a bare number"),
+            (["ur5e", "--ros2", "--fault", "program running=drop"], "said once, at the start"),
+            (["aloha", "--ros2", "--task", "x"], "there is no task 'x'; there are transfer_cube"),
+            (["aloha", "--ros2", "--real-time-factor", "0"], "must be above 0 and at most 1"),
+            (["aloha", "--ros2", "--camera-hz", "0"], "cameras need a rate from 0 to 1000 Hz"),
             (["aloha", "--ros2", "--preset", "x"], "unknown preset 'x'; known are cobot_magic"),
             (["aloha", "--ros2", "--cameras", "x"], "no camera 'x'; there are top, left_wrist"),
             (["ur5e", "--ros2", "--controller", "x"], "unknown controller 'x'"),

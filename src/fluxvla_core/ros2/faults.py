@@ -21,6 +21,7 @@ MODES: Mapping[str, str] = {
     "out_of_order": "every second message is sent after the one that follows it",
     "clock": "stamps are off by an amount of seconds, as after a step of the clock",
 }
+AMOUNTS = ("drop", "delay", "clock")
 _NUMBERS = ("position", "velocity", "effort", "data")
 
 
@@ -36,7 +37,7 @@ class Fault:
         """``STREAM=MODE`` or ``STREAM=MODE:AMOUNT``, as on a command line.
 
         Raises:
-            UsageError: another form, an unknown mode, or no number.
+            UsageError: another form, an unknown mode, or an amount that means nothing.
         """
         stream, _, rest = text.partition("=")
         mode, _, amount = rest.partition(":")
@@ -51,6 +52,12 @@ class Fault:
             value = math.nan
         if not math.isfinite(value):
             raise UsageError(f"{text!r}: {amount!r} is no number")
+        if mode == "drop" and not 0 < value <= 1:
+            raise UsageError(f"{text!r}: the share that is dropped is above 0 and at most 1")
+        if mode == "delay" and value <= 0:
+            raise UsageError(f"{text!r}: a delay is a positive number of seconds")
+        if amount and mode not in AMOUNTS:
+            raise UsageError(f"{text!r}: {mode} takes no amount; {', '.join(AMOUNTS)} do")
         return stream, cls(mode, value)
 
 

@@ -67,8 +67,10 @@ class SimCommand:
             action="append",
             default=[],
             metavar="STREAM=MODE[:AMOUNT][@S]",
-            help="make a stream ill, S seconds after the start; modes: freeze, drop, delay, nan, "
-            "duplicate, out_of_order, clock",
+            help="make a stream ill, S seconds after the start (also at any time, as text on "
+            f"/sim/fault; STREAM=well ends it). {_modes()}. Streams of aloha: 'left arm', 'right "
+            "arm', top, left_wrist, right_wrist; of ur5e: arm, gripper, 'speed scaling', front, "
+            "wrist",
         )
         parser.add_argument("--domain-id", type=int, metavar="N", help="ROS domain")
         parser.add_argument("--seconds", type=float, metavar="S", help="end by itself")
@@ -100,14 +102,14 @@ class SimCommand:
     def _simulate(self, args: Any, faults: list[Any], reporter: Any) -> int:
         from fluxvla_sim.robots import ROBOTS
         from fluxvla_sim.ros2.judge import Judge
-        from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_stream
+        from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_fault
 
         robot = ROBOTS[args.robot]
         world, _ = robot.find(args.task or robot.default_tasks[0])
         body = _aloha(args) if args.robot == "aloha" else _ur(args)
         _some_cameras(body, args.cameras)
-        for _, stream, _ in faults:
-            check_stream(stream, {*body.states, *body.latched, *body.cameras})
+        for _, stream, fault in faults:
+            check_fault(body, stream, fault)
         settings = NodeSettings(
             name=f"sim_{args.robot}",
             seed=args.seed,
@@ -140,6 +142,13 @@ class SimCommand:
                 f"{counts.commands} commands"
             )
         return 0
+
+
+def _modes() -> str:
+    from fluxvla_core.ros2.faults import AMOUNTS, MODES
+
+    names = {mode: f"{mode}:AMOUNT" if mode in AMOUNTS else mode for mode in MODES}
+    return "; ".join(f"{names[mode]}: {what}" for mode, what in MODES.items())
 
 
 def timed_fault(text: str) -> tuple[float, str, Any]:

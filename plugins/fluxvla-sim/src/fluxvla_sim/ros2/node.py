@@ -27,7 +27,7 @@ from fluxvla_core.ros2 import images, qos
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE
+from fluxvla_core.ros2.streams import FLOAT64, IMAGE
 from fluxvla_core.ros2.trouble import BadMessage
 from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.ros2.bodies import Body
@@ -110,7 +110,6 @@ class RobotNode:
         self._body, self._scene, self._settings = body, scene, settings
         self._reporter, self._judge = reporter, judge
         self._faults = Faults()
-        self._streams = {*body.states, *body.latched, *body.cameras}
         # The scene's data, the body's target and what is set by topics.
         self._lock = threading.Lock()
         self._stopping = threading.Event()
@@ -267,7 +266,7 @@ class RobotNode:
             return
         try:
             stream, fault = Fault.parse(text)
-            check_stream(stream, self._streams)
+            check_fault(self._body, stream, fault)
         except FluxError as error:
             self._reporter.warn(str(error))
             return
@@ -311,14 +310,22 @@ class RobotNode:
             renderer.close()
 
 
-def check_stream(stream: str, known: set[str]) -> None:
-    """Refuse a fault for a stream that the robot does not have.
+def check_fault(body: Body, stream: str, fault: Fault) -> None:
+    """Refuse a fault that a robot's stream cannot have.
 
     Raises:
-        UsageError: names those that it has.
+        UsageError: there is no such stream (names those that there are), or its messages have
+            nothing that could be wrong in this way.
     """
+    known = [*body.states, *body.cameras]
+    if stream in body.latched:
+        raise UsageError(f"{stream} is said once, at the start: it can have no fault")
     if stream not in known:
-        raise UsageError(f"the robot has no stream {stream!r}; it has {', '.join(sorted(known))}")
+        raise UsageError(f"the robot has no stream {stream!r}; it has {', '.join(known)}")
+    if fault.mode == "nan" and stream in body.cameras:
+        raise UsageError(f"{stream} is a camera: a picture's numbers cannot be NaN")
+    if fault.mode == "clock" and stream in body.states and body.states[stream][1] == FLOAT64:
+        raise UsageError(f"{stream} is a bare number: it bears no stamp that could be wrong")
 
 
 class _Drawing(threading.Thread):

@@ -142,11 +142,7 @@ class InSimulation(RosOperator):
         Raises:
             NotReady: there was none yet.
         """
-        received = self.newest("facts")
-        if received is None:
-            raise NotReady(f"the simulator ({FACTS}) has said nothing yet")
-        facts: Mapping[str, Any] = json.loads(received.message.data)
-        return facts
+        return self._told()[0]
 
     def episode_facts(self) -> dict[str, Any]:
         """JSON values about how the last episode was simulated, for whoever reports its outcome.
@@ -178,9 +174,14 @@ class InSimulation(RosOperator):
 
     def _simulated(self) -> tuple[float, float]:
         """Simulated seconds of the newest facts, and when they came (monotonic)."""
+        facts, receipt = self._told()
+        return float(facts["time"]), receipt
+
+    def _told(self) -> tuple[Mapping[str, Any], float]:
         received = self.newest("facts")
-        assert received is not None
-        return float(json.loads(received.message.data)["time"]), received.receipt
+        if received is None:
+            raise NotReady(f"the simulator ({FACTS}) has said nothing yet")
+        return json.loads(received.message.data), received.receipt
 
     def _stamp(self, name: str) -> int:
         received = self.newest(name)

@@ -93,6 +93,29 @@ def test_a_method_that_is_not_there_is_named_with_its_place(bench):
     )
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("latency", [0.03, 0.25])
+def test_a_simulated_latency_is_between_observation_and_chunk(bench, going, method, latency):
+    bench.run(chunk_joining=method, simulated_latency=latency, max_publish_step=150)
+
+    chunks = [row for row in bench.trace() if row["event"] == "chunk"][1:]
+    took = [row["t"] - row["observed"] for row in chunks]
+    # It is there at the first beat after it.
+    np.testing.assert_allclose(took, np.ceil(latency * 50 - 1e-6) / 50, atol=1e-6)
+    assert bench.arm.state[0] == pytest.approx(0.8, abs=0.05)
+    bench.assert_within_limits()
+
+
+def test_frozen_keyframes_follow_the_simulated_latency(bench, make_waver):
+    bench.policy = going = Going(make_waver(horizon=10))
+    bench.run(chunk_joining="rtc", simulated_latency=0.25, max_publish_step=100)
+
+    frozen = [rest.frozen for rest in going.told if rest is not None]
+    # The first answer took no time; from the second on 0.26 s were measured: three keyframes.
+    assert frozen[0] == 0
+    assert set(frozen[1:]) == {3}
+
+
 @pytest.mark.realtime
 def test_in_real_time_the_policy_is_told_what_is_executed_meanwhile(bench, make_arm, going):
     bench.arm = make_arm(realtime=True)

@@ -120,6 +120,8 @@ def test_a_start_pose_that_cannot_be(bench, pose, message):
             {"chunk_joining": "rtc"},
             "chunk_joining is 'rtc', and Waver cannot go on from a chunk",
         ),
+        ({"simulated_latency": -1}, "simulated_latency must be 0 or more, got -1"),
+        ({"simulated_latency": float("nan")}, "simulated_latency must be 0 or more, got nan"),
         ({"execute_horizon": 0}, "execute_horizon must be at least 1, got 0"),
         ({"action_chunk": 0}, "action_chunk must be at least 1, got 0"),
         ({"max_publish_step": 0}, "max_publish_step must be at least 1, got 0"),
@@ -143,6 +145,17 @@ def test_messages_name_the_place_in_the_config(bench):
 
 
 @pytest.mark.realtime
+def test_a_robot_has_a_latency_of_its_own(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+
+    refused(
+        bench,
+        ConfigError,
+        "simulated_latency is for simulations; this robot has its own",
+        simulated_latency=0.1,
+    )
+
+
 def test_a_slower_rate_is_allowed_on_a_robot(bench, make_arm):
     bench.arm = make_arm(realtime=True)
 

@@ -4,7 +4,8 @@ The thread that calls ``run`` alone sends commands, on the absolute deadlines of
 a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
 policy never keeps a command from being sent: without a chunk the arm brakes and holds, and after
 ``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still
-between commands, observing happens in the sending thread (renderers are bound to one).
+between commands, observing happens in the sending thread (renderers are bound to one), and answers
+take as long as they are said to: none, or ``latency_s``.
 
 A chunk is played whole before the next is asked for (``Synchronous``), or the policy is asked again
 while its last answer is being played (the joiners that are ``streamed``).
@@ -53,6 +54,16 @@ class Seen:
 
 
 @dataclass(frozen=True)
+class Asked:
+    """A question under way: the ``(D,)`` command that the arm had then, and, in lockstep, the time
+    before which the answer does not count as there."""
+
+    future: Future[tuple[Seen, Any]]
+    last: Array
+    due: float
+
+
+@dataclass(frozen=True)
 class Loop:
     """What one episode is run with.
 
@@ -69,6 +80,7 @@ class Loop:
         settings: ``starvation_s`` and ``first_chunk_s``.
         worker: where the policy thinks.
         interrupts: looked at while waiting; the beat looks at them too.
+        latency_s: how long, in lockstep, an answer takes.
     """
 
     path: CommandPath
@@ -83,6 +95,7 @@ class Loop:
     settings: SafetySettings
     worker: Worker
     interrupts: Interrupts
+    latency_s: float = 0.0
 
     def run(self) -> str:
         """Run until the beat says that the episode is over.
@@ -108,23 +121,22 @@ class Loop:
     def _play_whole(self) -> NoReturn:
         while True:
             self.path.play(self._targets())
-            self._receive(*self._wait(*self._ask()))
+            asked, since = self._ask(), self.clock.now()
+            while not self._arrived(asked):
+                self._check_starved(self.clock.now() - since)
+                self.path.hold()
+            # The arm may have been braking: the chunk starts where it is commanded to be now.
+            self._receive(self._answer(asked), self.path.limiter.last)
 
     def _play_streamed(self) -> NoReturn:
         period = self.path.rate.period
-        asked: tuple[Future[tuple[Seen, Any]], Array] | None = None
+        asked: Asked | None = None
         starved_since: float | None = None
         while True:
             now = self.clock.now()
-            if asked is not None and asked[0].done():
-                self._receive(asked[0].result(), asked[1])
-                asked = None
+            asked = self._take(asked)
             if asked is None and self.joiner.wants_chunk(now):
-                asked = self._ask()
-                if self.lockstep:
-                    # Time stands still until the answer is there.
-                    self._receive(*self._idle(*asked))
-                    asked = None
+                asked = self._take(self._ask())
             target = self.joiner.target(now + period)
             if target is not None:
                 starved_since = None
@@ -147,39 +159,58 @@ class Loop:
             )
         return np.array(rows)
 
-    def _ask(self) -> tuple[Future[tuple[Seen, Any]], Array]:
+    def _ask(self) -> Asked:
         last, ahead = self.path.limiter.last, self.joiner.ahead()
 
         def think(seen: Seen) -> tuple[Seen, Any]:
             rest = None if ahead is None else ahead.seen_at(seen.at, self.horizon)
             return seen, self.think(seen, rest)
 
+        due = self.clock.now() + self.latency_s
         if self.lockstep:
             seen = self.observe(last)
-            return self.worker.submit(lambda: think(seen)), last
-        return self.worker.submit(lambda: think(self.observe(last))), last
+            return Asked(self.worker.submit(lambda: think(seen)), last, due)
+        return Asked(self.worker.submit(lambda: think(self.observe(last))), last, due)
 
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
         """The first answer: nothing moves yet, and the policy may have to warm up.
 
         It is asked twice on a robot: by the time of a long first answer, what it saw is old.
         """
-        answer, last = self._idle(*self._ask())
+        asked = self._ask()
+        answer = self._idle(asked)
         if not self.lockstep:
-            answer, last = self._idle(*self._ask())
-        return answer, last
+            asked = self._ask()
+            answer = self._idle(asked)
+        return answer, asked.last
 
-    def _idle(
-        self, future: Future[tuple[Seen, Any]], last: Array
-    ) -> tuple[tuple[Seen, Any], Array]:
+    def _take(self, asked: Asked | None) -> Asked | None:
+        """Receive the answer if it is there; else the question is still under way."""
+        if asked is None or not self._arrived(asked):
+            return asked
+        self._receive(self._answer(asked), asked.last)
+        return None
+
+    def _arrived(self, asked: Asked) -> bool:
+        if self.lockstep:
+            # Half a microsecond: the clock sums its steps, and the sum is rounded.
+            return self.clock.now() >= asked.due - 5e-7
+        return asked.future.done()
+
+    def _answer(self, asked: Asked) -> tuple[Seen, Any]:
+        # In lockstep time stands still until it is there.
+        return self._idle(asked) if self.lockstep else asked.future.result()
+
+    def _idle(self, asked: Asked) -> tuple[Seen, Any]:
+        """The answer, waited for in real time while nothing is sent."""
         until = time.monotonic() + self.settings.first_chunk_s
         while True:
             self.interrupts.check()
             try:
-                return future.result(timeout=_LOOK_S), last
+                return asked.future.result(timeout=_LOOK_S)
             except NotYet:
                 # A policy may raise the same class; then the answer is there.
-                if future.done():
+                if asked.future.done():
                     raise
             if time.monotonic() > until:
                 raise Starved(
@@ -187,19 +218,6 @@ class Loop:
                     cause="it hangs, or it is far slower than this robot needs",
                     next="safety.first_chunk_s sets how long it may take to warm up",
                 )
-
-    def _wait(
-        self, future: Future[tuple[Seen, Any]], last: Array
-    ) -> tuple[tuple[Seen, Any], Array]:
-        """The next answer; on a robot the arm brakes and holds in the meantime."""
-        if self.lockstep:
-            return self._idle(future, last)
-        since = self.clock.now()
-        while not future.done():
-            self._check_starved(self.clock.now() - since)
-            self.path.hold()
-        # The arm may have been braking: the next chunk starts where it is commanded to be now.
-        return future.result(), self.path.limiter.last
 
     def _receive(self, answer: tuple[Seen, Any], anchor: Array) -> None:
         seen, keyframes = answer

@@ -7,6 +7,7 @@ specification's shape overrides ``get_ros_observation``, ``update_observation_wi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -73,6 +74,8 @@ class BaseInferenceRunner:
         async_execution: think while moving: short for ``chunk_joining="latest_only"``.
         chunk_joining: how chunks become one motion: a name of ``control.joiners.METHODS``, or a
             table with ``method = '<name>'`` and its parameters. ``synchronous`` by default.
+        simulated_latency: seconds from an observation to its chunk, in a simulation whose time
+            stands still while the policy thinks: how the same policy would do on a slower computer.
         gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
             that it presses on what it holds; in the gripper's unit. None leaves them as they are.
         action_filters: tables or callables that may alter an action, in order, before the limits.
@@ -114,6 +117,7 @@ class BaseInferenceRunner:
         execute_horizon: int | None = None,
         async_execution: bool = False,
         chunk_joining: str | Mapping[str, Any] | None = None,
+        simulated_latency: float = 0.0,
         gripper_threshold: float | None = None,
         action_filters: Sequence[Any] = (),
         safety: Mapping[str, Any] | None = None,
@@ -139,6 +143,7 @@ class BaseInferenceRunner:
         self.prepare_pose = prepare_pose
         self.async_execution = async_execution
         self.chunk_joining = self._checked_joining(chunk_joining)
+        self.simulated_latency = simulated_latency
         self.gripper_threshold = gripper_threshold
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
@@ -171,6 +176,10 @@ class BaseInferenceRunner:
                 f"is {state_dim}; {self.embodiment.name} has "
                 f"{self.embodiment.state_dim} state values",
             )
+        if not 0.0 <= simulated_latency < math.inf:
+            raise self._wrong("simulated_latency", f"must be 0 or more, got {simulated_latency}")
+        if simulated_latency and not self.robot.lockstep:
+            raise self._wrong("simulated_latency", "is for simulations; this robot has its own")
         self.action_filters = [build_action_filter_from_cfg(f, context) for f in action_filters]
         if gripper_threshold is not None:
             # After the config's own filters, right before the limits.
@@ -310,6 +319,7 @@ class BaseInferenceRunner:
             latch=self.latch,
             filters=self.action_filters,
             joiner=joiner,
+            latency_s=self.simulated_latency,
             keyframes=min(horizons) if horizons else None,
             most_steps=self.max_publish_step,
             start_pose=self.prepare_pose,

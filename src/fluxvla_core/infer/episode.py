@@ -154,6 +154,7 @@ class Episode:
             settings=plan.settings,
             worker=plan.worker,
             interrupts=plan.interrupts,
+            latency_s=plan.latency_s,
         )
 
     def _first_reading(self) -> tuple[dict[str, Any], Frame | None]:

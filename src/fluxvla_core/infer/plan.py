@@ -47,6 +47,7 @@ class Plan:
         latch: of the run; an episode does not begin while it is tripped.
         filters: the config's ``action_filters``.
         joiner: how chunks become one motion.
+        latency_s: how long, in a simulation whose time stands still, an answer takes.
         keyframes: how many of a chunk's keyframes are played; None plays all.
         most_steps: commands after which the episode ends.
         start_pose: ``(D,)``, where the arm goes first; None stays.
@@ -67,6 +68,7 @@ class Plan:
     latch: Latch
     filters: Sequence[Filter]
     joiner: Joiner
+    latency_s: float
     keyframes: int | None
     most_steps: int
     start_pose: Sequence[float] | None

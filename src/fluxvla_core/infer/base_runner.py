@@ -28,7 +28,7 @@ from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.control.joining import Joiner
 from fluxvla_core.control.worker import Worker
-from fluxvla_core.errors import ConfigError, SpecMismatch
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.infer.episode import Episode
 from fluxvla_core.infer.plan import Plan
@@ -36,6 +36,7 @@ from fluxvla_core.infer.robot import Robot
 from fluxvla_core.infer.session import Session
 from fluxvla_core.infer.sources import TaskSource, task_source
 from fluxvla_core.infer.tasks import Task, check_descriptions
+from fluxvla_core.infer.views import scaled_views
 from fluxvla_core.record.ros_messages import typestore
 from fluxvla_core.record.trace import next_folder
 from fluxvla_core.safety.ramp import check_pose
@@ -228,7 +229,8 @@ class BaseInferenceRunner:
                 raise self._wrong("camera_names", f"{name!r} is none of {', '.join(known)}")
             if name not in self._cameras:
                 raise self._wrong("camera_names", f"the policy looks at {name!r} too")
-        self._check_views(self.policy.embodiment, looks_at)
+        for warning in scaled_views(self.policy.embodiment, self.embodiment, looks_at):
+            self.context.reporter.warn(warning)
         if self.prepare_pose is not None:
             check_pose(self.prepare_pose, self.embodiment)
 
@@ -352,28 +354,6 @@ class BaseInferenceRunner:
                 reporter.warn(problem)
         if not worker.close(1.0):
             reporter.warn("the policy still hangs; its thread ends with the program")
-
-    def _check_views(self, trained: EmbodimentSpec, names: Sequence[str]) -> None:
-        """A camera may have more pixels than in training; it may not show another view."""
-        here = {camera.name: camera for camera in self.embodiment.cameras}
-        for then in trained.cameras:
-            now = here.get(then.name)
-            if then.name not in names or now is None:
-                continue
-            if (now.height, now.width) == (then.height, then.width):
-                continue
-            sizes = (
-                f"camera {then.name} gives {now.height} x {now.width} pictures; the policy was "
-                f"trained on {then.height} x {then.width}"
-            )
-            if abs(now.width * then.height - then.width * now.height) > 0.01 * (
-                now.height * then.width
-            ):
-                raise SpecMismatch(
-                    f"{sizes}: another view",
-                    next="set the camera to the size, or at least the aspect, of the recordings",
-                )
-            self.context.reporter.warn(f"{sizes}; they are scaled")
 
     def _task_source(self) -> TaskSource:
         domain_id = getattr(self.ros_operator, "domain_id", None)

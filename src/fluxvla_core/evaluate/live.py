@@ -13,7 +13,7 @@ import json
 import shutil
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,8 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.environment import Actor, Environment, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
+from fluxvla_core.contracts.optional import can_continue
 from fluxvla_core.control.clock import MonotonicClock
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
@@ -203,14 +205,21 @@ class _Driver:
         self.cameras = tuple(camera.name for camera in cameras)
         self.action_rate_hz = float(getattr(actor, "action_rate_hz", spec.rate_hz))
         self.horizon = int(getattr(actor, "horizon", 0))
+        self.continues = can_continue(actor)
         self.seconds = 0.0
 
     def reset(self, seed: int) -> None:
         self._actor.reset(seed)
 
     def predict_action(self, observation: Observation) -> Array:
+        return self._timed(self._actor.predict_action, observation)
+
+    def continue_action(self, observation: Observation, rest: Continuation) -> Array:
+        return self._timed(self._actor.continue_action, observation, rest)  # type: ignore[attr-defined]
+
+    def _timed(self, ask: Callable[..., Array], *arguments: Any) -> Array:
         began = time.perf_counter()
-        chunk = self._actor.predict_action(observation)
+        chunk = ask(*arguments)
         self.seconds += time.perf_counter() - began
         # An expert's chunks may be of any length; what a policy said, it has to keep.
         self.horizon = getattr(self._actor, "horizon", len(chunk))

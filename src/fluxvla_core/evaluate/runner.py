@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.build import RunContext, build_environment_from_cfg
 from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
@@ -22,7 +22,6 @@ from fluxvla_core.evaluate import results
 from fluxvla_core.evaluate.behaviours import count_behaviours, instruction_test
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
-from fluxvla_core.evaluate.live import Live, check_options
 from fluxvla_core.evaluate.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
@@ -47,6 +46,9 @@ from fluxvla_core.evaluate.worker import (
     Video,
     choose_tasks,
 )
+
+if TYPE_CHECKING:
+    from fluxvla_core.evaluate.live import Live
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"
@@ -142,7 +144,11 @@ class EvalRunner:
         self.shard = shard_of()
         # Under a launcher, nproc is the number of launched processes, not of each one's workers.
         own = self.context.nproc > 1 and self.shard.count == 1
-        usual = 1 if live else 2
+        try:
+            self._live = live_options(live)
+        except ConfigError as error:
+            raise self.wrong("live", error.what) from error
+        usual = 2 if self._live is None else 1
         self.workers = self.context.nproc if own else (usual if workers is None else workers)
         self.ckpt_path = ckpt_path
         self.episodes = episodes
@@ -152,7 +158,7 @@ class EvalRunner:
         self.baseline = baseline
         self.record_videos = record_videos
         self.episode_timeout_s = episode_timeout_s
-        self.folder = Path(self.context.work_dir) / (LIVE_FOLDER if live else FOLDER)
+        self.folder = Path(self.context.work_dir) / (FOLDER if self._live is None else LIVE_FOLDER)
         self._given = tasks
         for name, value, least in (
             ("episodes", episodes, 1),
@@ -170,13 +176,8 @@ class EvalRunner:
             raise self.wrong("height", "and width belong together: give both or none")
         if video_fps <= 0:
             raise self.wrong("video_fps", f"must be positive, got {video_fps:g}")
-        if live and instruction_swap:
+        if self._live is not None and instruction_swap:
             raise self.wrong("instruction_swap", "cannot be live: evaluate it stepped")
-        try:
-            options = check_options(live if isinstance(live, Mapping) else {}) if live else None
-        except ConfigError as error:
-            raise self.wrong("live", error.what) from error
-        self._live = None if options is None else plain(options)
         if environment is None:
             raise ConfigError(
                 f"{type(self).__name__} has no environment: where is the policy to act?",
@@ -215,6 +216,11 @@ class EvalRunner:
         self._spec = environment.spec
         what = resolve_name(self._policy, environment)
         environment.close()
+        names, *look = self._video
+        try:
+            video = Video.of(self._spec, names, *look)
+        except ConfigError as error:
+            raise self.wrong("video_cameras", error.what) from error
         self._tasks = choose_tasks(self._spec.tasks, self._given)
         if what in FROM_CHECKPOINT or self.baseline:
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
@@ -229,8 +235,8 @@ class EvalRunner:
             sources=sources,
             course=self._course,
             size=self._size,
-            video=self._film(self._spec),
-            live=self._live_settings(self._spec, video_fps=self._video[3]),
+            video=video,
+            live=self._live_settings(self._spec),
         )
 
     def run(self) -> dict[str, Any]:
@@ -358,7 +364,7 @@ class EvalRunner:
         )
         return {"shard": part.index, "episodes_left": left}
 
-    def _live_settings(self, spec: EnvironmentSpec, video_fps: float) -> Live | None:
+    def _live_settings(self, spec: EnvironmentSpec) -> Live | None:
         if self._live is None:
             return None
         if not spec.limited:
@@ -367,32 +373,28 @@ class EvalRunner:
                 f"needs an environment that takes joint targets; {spec.name} does not, and the "
                 "safety of a robot cannot be kept for its actions",
             )
+        from fluxvla_core.evaluate.live import Live
+
         options = dict(self._live)
         if self._course.replan_every is not None:
             options.setdefault("execute_horizon", self._course.replan_every)
-        fps = video_fps if self.record_videos else None
+        fps = self._video[3] if self.record_videos else None
         return Live(options, str(self.folder / RECORDS), fps)
-
-    def _film(self, spec: EnvironmentSpec) -> Video:
-        names, height, width, fps = self._video
-        known = {camera.name: camera for camera in spec.embodiment.cameras}
-        for name in names or ():
-            if name not in known:
-                there = ", ".join(known) or "none"
-                raise self.wrong("video_cameras", f"{name!r} is none of {there}")
-        chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
-        return Video(
-            tuple(
-                replace(camera, height=height or camera.height, width=width or camera.width)
-                for camera in chosen
-            ),
-            fps,
-        )
 
     def _ready(self) -> tuple[EnvironmentSpec, Settings]:
         assert self._spec is not None, "run_setup() comes first"
         assert self._settings is not None
         return self._spec, self._settings
+
+
+def live_options(live: bool | Mapping[str, Any]) -> dict[str, Any] | None:
+    """What drives the robot of a live evaluation; None for a stepped one."""
+    if live is False:
+        return None
+    from fluxvla_core.evaluate.live import check_options
+
+    options: dict[str, Any] = plain(check_options({} if live is True else live))
+    return options
 
 
 def plain(table: Any) -> Any:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.errors import EXIT_BAD_INPUT, ConfigError, FluxError, RunFailed
 from fluxvla_core.infer.local_policy import LocalPolicy, Question
@@ -39,6 +40,7 @@ class Facts:
     cameras: tuple[str, ...]
     action_rate_hz: float
     horizon: int
+    continues: bool = False
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,11 @@ class _Asked:
     connection: Connection
     name: str
     question: Question
+
+    @property
+    def kind(self) -> tuple[str, bool]:
+        """What those in one batch have in common: the policy, and whether they go on."""
+        return self.name, self.question.rest is None
 
 
 class PolicyServer:
@@ -111,16 +118,24 @@ class PolicyServer:
                 check_rows(policy)
                 self._policies[name] = policy
                 self.facts[name] = Facts(
-                    policy.embodiment, policy.cameras, policy.action_rate_hz, policy.horizon
+                    policy.embodiment,
+                    policy.cameras,
+                    policy.action_rate_hz,
+                    policy.horizon,
+                    policy.continues,
                 )
         except BaseException as error:  # noqa: BLE001 - it is raised where the server is made
             self._started.put(error)
             return
         self._started.put(None)
-        self._answer_all()
-
-    def _answer_all(self) -> None:
         connections: list[Connection] = []
+        try:
+            self._answer_all(connections)
+        finally:  # whatever ends this: nobody waits for an answer that will not come
+            for connection in connections:
+                connection.close()
+
+    def _answer_all(self, connections: list[Connection]) -> None:
         waiting: deque[_Asked] = deque()
         while True:
             # With questions in hand one only looks, else one sleeps.
@@ -130,8 +145,6 @@ class PolicyServer:
                     self._awake.recv_bytes()
                     new = self._new.get()
                     if new is None:
-                        for each in connections:
-                            each.close()
                         return
                     connections.append(new)
                     continue
@@ -147,8 +160,10 @@ class PolicyServer:
 
     def _answer_some(self, waiting: deque[_Asked]) -> None:
         """One forward pass for the oldest question and those that fit into its batch."""
-        policy = self._policies[waiting[0].name]
-        mine = [asked for asked in waiting if asked.name == waiting[0].name][: policy.batch_size]
+        oldest = waiting[0]
+        policy = self._policies[oldest.name]
+        alike = [asked for asked in waiting if asked.kind == oldest.kind]
+        mine = alike[: policy.batch_size]
         for asked in mine:
             waiting.remove(asked)
         answers: list[tuple[str, Any]]
@@ -183,6 +198,7 @@ class ServedPolicy:
         self.cameras = facts.cameras
         self.action_rate_hz = facts.action_rate_hz
         self.horizon = facts.horizon
+        self.continues = facts.continues
         self._connection = connection
         self._name = name
         self._seed = self._calls = 0
@@ -197,8 +213,15 @@ class ServedPolicy:
             FluxError: what means bad input, as the policy raised it.
             RunFailed: the policy raised something else, or the server is gone.
         """
+        return self._ask(Question(observation, self._seed, self._calls))
+
+    def continue_action(self, observation: Observation, rest: Continuation) -> Array:
+        """As ``predict_action``, for a chunk that goes on from ``rest`` (``ContinuesChunks``)."""
+        return self._ask(Question(observation, self._seed, self._calls, rest))
+
+    def _ask(self, question: Question) -> Array:
         try:
-            self._connection.send((self._name, Question(observation, self._seed, self._calls)))
+            self._connection.send((self._name, question))
             kind, answer = self._connection.recv()
         except (EOFError, OSError) as error:
             raise RunFailed("the process with the policy is gone") from error

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import Actor, Environment, TaskSpec
+from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate.ledger import EpisodeKey
 from fluxvla_core.evaluate.policies import Source, fit, make_policy
@@ -36,6 +36,31 @@ class Video:
 
     cameras: tuple[Camera, ...] = ()
     fps: float = 10.0
+
+    @classmethod
+    def of(
+        cls,
+        spec: EnvironmentSpec,
+        names: Sequence[str] | None,
+        height: int | None,
+        width: int | None,
+        fps: float,
+    ) -> Video:
+        """Videos of the cameras ``names``, the first one by default, in their own size by default.
+
+        Raises:
+            ConfigError: there is no such camera.
+        """
+        known = {camera.name: camera for camera in spec.embodiment.cameras}
+        for name in names or ():
+            if name not in known:
+                raise ConfigError(f"{name!r} is none of {', '.join(known) or 'none'}")
+        chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
+        sized = (
+            replace(camera, height=height or camera.height, width=width or camera.width)
+            for camera in chosen
+        )
+        return cls(tuple(sized), fps)
 
 
 @dataclass(frozen=True)

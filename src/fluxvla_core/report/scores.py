@@ -100,6 +100,13 @@ def _details(results: Mapping[str, Any]) -> dict[str, Any]:
             f"{number(timing.get('steps_per_s')):.0f} steps/s in {timing.get('workers')} "
             f"processes, {timing['episodes']} episodes in {number(timing.get('seconds')):.0f} s"
         )
+    live = tables.get("live", {})
+    if live:
+        stopped = ", ".join(f"{rule} {n}" for rule, n in dict(live.get("stopped_by", {})).items())
+        rows["on the wall clock"] = (
+            f"{number(live.get('missed_share')):.1%} of {live.get('ticks')} ticks without a target "
+            f"of the policy; stopped by safety: {stopped or 'none'}"
+        )
     if "policy_ms" in timing:
         rows["the policy's answer"] = f"{number(timing['policy_ms']):.1f} ms on average"
     return {**rows, **tables.get("settings", {})}

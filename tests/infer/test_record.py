@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import DataError, RunFailed
+from fluxvla_core.record.finish import finish_recording
 from fluxvla_core.record.recording import find_recordings, open_recording
 from fluxvla_core.safety.stops import BadChunk
 
@@ -250,6 +251,11 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     outcome = "interrupted" if found.whole else "cut short"
     assert found.summary()["outcome"] == outcome
     assert np.diff(times).max() < 5
+
+    assert finish_recording(found.path) != found.whole
+    assert open_recording(record).events == found.events
+    assert connections(found.path)["/fluxvla/command"][1] == len(commands)
+    assert sorted(p.name for p in record.iterdir()) == ["001-1"]
 
 
 def test_what_is_no_recording_is_said(tmp_path, bench):

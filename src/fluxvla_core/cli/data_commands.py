@@ -1,4 +1,4 @@
-"""``fluxvla data inspect``, ``validate``, ``stats`` and ``convert``."""
+"""``fluxvla data inspect``, ``validate``, ``stats``, ``convert`` and ``finish``."""
 
 from __future__ import annotations
 
@@ -124,6 +124,28 @@ class Convert:
             else:
                 found = convert(datasets[0], args.out, reporter)
             reporter.artifact("dataset", found)
+        return 0
+
+
+class Finish:
+    api = "1.0"
+    help = (
+        "Finish recordings that were cut short (kill -9, a full disk), so that ROS tools open "
+        "them. FluxVLA itself reads them as they are."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument(
+            "recording", metavar="DIR", help="an episode's folder, or several in one"
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.record.finish import finish_recording
+        from fluxvla_core.record.recording import find_recordings
+
+        for path in find_recordings(args.recording):
+            done = finish_recording(path)
+            print(f"{path}: {'finished' if done else 'is whole'}")
         return 0
 
 

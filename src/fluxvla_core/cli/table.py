@@ -40,7 +40,10 @@ COMMANDS: Mapping[str, Entry] = {
         "fluxvla_core.cli.data_commands:Stats", "print exact statistics of a dataset"
     ),
     "data convert": Entry(
-        "fluxvla_core.cli.data_commands:Convert", "write a dataset of LeRobot v2 as v3.0"
+        "fluxvla_core.cli.data_commands:Convert", "write recordings, or LeRobot v2, as v3.0"
+    ),
+    "data finish": Entry(
+        "fluxvla_core.cli.data_commands:Finish", "finish a recording that was cut short"
     ),
     "data collect": Entry(
         "fluxvla_core.cli.collect_command:Collect", "record demonstrations of a scripted expert"

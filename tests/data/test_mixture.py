@@ -301,3 +301,29 @@ def test_the_first_dataset_of_a_table():
         **plain,
         "statistic_name": "arm",
     }
+
+
+def test_its_parts_have_names_and_as_many_ids_as_samples(shared, others, left):
+    more, _ = others
+    again, other = (table(r, statistic_name=n) for r, n in ((more, "again"), (left, "left")))
+    several = mixture(table(shared), table(more), again, other)
+    sizes = several.lengths.tolist()
+    assert list(several.parts) == [shared.name, "more-1", "more-2", "left"]
+    assert list(several.parts.values()) == sizes
+    ids = sorted(int(several[i]["sample_ids"]) for i in range(len(several)))
+    assert ids == list(range(sum(sizes)))
+
+
+def test_parts_of_datasets_that_have_no_folder():
+    class Plain:
+        statistic_name = "plain"
+        statistics = {"plain": {}}  # noqa: RUF012
+
+        def __len__(self):
+            return 3
+
+    class Bare(Plain):
+        statistic_name = "bare"
+        statistics = {"bare": {}}  # noqa: RUF012
+
+    assert mixture(Plain(), Bare()).parts == {"plain": 3, "bare": 3}

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.optional import libav
+from fluxvla_core.data.scheduling import unchanged_scheduling
 from fluxvla_core.errors import ConfigError, DataError
 
 
@@ -97,6 +98,8 @@ class EpisodeEncoder:
         self._stream.options = dict(codec.options)
         # Threads would make the bytes depend on the machine; collectors run side by side anyway.
         self._stream.codec_context.thread_count = 1
+        with unchanged_scheduling():
+            self._stream.codec_context.open()
 
     def add(self, image: npt.NDArray[np.uint8]) -> None:
         """Encode the next picture, ``(height, width, 3)`` uint8 RGB."""

@@ -98,6 +98,17 @@ class DistributedRepeatingDataset:
         return getattr(self.datasets[0], "pipeline", None)
 
     @property
+    def parts(self) -> dict[str, int]:
+        """The datasets by name, each with the number of its sample ids, in the order of these.
+
+        A dataset is called by its folder (its ``statistic_name`` if it has none), with its place
+        in the mixture behind it where several are called alike.
+        """
+        names = [_called(dataset) for dataset in self.datasets]
+        unique = [n if names.count(n) == 1 else f"{n}-{i}" for i, n in enumerate(names)]
+        return dict(zip(unique, self.lengths.tolist(), strict=True))
+
+    @property
     def tasks(self) -> tuple[str, ...]:
         """The instructions of all datasets."""
         return tuple(dict.fromkeys(t for d in self.datasets for t in getattr(d, "tasks", ())))
@@ -227,6 +238,13 @@ def _build(datasets: Any, context: RunContext | None) -> list[Any]:
     if not built:
         raise ConfigError("DistributedRepeatingDataset: datasets names no dataset")
     return built
+
+
+def _called(dataset: Any) -> str:
+    recordings = getattr(dataset, "recordings", None)
+    if recordings:
+        return str(recordings[0].meta.root.name)
+    return str(getattr(dataset, "statistic_name", type(dataset).__name__))
 
 
 def _check_group(name: str, group: Sequence[Any]) -> None:

@@ -39,8 +39,8 @@ class Clock(Protocol):
 class Operator(Protocol):
     """One robot behind a fixed set of calls. The constructor does no I/O.
 
-    ``embodiment`` is valid before ``connect``. An operator may have ``clock: Clock``; one that
-    has none lives on the monotonic clock.
+    ``embodiment`` is valid before ``connect``. ``contracts.optional`` has what an operator may have
+    besides: a clock of its own, the state alone, and what it knows of tasks and episodes.
     """
 
     api: ClassVar[str]
@@ -71,7 +71,8 @@ class Policy(Protocol):
     """Observation in, chunk of actions out. Local model, remote server and replay are three of it.
 
     ``horizon`` actions come at ``action_rate_hz``; action ``j`` is to be reached
-    ``(j + 1) / action_rate_hz`` seconds after the observation.
+    ``(j + 1) / action_rate_hz`` seconds after the observation. One that can go on from a chunk that
+    is being played has ``continue_action`` (``contracts.optional``).
     """
 
     @property

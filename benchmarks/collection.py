@@ -34,15 +34,13 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
-from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene
 from fluxvla_sim.aloha.tasks import MAX_STEPS
-from fluxvla_sim.aloha.world import CUBE
-from fluxvla_sim.demonstrations import demonstrate
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 
 from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.evaluate.demonstrating import demonstrate
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import EpisodeKey
 from fluxvla_core.evaluate.policies import Source
@@ -54,7 +52,6 @@ from fluxvla_core.spec.embodiment import Camera
 RESULTS = Path(__file__).with_name("results") / "collection.json"
 CAMERA = Camera("top", 144, 192)
 PICTURES = 10
-TASKS = {task.name: task for task in CUBE.tasks}
 
 
 def pictures() -> dict[str, Callable[[], tuple[float, float]]]:
@@ -81,11 +78,9 @@ class Demonstrate:
     """A worker that collects: one demonstration a job, its frames sent back."""
 
     def __call__(self) -> Callable[[int], Any]:
-        scene = AlohaScene()
-        expert, tasks = Expert(scene.model), list(TASKS.values())
-        return lambda seed: demonstrate(
-            CUBE, scene, expert, tasks[seed % len(tasks)], seed, [CAMERA], fps=10
-        )
+        environment = AlohaSimEnvironment(ends_with_success=False)
+        expert, tasks = SimExpert(), environment.spec.tasks[:2]
+        return lambda seed: demonstrate(environment, expert, tasks[seed % 2], seed, [CAMERA])[0]
 
 
 def collecting(workers: int, episodes: int) -> float:

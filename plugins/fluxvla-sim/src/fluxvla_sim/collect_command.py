@@ -1,4 +1,4 @@
-"""``fluxvla collect``: demonstrations of a scripted expert as a dataset."""
+"""``fluxvla collect``: ``fluxvla data collect`` with what suits the simulated robots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 
 class CollectCommand:
-    """The command's arguments; the work is in ``fluxvla_sim.collect``."""
+    """The command's arguments; the work is in ``fluxvla_core.evaluate.demonstrating``."""
 
     api: ClassVar[str] = "1.0"
     help: ClassVar[str] = "Record demonstrations of a scripted expert as a LeRobot v3.0 dataset."
@@ -51,22 +51,23 @@ class CollectCommand:
     def run(self, args: Any) -> int:
         from fluxvla_core.cli.reporters import make_reporter
         from fluxvla_core.errors import UsageError
-        from fluxvla_sim.collect import Collection, collect
-        from fluxvla_sim.robots import ROBOTS
+        from fluxvla_core.evaluate.demonstrating import Collection, collect
+        from fluxvla_sim.environment import ENVIRONMENTS
 
         if args.workers < 1:
             raise UsageError(f"--workers must be at least 1, got {args.workers}")
-        robot = ROBOTS[args.robot]
+        environment = ENVIRONMENTS[args.robot]
+        robot = environment.robot
         collection = Collection(
+            # What comes after a success teaches too: how to go on where it was missed by a little.
+            environment={"type": environment.__name__, "ends_with_success": False},
+            policy={"type": "SimExpert", "action_rate_hz": args.fps, "noise": args.noise},
             episodes=args.episodes,
-            robot=args.robot,
             tasks=tuple(args.tasks or robot.default_tasks),
             seed=args.seed,
-            fps=args.fps,
-            camera_names=tuple(args.cameras or robot.cameras[:1]),
+            cameras=tuple(args.cameras or robot.cameras[:1]),
             height=args.height,
             width=args.width,
-            noise=args.noise,
         )
         reporter = make_reporter(args.log_format)
         try:
@@ -75,7 +76,7 @@ class CollectCommand:
             again = f", {found['retried']} tried again" if found["retried"] else ""
             reporter.info(
                 f"{found['episodes']} episodes, {found['frames']} frames{again} in "
-                f"{found['seconds']:.0f} s: {found['steps_per_s']:.0f} steps/s"
+                f"{found['seconds']:.0f} s: {found['frames_per_s']:.1f} frames/s"
             )
         finally:
             reporter.close()

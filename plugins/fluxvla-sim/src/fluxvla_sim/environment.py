@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -31,6 +31,7 @@ class SimEnvironment:
     Args:
         render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones, or
             ``reference``: as the model files ask. See ``fluxvla_core.evaluate.drawing``.
+        ends_with_success: end an episode when its task is done, not after its last step.
 
     Raises:
         ConfigError: there is no such quality.
@@ -40,9 +41,10 @@ class SimEnvironment:
     expert: ClassVar[str] = "SimExpert"
     robot: ClassVar[SimRobot]
 
-    def __init__(self, render: str = "cheap") -> None:
+    def __init__(self, render: str = "cheap", ends_with_success: bool = True) -> None:
         check_render(render)
         self._render = render
+        self._ends = ends_with_success
         robot = self.robot
         self.spec = EnvironmentSpec(
             name=f"the simulated {robot.title}",
@@ -101,7 +103,7 @@ class SimEnvironment:
         return Step(
             reward=float(facts.reward),
             success=self._task.success(facts),
-            ended=self._told.done(facts),
+            ended=self._ends and self._told.done(facts),
             behaviours={task.name: task.success(facts) for task in self.world.tasks},
         )
 
@@ -136,3 +138,9 @@ class URSimEnvironment(SimEnvironment):
     """A UR5e with a Robotiq 2F-85 at a table: ``lift_cube``."""
 
     robot: ClassVar[SimRobot] = UR5E
+
+
+ENVIRONMENTS: Mapping[str, type[SimEnvironment]] = {
+    cls.robot.name: cls for cls in (AlohaSimEnvironment, URSimEnvironment)
+}
+"""By the robot's name, as commands take it."""

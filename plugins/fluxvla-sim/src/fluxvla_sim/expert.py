@@ -36,9 +36,9 @@ class SimExpert:
     Args:
         action_rate_hz: keyframes a second; must divide 50.
         horizon: keyframes in a chunk.
-        noise: standard deviation, in rad, of smooth offsets on what a demonstration executes. Its
-            labels are without them, so that they lead back to the expert's way (Laskey et al.,
-            "DART", CoRL 2017).
+        noise: standard deviation, in rad, of smooth offsets on what a demonstration executes:
+            ``executed``, the plan at every control step. Its labels, the keyframes, are without
+            them, so that they lead back to the expert's way (Laskey et al., "DART", CoRL 2017).
 
     Raises:
         ConfigError: a value is impossible.
@@ -61,7 +61,7 @@ class SimExpert:
         self._experts: dict[int, Expert] = {}
         self._seed = 0
         self._plan: Array | None = None
-        self._disturbed: Array | None = None
+        self._way: Array = np.zeros((0, 0))
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
@@ -97,8 +97,7 @@ class SimExpert:
         if self._plan is None:
             self._plan = self._planned(self._place, observation["task_description"])
         plan, step = self._plan, self._place.scene.steps
-        if self._disturbed is not None:
-            self.executed = self._disturbed[step : step + self._stride]
+        self.executed = self._way[step : step + self._stride]
         steps = step + self._stride * (1 + np.arange(self.horizon)) - 1
         return plan[np.minimum(steps, len(plan) - 1)]
 
@@ -114,8 +113,8 @@ class SimExpert:
         if key not in self._experts:
             self._experts[key] = world.open_expert(scene.model)
         plan = self._experts[key].plan(task.name, scene.objects)
-        if self.noise:
-            self._disturbed = plan + self.noise * world.noise(np.random.default_rng(self._seed))
+        rng = np.random.default_rng(self._seed)
+        self._way = plan + self.noise * world.noise(rng) if self.noise else plan
         return plan
 
 

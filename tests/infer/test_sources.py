@@ -88,6 +88,29 @@ def terminal():
             assert end == keys, "only a test closes the keyboard"
 
 
+def test_whatever_draws_on_the_terminal_makes_room_first(terminal):
+    said = []
+    prompt = Prompt({}, said.append, lambda: said.append("settled"), terminal[1])
+    prompt.ask()
+
+    assert said == ["settled", "task id or instruction (empty ends):"]
+
+
+def test_the_reporters_own_way_to_make_room_is_used(monkeypatch):
+    class Drawing:
+        def info(self, text):
+            said.append(text)
+
+        def settle(self):
+            said.append("settled")
+
+    said = []
+    monkeypatch.setattr("sys.stdin", Terminal())
+    task_source(context(reporter=Drawing()), {}).ask()
+
+    assert said == ["settled", "task id or instruction (empty ends):"]
+
+
 def typed(prompt, seconds=5.0):
     until = time.monotonic() + seconds
     while (line := prompt.poll()) is None:
@@ -99,7 +122,7 @@ def typed(prompt, seconds=5.0):
 def test_a_person_types_a_line(terminal):
     keys, descriptor = terminal
     said = []
-    prompt = Prompt(KNOWN, said.append, descriptor)
+    prompt = Prompt(KNOWN, said.append, descriptor=descriptor)
     prompt.ask()
     assert said == [
         "  1: wave at the camera",
@@ -117,7 +140,7 @@ def test_a_person_types_a_line(terminal):
 @pytest.mark.parametrize("ending", [b"\n", b"  \n", b"\x04"], ids=["empty", "blank", "ctrl-d"])
 def test_an_empty_line_or_the_end_of_file_ends(terminal, ending):
     keys, descriptor = terminal
-    prompt = Prompt(KNOWN, lambda text: None, descriptor)
+    prompt = Prompt(KNOWN, lambda text: None, descriptor=descriptor)
     os.write(keys, ending)
 
     with pytest.raises(EndOfTasks):
@@ -126,7 +149,7 @@ def test_an_empty_line_or_the_end_of_file_ends(terminal, ending):
 
 def test_a_terminal_that_went_away_ends(terminal):
     keys, descriptor = terminal
-    prompt = Prompt(KNOWN, lambda text: None, descriptor)
+    prompt = Prompt(KNOWN, lambda text: None, descriptor=descriptor)
     os.close(keys)
 
     with pytest.raises(EndOfTasks):
@@ -135,7 +158,7 @@ def test_a_terminal_that_went_away_ends(terminal):
 
 def test_what_was_typed_while_the_arm_moved_is_no_answer(terminal):
     keys, descriptor = terminal
-    prompt = Prompt(KNOWN, lambda text: None, descriptor)
+    prompt = Prompt(KNOWN, lambda text: None, descriptor=descriptor)
     prompt.ask()
     os.write(keys, b"1\n")
     assert typed(prompt) == "1"
@@ -150,7 +173,7 @@ def test_what_was_typed_while_the_arm_moved_is_no_answer(terminal):
 
 def test_bytes_that_are_no_text_are_refused_like_any_slip(terminal):
     keys, descriptor = terminal
-    prompt = Prompt(KNOWN, lambda text: None, descriptor)
+    prompt = Prompt(KNOWN, lambda text: None, descriptor=descriptor)
     os.write(keys, b"\xc3(\n")
 
     assert typed(prompt) == "\ufffd("

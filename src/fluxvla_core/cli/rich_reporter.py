@@ -51,6 +51,13 @@ class RichReporter:
             self._tasks[name], completed=done, total=total, beside=escape(shown(fields))
         )
 
+    def settle(self) -> None:
+        """Leave the terminal to whoever types: a bar would draw over it. The next one is new."""
+        self._bars.stop()
+        for task in self._tasks.values():
+            self._bars.remove_task(task)
+        self._tasks.clear()
+
     def event(self, kind: str, **fields: object) -> None:
         return
 

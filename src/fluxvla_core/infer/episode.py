@@ -114,7 +114,11 @@ class Episode:
             SafetyStop: the latch was tripped.
             OperatorError: the robot does not take it.
         """
+        beats = self._rate.beats
         self._path.hold()
+        if self._rate.beats == beats:
+            # A runner's own sending that has no beat of the rate's.
+            time.sleep(self._rate.period)
 
     def _begin(self) -> None:
         """Read where the arm is, and bring it to the start pose."""

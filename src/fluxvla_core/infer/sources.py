@@ -73,18 +73,27 @@ class Prompt(TaskSource):
     Args:
         known: id -> instruction.
         say: shows one line.
+        settle: called before each question: whatever draws on the terminal makes room.
         descriptor: of the terminal; stdin by default.
     """
 
     waits: ClassVar[bool] = True
 
-    def __init__(self, known: Mapping[str, str], say: Say, descriptor: int | None = None) -> None:
+    def __init__(
+        self,
+        known: Mapping[str, str],
+        say: Say,
+        settle: Callable[[], None] = lambda: None,
+        descriptor: int | None = None,
+    ) -> None:
         self._known = known
         self._say = say
+        self._settle = settle
         self._file = sys.stdin.fileno() if descriptor is None else descriptor
         self._asked = False
 
     def ask(self) -> None:
+        self._settle()
         if self._asked:
             import termios
 
@@ -199,7 +208,7 @@ def task_source(
     if topic is not None:
         return Topic(topic, say, domain_id)
     if sys.stdin is not None and sys.stdin.isatty():
-        return Prompt(known, say)
+        return Prompt(known, say, getattr(context.reporter, "settle", lambda: None))
     ids = f"one of {', '.join(known)}, or an" if known else "an"
     raise UsageError(
         "no task was given, and there is no terminal to ask at; nothing was moved",

@@ -13,10 +13,12 @@ from collections.abc import Iterator
 for name, value in (("OMP_NUM_THREADS", "1"), ("MUJOCO_GL", "egl"), ("LP_NUM_THREADS", "1")):
     os.environ.setdefault(name, value)
 
-# Started in the background of a script, a process ignores Ctrl-C, and so does all that it starts;
-# a test of Ctrl-C would then wait for nothing.
+# Started in the background of a script, a process ignores Ctrl-C, under nohup the loss of its
+# terminal, and so does all that it starts; a test of either would then wait for nothing.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import Faulted, NotReady, RunFailed, SafetyStop
+from fluxvla_core.ros2.trouble import Stale
 
 
 def spoil(row: int, column: int, value: float):
@@ -216,6 +217,26 @@ def test_a_stream_that_froze(bench):
 
     fails(bench, SafetyStop, r"stream state is stale: its newest reading is \d\.\d\d s old")
     assert_stopped(bench, "freshness", "stale")
+
+
+def test_a_stream_that_falls_silent_does_not_keep_the_arm_from_braking(bench):
+    """It is silent still when the arm brakes; what is sent then is recorded like the rest."""
+
+    def state():
+        if len(bench.arm.sent) >= 20:
+            raise Stale("cam is silent")
+        return bench.arm.state
+
+    bench.arm.get_state = state
+    bench.policy.stride = 0.2
+
+    fails(bench, Stale, "cam is silent")
+    assert_stopped(bench, "freshness", "cam is silent")
+    commands = [row for row in bench.trace() if row["event"] == "command"]
+    assert len(commands) == len(bench.arm.sent)
+    assert [row["phase"] for row in commands[20:]] == ["stop"] * (len(commands) - 20)
+    assert len(commands) > 25
+    np.testing.assert_allclose(bench.arm.sent[-1], bench.arm.sent[-2], atol=1e-2)
 
 
 def test_a_robot_that_never_gives_a_reading(bench):

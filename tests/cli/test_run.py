@@ -52,6 +52,15 @@ def test_training(run: Fluxvla) -> None:
     ]
 
 
+def test_what_records_a_robots_run_is_part_of_the_config(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--record", "rec")
+    assert ended.code == 2
+    assert "--record: runner.record: ToyTrainRunner takes no 'record'" in ended.err
+    ended = run("--config", "c.py", "--section", "eval", "--record", "rec")
+    assert "ToyEvalRunner takes no 'record'" in ended.err
+    assert not Path("work_dirs").exists()
+
+
 def test_the_resolved_config_of_a_run_runs_again(run: Fluxvla) -> None:
     run("--config", "c.py", "--section", "runner", "--set", "runner.max_epochs=2")
     first = said()

@@ -186,6 +186,7 @@ def test_a_new_operator_alone_is_driven_by_the_aloha_runner(place):
     folder = place.folder / "work_dirs/faq/inference/001-1"
     episode = json.loads((folder / "episode.json").read_text())
     assert (episode["robot"], episode["steps"]) == ("MyDualArmOperator", 50)
-    last = json.loads((folder / "trace.jsonl").read_text().splitlines()[-1])["command"]
+    events = map(json.loads, (folder / "trace.jsonl").read_text().splitlines())
+    last = [event["command"] for event in events if event["event"] == "command"][-1]
     assert last[0] == pytest.approx(0.5, abs=0.02)
     assert last[7] == pytest.approx(0.5, abs=0.02)

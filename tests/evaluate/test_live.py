@@ -11,7 +11,8 @@ import pytest
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, Rejected
-from fluxvla_core.evaluate.live import EnvironmentOperator, check_options
+from fluxvla_core.evaluate.live import EnvironmentOperator
+from fluxvla_core.evaluate.live_settings import live_options
 from fluxvla_core.evaluate.runner import EvalRunner
 
 LINE = {"type": "Walk", "limited": True, "max_steps": 30}
@@ -86,9 +87,10 @@ def test_what_cannot_be_live_is_refused(tmp_path, walking):
         evaluate(tmp_path, {"type": "Walk"})
     with pytest.raises(ConfigError, match="instruction_swap cannot be live: evaluate it stepped"):
         evaluate(tmp_path, instruction_swap=True)
-    with pytest.raises(ConfigError, match="live live takes no speed; it takes action_chunk, "):
+    with pytest.raises(ConfigError, match="live takes no speed; it takes action_chunk, "):
         evaluate(tmp_path, live={"speed": 3})
-    assert check_options({}) == {"chunk_joining": "latest_only"}
+    assert live_options({}) == live_options(True) == {"chunk_joining": "latest_only"}
+    assert live_options(False) is None
 
 
 @pytest.fixture

@@ -79,7 +79,32 @@ def test_speed_is_told_of_whole_runs_only():
     assert whole["steps_per_s"] == 10.0
     assert whole["policy_ms"] == pytest.approx(2.0)
     rest = results.timing(records, 1, 2.0, 4)
-    assert rest == {"episodes": 0, "workers": 4, "policy_ms": pytest.approx(2.0)}
+    assert rest["policy_ms"] == pytest.approx(2.0)
+    assert rest["episodes"] == 0
+    assert "steps_per_s" not in rest
+
+
+def test_times_of_steps_and_pictures_and_memory_are_those_of_finished_episodes():
+    slow = record("a", 0, True)
+    slow["timing"] |= {"step_seconds": 0.5, "observe_seconds": 0.25, "memory_mb": 300.0}
+    found = results.timing([slow, {"status": "error"}], 2, 2.0, 1)
+    assert found["step_ms"] == pytest.approx(500.0 / slow["steps"])
+    assert found["observe_ms"] == pytest.approx(250.0 / slow["calls"])
+    assert found["worker_memory_mb"] == 300.0
+
+
+def test_ticks_of_live_episodes_are_summed():
+    live = {"status": "done", "steps": 30, "ticks": 28, "missed_ticks": 6, "late_ticks": 1}
+    live |= {"skipped_beats": 2, "trips": ["starvation", "later"]}
+    found = results.ticks([live, {**live, "trips": []}, {"status": "error"}])
+    assert found == {
+        "ticks": 56,
+        "missed_ticks": 12,
+        "missed_share": 0.2,
+        "skipped_beats": 4,
+        "late_ticks": 2,
+        "stopped_by": {"starvation": 1},
+    }
 
 
 def test_errors_alone_are_no_result(tmp_path):

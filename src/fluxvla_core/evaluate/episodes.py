@@ -108,3 +108,23 @@ def open_ledger(
             f"{path.name} was about another evaluation; it is {ledger.set_aside.name} now"
         )
     return ledger
+
+
+def episode_keys(
+    groups: Sequence[tuple[str, int]], tasks: Sequence[str], episodes: int, together: bool
+) -> list[EpisodeKey]:
+    """Every episode of an evaluation, in the order in which they are given out.
+
+    Args:
+        groups: name and first seed of each; those of one number are side by side.
+        episodes: for each task and group.
+        together: task by task; otherwise in turn, so that an evaluation that is watched tells of
+            all tasks from the start.
+    """
+    numbers = range(episodes)
+    pairs = [(task, number) for number in numbers for task in tasks]
+    if together:
+        pairs = [(task, number) for task in tasks for number in numbers]
+    return [
+        EpisodeKey(group, task, first + number) for task, number in pairs for group, first in groups
+    ]

@@ -13,9 +13,9 @@ import json
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -29,47 +29,11 @@ from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.optional import can_continue
 from fluxvla_core.control.clock import MonotonicClock
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
+from fluxvla_core.evaluate.live_settings import Live
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]
-
-TAKEN = (
-    "action_chunk",
-    "action_filters",
-    "chunk_joining",
-    "execute_horizon",
-    "gripper_threshold",
-    "safety",
-)
-"""Keys of ``live``: those of an inference runner that say how a policy drives a robot."""
-
-
-@dataclass(frozen=True)
-class Live:
-    """How episodes are run live.
-
-    Args:
-        options: arguments of ``BaseInferenceRunner``, of those in ``TAKEN``.
-        folder: where each episode's record goes.
-        video_fps: of the recorded videos; None records none.
-    """
-
-    options: Mapping[str, Any]
-    folder: str
-    video_fps: float | None = None
-
-
-def check_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options with what is usual in motion: the newest chunk replaces the one before.
-
-    Raises:
-        ConfigError: there is no such option.
-    """
-    unknown = sorted(set(options) - set(TAKEN))
-    if unknown:
-        raise ConfigError(f"live takes no {', '.join(unknown)}; it takes {', '.join(TAKEN)}")
-    return {"chunk_joining": "latest_only", **options}
 
 
 class EnvironmentOperator:

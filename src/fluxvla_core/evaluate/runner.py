@@ -13,15 +13,16 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, build_environment_from_cfg
 from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate import results
 from fluxvla_core.evaluate.behaviours import count_behaviours, instruction_test
-from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
+from fluxvla_core.evaluate.episodes import episode_keys, open_ledger, run_in_pool
 from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
+from fluxvla_core.evaluate.live_settings import Live, live_options
 from fluxvla_core.evaluate.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
@@ -46,9 +47,6 @@ from fluxvla_core.evaluate.worker import (
     Video,
     choose_tasks,
 )
-
-if TYPE_CHECKING:
-    from fluxvla_core.evaluate.live import Live
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"
@@ -145,7 +143,7 @@ class EvalRunner:
         # Under a launcher, nproc is the number of launched processes, not of each one's workers.
         own = self.context.nproc > 1 and self.shard.count == 1
         try:
-            self._live = live_options(live)
+            self._live: dict[str, Any] | None = plain(live_options(live))
         except ConfigError as error:
             raise self.wrong("live", error.what) from error
         usual = 2 if self._live is None else 1
@@ -296,17 +294,8 @@ class EvalRunner:
         groups = [(POLICY, self.seed)]
         groups += [(SWAPPED, self.swap_seed)] if self.instruction_swap else []
         groups += [(UNTRAINED, self.seed)] if self.baseline else []
-        spec = self._ready()[0]
-        numbers, tasks = range(self.episodes), [task.name for task in self._tasks]
-        # In turn, so that an evaluation that is watched tells of all tasks from the start.
-        pairs = [(task, number) for number in numbers for task in tasks]
-        if spec.keep_together:
-            pairs = [(task, number) for task in tasks for number in numbers]
-        return [
-            EpisodeKey(group, task, first + number)
-            for task, number in pairs
-            for group, first in groups
-        ]
+        tasks = [task.name for task in self._tasks]
+        return episode_keys(groups, tasks, self.episodes, self._ready()[0].keep_together)
 
     def what(self) -> dict[str, Any]:
         """What outcomes follow from, beside each episode's key; JSON values."""
@@ -373,8 +362,6 @@ class EvalRunner:
                 f"needs an environment that takes joint targets; {spec.name} does not, and the "
                 "safety of a robot cannot be kept for its actions",
             )
-        from fluxvla_core.evaluate.live import Live
-
         options = dict(self._live)
         if self._course.replan_every is not None:
             options.setdefault("execute_horizon", self._course.replan_every)
@@ -385,16 +372,6 @@ class EvalRunner:
         assert self._spec is not None, "run_setup() comes first"
         assert self._settings is not None
         return self._spec, self._settings
-
-
-def live_options(live: bool | Mapping[str, Any]) -> dict[str, Any] | None:
-    """What drives the robot of a live evaluation; None for a stepped one."""
-    if live is False:
-        return None
-    from fluxvla_core.evaluate.live import check_options
-
-    options: dict[str, Any] = plain(check_options({} if live is True else live))
-    return options
 
 
 def plain(table: Any) -> Any:

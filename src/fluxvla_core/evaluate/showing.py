@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -50,11 +52,12 @@ def record_videos(
         JSON values, one for each video that was made, in the order of ``records``: ``group``,
         ``task``, ``seed``, ``success`` and ``path``, relative to ``folder``'s parent.
     """
-    for old in folder.glob("*.mp4"):
-        old.unlink()
+    # Another part of the same job may be doing the same: each makes its own, then puts them there.
+    part = folder / f".part-{os.getpid()}"
+    part.mkdir(parents=True, exist_ok=True)
     names = [video_name(number, record) for number, record in enumerate(records)]
     jobs = [
-        make_job(EpisodeKey(r["group"], r["task"], r["seed"]), str(folder / name))
+        make_job(EpisodeKey(r["group"], r["task"], r["seed"]), str(part / name))
         for r, name in zip(records, names, strict=True)
     ]
     made = [False] * len(jobs)
@@ -69,6 +72,14 @@ def record_videos(
                     f"{names[outcome.index]}: the episode went another way than when it was "
                     "counted; its outcome does not follow from its seed alone"
                 )
+    for old in folder.glob("*.mp4"):
+        if old.name not in names:
+            old.unlink(missing_ok=True)
+    for name in names:
+        made_here = part / name
+        if made_here.exists():
+            made_here.replace(folder / name)
+    shutil.rmtree(part, ignore_errors=True)
     return [
         {
             **{key: record[key] for key in ("group", "task", "seed", "success")},

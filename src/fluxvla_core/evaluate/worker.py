@@ -7,19 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.live_settings import Live
 from fluxvla_core.evaluate.policies import Source, fit, make_policy
 from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
 from fluxvla_core.evaluate.serving import Facts, ServedPolicy
 from fluxvla_core.spec.embodiment import Camera
-
-if TYPE_CHECKING:
-    from fluxvla_core.evaluate.live import Live
 
 POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
 """Groups of episodes: the policy, the policy told another task, its untrained twin."""

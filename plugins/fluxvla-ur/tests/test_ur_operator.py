@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 from fluxvla_ur.embodiment import JOINTS, ur_spec
-from fluxvla_ur.operator import CONTROLLERS, TRAJECTORY, UROperator, scaled_step
+from fluxvla_ur.operator import CONTROLLERS, TRAJECTORY, UROperator
+from fluxvla_ur.speed import scaled_step
 
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.ros2.streams import FLOAT64, FLOAT64_ARRAY, IMAGE, JOINT_STATE

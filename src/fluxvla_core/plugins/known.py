@@ -37,7 +37,10 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "operators": ("AlohaSimOperator", "URSimOperator"),
         "runners": ("AlohaSimEvalRunner",),
     },
-    "fluxvla-ur": {"operators": ("UROperator",), "runners": ("URInferenceRunner",)},
+    "fluxvla-ur": {
+        "operators": ("UROperator", "URRTDEOperator"),
+        "runners": ("URInferenceRunner",),
+    },
 }
 
 

@@ -25,6 +25,7 @@ from fluxvla_core.ros2.streams import (
 from fluxvla_core.ros2.trouble import BadMessage, Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
+from fluxvla_ur.speed import check_not_paused, scaled_step
 
 Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
@@ -44,9 +45,6 @@ CONTROLLERS: Mapping[str, tuple[str, str]] = {
 }
 """Controller -> command topic and message type. The first passes every command on as it is
 (servoj); the others interpolate, and the scaled one follows the teach pendant's speed slider."""
-
-PAUSED = 0.01
-"""Speed scaling below which the robot counts as paused."""
 
 
 class UROperator(RosOperator):
@@ -207,12 +205,7 @@ class UROperator(RosOperator):
                 next="look at the teach pendant, clear the stop, and play the program again",
             )
         scaling = self.speed_scaling
-        if scaling < PAUSED:
-            raise Faulted(
-                "the robot is paused: its speed scaling is 0",
-                cause="the speed slider is at 0, or a safeguard stop is active",
-                next="look at the teach pendant",
-            )
+        check_not_paused(scaling)
         if scaling == 1.0 or not self._forward:
             return action
         before = self.last_action
@@ -251,19 +244,3 @@ class UROperator(RosOperator):
 
     def _speeds(self) -> Array:
         return np.array([joint.velocity for joint in self.embodiment.joints])
-
-
-def scaled_step(before: Array, wanted: Array, speeds: Array, seconds: float) -> Array:
-    """``wanted``, or as far towards it as ``speeds`` allow in ``seconds``, on the straight line.
-
-    All joints are slowed down alike, so that the path stays what the policy meant.
-
-    Args:
-        before, wanted: ``(D,)`` positions.
-        speeds: ``(D,)`` largest speeds, in the positions' units a second.
-        seconds: time for the step, already scaled.
-    """
-    step = wanted - before
-    share = np.max(np.abs(step) / (speeds * seconds))
-    moved: Array = wanted if share <= 1.0 else before + step / share
-    return moved

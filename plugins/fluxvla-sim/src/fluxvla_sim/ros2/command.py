@@ -100,11 +100,11 @@ class SimCommand:
             reporter.close()
 
     def _simulate(self, args: Any, faults: list[Any], reporter: Any) -> int:
-        from fluxvla_sim.robots import ROBOTS
+        from fluxvla_sim.environment import ENVIRONMENTS
         from fluxvla_sim.ros2.judge import Judge
         from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_fault
 
-        robot = ROBOTS[args.robot]
+        robot = ENVIRONMENTS[args.robot].robot
         world, _ = robot.find(args.task or robot.default_tasks[0])
         body = _aloha(args) if args.robot == "aloha" else _ur(args)
         _some_cameras(body, args.cameras)

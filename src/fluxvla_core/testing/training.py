@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -134,12 +135,17 @@ class TinyDataset:
         }
 
 
-def tiny_config(runner: Mapping[str, Any], batch: int = 4, **model: Any) -> dict[str, Any]:
-    """A whole config around ``runner``, with ``batch`` samples per process."""
+def tiny_config(
+    runner: Mapping[str, Any], batch: int = 4, workers: int = 0, **model: Any
+) -> dict[str, Any]:
+    """A whole config around ``runner``, with ``batch`` samples and ``workers`` per process."""
     collator = {"type": "DictCollator", "keys": list(KEYS)}
     return {
         "model": {"type": "TinyVLA", **model},
-        "train_dataloader": {"per_device_batch_size": batch},
+        "train_dataloader": {
+            "per_device_batch_size": batch,
+            **({"per_device_num_workers": workers} if workers else {}),
+        },
         "runner": {"learning_rate": 1e-2, "collator": collator, **runner},
     }
 
@@ -166,6 +172,8 @@ def train(settings: Mapping[str, Any]) -> Any:
         settings: ``work_dir`` and ``config``; ``resume`` (None), ``length`` of the dataset (37),
             ``signal`` (rank, n, number): the rank sends itself signal ``number`` when it collates
             its n-th batch; ``kill_write`` n: SIGKILL before the n-th file operation of checkpoints;
+            ``kill_forward`` (rank, n): the rank ends by SIGKILL before its n-th forward pass,
+            as soon as there is a checkpoint; ``nap_s``: seconds to sleep before each of them;
             ``notice_s`` (0.5): seconds within which ranks hear of each other's signals.
     """
     config = settings["config"]
@@ -188,8 +196,34 @@ def train(settings: Mapping[str, Any]) -> Any:
     with unflushed():
         runner = build_runner_from_cfg(table, context)
         runner.run_setup(len(dataset))
+        if "kill_forward" in settings or "nap_s" in settings:
+            runner._training_step = _endangered(runner._training_step, settings)
         runner.run(dataset)
     return runner
+
+
+def _endangered(step: Callable[..., Any], settings: Mapping[str, Any]) -> Callable[..., Any]:
+    rank, left = settings.get("kill_forward", (-1, 0))
+    mine = rank == int(os.environ.get("RANK", "0"))
+
+    def run(batch: dict[str, Any]) -> Any:
+        nonlocal left
+        left -= 1
+        time.sleep(settings.get("nap_s", 0.0))
+        if mine and left == 0:
+            await_checkpoint(Path(settings["work_dir"]))
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(batch)
+
+    return run
+
+
+def await_checkpoint(work_dir: Path) -> None:
+    """Return once there is one: it may still be on its way when its step is done."""
+    limit = time.monotonic() + 60.0
+    while not folders(work_dir):
+        assert time.monotonic() < limit, "no checkpoint within a minute"
+        time.sleep(0.01)
 
 
 @contextmanager
@@ -220,10 +254,8 @@ class SignallingCollator(DictCollator):
     def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         self.left -= 1
         if self.left == 0:
-            limit = time.monotonic() + 60.0
-            while self.number == signal.SIGKILL and not folders(self.work_dir):
-                assert time.monotonic() < limit, "no checkpoint within a minute"
-                time.sleep(0.01)
+            if self.number == signal.SIGKILL:
+                await_checkpoint(self.work_dir)
             os.kill(os.getpid(), self.number)
         return super().__call__(samples)
 
@@ -246,18 +278,24 @@ def _counted(operation: Callable[..., Any], left: list[int]) -> Callable[..., An
 
 
 def run_ranks(
-    ranks: int, function: Callable[..., Any], *args: Any, timeout: float = 600.0
+    ranks: int,
+    function: Callable[..., Any],
+    *args: Any,
+    timeout: float = 600.0,
+    watch: Callable[[Sequence[Any]], None] | None = None,
 ) -> list[int | None]:
     """Call ``function(*args)`` in ``ranks`` new processes that form one group on the loopback.
 
     The processes are forked from a server that has torch imported already, so that a start takes
-    a tenth of a second. One that is still alive after ``timeout`` seconds is killed.
+    a tenth of a second. ``watch`` is called with the processes once all have been started. One
+    that is still alive after ``timeout`` seconds is killed.
 
     Returns:
         The exit code of each: 0, 1 after an exception, ``-9`` after SIGKILL.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(PRELOAD))
+    # Slow to import, so only for those who use it.
+    context.set_forkserver_preload([*PRELOAD, *(n for n in ("peft",) if n in sys.modules)])
     port = _free_port() if ranks > 1 else 0
     processes = [
         context.Process(target=_rank, args=(rank, ranks, port, function, args))
@@ -265,6 +303,8 @@ def run_ranks(
     ]
     for process in processes:
         process.start()
+    if watch is not None:
+        watch(processes)
     for process in processes:
         process.join(timeout)
         if process.is_alive():

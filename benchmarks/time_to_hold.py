@@ -3,7 +3,7 @@
     python benchmarks/time_to_hold.py [--rounds 5] [--only WORDS]
 
 The real runner moves an arm of three joints over ROS 2; the faults are provoked for real
-(``robot_fault_list``). The time is from the fault to the receipt, in another process, of the first
+(``_robot_fault_list``). The time is from the fault to the receipt, in another process, of the first
 command that is not changed any more. It contains what is allowed before something counts as a
 fault: ``max_age_s`` (0.5 s) of silence, ``tracking_time_s`` (0.25 s) away from the command.
 Loopback only. Writes ``benchmarks/results/time_to_hold.json``, which docs/safety.md quotes.
@@ -23,8 +23,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.robot_fault_list import FAULTS
-from benchmarks.robot_faults import Fault, Result, play, stage_crew
+from benchmarks._robot_fault_list import FAULTS
+from benchmarks._robot_faults import Fault, Result, play, stage_crew
 
 RESULTS = Path(__file__).with_name("results") / "time_to_hold.json"
 

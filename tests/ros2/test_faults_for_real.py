@@ -1,6 +1,6 @@
 """Every fault of docs/safety.md, provoked while an arm moves over ROS 2, seen from the other side.
 
-What a fault is, and how it is provoked, is in ``benchmarks/robot_fault_list.py``; ``play`` holds
+What a fault is, and how it is provoked, is in ``benchmarks/_robot_fault_list.py``; ``play`` holds
 every command that was received against the limits.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.robot_fault_list import FAULTS
-from benchmarks.robot_faults import GOES_ON, REFUSED, STOP, play, stage_crew
+from benchmarks._robot_fault_list import FAULTS
+from benchmarks._robot_faults import GOES_ON, REFUSED, STOP, play, stage_crew
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.robot_fault_list import FAULTS
+from benchmarks._robot_fault_list import FAULTS
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "time_to_hold.json"

@@ -1,4 +1,4 @@
-"""The faults of docs/safety.md, in its order; see ``robot_faults`` for how they are played."""
+"""The faults of docs/safety.md, in its order; see ``_robot_faults`` for how they are played."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.robot_faults import (
+from benchmarks._robot_faults import (
     COMMAND,
     GOES_ON,
     NAMES,
@@ -35,7 +35,7 @@ CAM = "/cam/image"
 WITHOUT_ROS = """
 import sys
 sys.modules["rclpy"] = None
-from benchmarks.robot_faults import BenchArm
+from benchmarks._robot_faults import BenchArm
 from fluxvla_core.errors import LoadFailed
 try:
     BenchArm().connect()

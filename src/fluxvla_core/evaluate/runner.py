@@ -214,9 +214,9 @@ class EvalRunner:
         self._spec = environment.spec
         what = resolve_name(self._policy, environment)
         environment.close()
-        names, *look = self._video
+        names, height, width, fps = self._video
         try:
-            video = Video.of(self._spec, names, *look)
+            video = Video.of(self._spec, names, height, width, fps)
         except ConfigError as error:
             raise self.wrong("video_cameras", error.what) from error
         self._tasks = choose_tasks(self._spec.tasks, self._given)

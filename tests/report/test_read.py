@@ -97,6 +97,23 @@ def test_results_without_rates_or_with_missing_videos_show_what_there_is(tmp_pat
     assert evaluation.videos == []
 
 
+@pytest.mark.parametrize(
+    ("mode", "label"),
+    [
+        ("stepped", "trained policy"),
+        ("robot", "trained policy, on the robot"),
+        ("live", "trained policy, in real time"),
+    ],
+)
+def test_evaluations_of_one_policy_are_told_apart(tmp_path: Path, mode: str, label: str) -> None:
+    (tmp_path / "eval").mkdir()
+    counted = {"episodes": 2, "successes": 1, "low": 0.1, "high": 0.9, "errors": 0}
+    results = {"mode": mode, "groups": {"policy": {"all": counted, "tasks": {}}}}
+    (tmp_path / "eval" / "results.json").write_text(json.dumps(results))
+    (evaluation,) = read_evaluations(Reader(tmp_path), tmp_path)
+    assert [group.label for group in evaluation.groups] == [label]
+
+
 def test_joints_of_a_trace_with_other_states() -> None:
     events: list[dict[str, Any]] = [
         {"event": "trip", "t": 0.0},

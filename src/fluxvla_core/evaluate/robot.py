@@ -135,6 +135,7 @@ class RobotEvalRunner:
         found = {
             "format": results.FORMAT,
             "policy": "checkpoint" if self._checkpoint else type(self._policy).__name__,
+            "mode": "robot",
             "groups": summarise(records),
             "checkpoint": self._checkpoint,
             "settings": {**about["settings"], **_kept_time(records)},

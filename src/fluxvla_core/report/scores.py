@@ -16,6 +16,9 @@ NAMES = {
 }
 """What people call the groups of an evaluation; an unknown one keeps its own name."""
 
+MODES = {"robot": ", on the robot", "live": ", in real time"}
+"""What is added where the policy did not have all the time in the world."""
+
 
 def read_evaluations(reader: Reader, work_dir: Path) -> list[Evaluation]:
     """Every ``results.json`` in a folder of the work dir that has success rates in it."""
@@ -30,6 +33,7 @@ def _evaluation(folder: Path, results: Mapping[str, Any]) -> Evaluation:
     names = dict(NAMES)
     if results.get("policy") not in (None, "checkpoint"):
         names["policy"] = f"{results['policy']} policy"
+    names = {name: text + MODES.get(str(results.get("mode")), "") for name, text in names.items()}
     groups = [_group(name, names, table) for name, table in mappings(results.get("groups"))]
     return Evaluation(
         name=folder.name,

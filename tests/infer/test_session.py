@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.errors import Faulted, RunFailed, SafetyStop, UsageError
+from fluxvla_core.errors import Faulted, NotReady, RunFailed, SafetyStop, UsageError
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 from tests.infer.test_sources import Person
 
@@ -203,6 +203,25 @@ def test_a_policy_that_raised_may_be_asked_again(bench, asked):
     asked(Person("1", "rearm", "1"))
 
     assert bench.run(task=None, max_publish_step=5)["episodes"] == 1
+
+
+def test_a_stream_that_fell_silent_may_come_back(bench, asked):
+    silent = NotReady("camera front is silent")
+    person = asked(Person("1", "rearm", "1"))
+    bench.arm.faults = {"get_frame": silent, "after": 20}
+    rearm = person.poll
+
+    def mended():
+        line = rearm()
+        if line == "rearm":
+            bench.arm.faults = {}
+        return line
+
+    person.poll = mended
+
+    assert bench.run(task=None, max_publish_step=30)["episodes"] == 1
+    assert "camera front is silent" in person.told[0]
+    assert bench.arm.calls == ["connect", "stop", "stop", "close"]
 
 
 class Impatient(Person):

@@ -14,7 +14,7 @@ from typing import Any
 
 from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.worker import Worker
-from fluxvla_core.errors import FluxError, SafetyStop
+from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.infer.episode import Episode
 from fluxvla_core.infer.plan import PolicyFailed
 from fluxvla_core.infer.sources import TaskSource, tasks
@@ -62,7 +62,7 @@ class Session:
             The last episode's task, outcome, success and steps, and how many there were.
 
         Raises:
-            SafetyStop, PolicyFailed: what ended an episode, if nobody allowed motion again.
+            SafetyStop, PolicyFailed, NotReady: what ended an episode, if nobody said ``rearm``.
             Interrupted: a signal came.
             Exception: what else ended an episode or the hold between two.
         """
@@ -71,7 +71,7 @@ class Session:
         for task in tasks(self._source, self._known, self._idle, self._heard):
             try:
                 summary = self._run_episode(task)
-            except (SafetyStop, PolicyFailed) as error:
+            except (SafetyStop, PolicyFailed, NotReady) as error:
                 self.episode = None
                 # A policy that still thinks cannot be asked again.
                 if not self._source.waits or self._worker.busy:

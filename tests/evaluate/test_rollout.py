@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -11,7 +13,7 @@ import pytest
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluate.policies import RandomPolicy, fit, resolve_name
 from fluxvla_core.evaluate.rollout import Course, run_episode
-from fluxvla_core.evaluate.worker import told_instead
+from fluxvla_core.evaluate.worker import memory_mb, told_instead
 from fluxvla_core.spec.embodiment import Camera
 
 
@@ -159,3 +161,14 @@ def test_a_wrong_instruction_is_the_next_task_of_those_evaluated(walk):
     assert told_instead(walk.Walk(), "left", ["left", "right"]) == "right"
     with pytest.raises(ConfigError, match="no other task of a line can be done in the scene of 'l"):
         told_instead(World(), "left", [])
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells it there")
+def test_a_processs_memory_is_its_own_and_not_its_parents():
+    code = "from fluxvla_core.evaluate.worker import memory_mb; print(memory_mb())"
+    ballast = np.ones(64_000_000)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert 5 < float(found) < memory_mb() - 100
+    assert ballast.nbytes == 512_000_000

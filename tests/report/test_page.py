@@ -16,8 +16,9 @@ import pytest
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.report import build_report
 from fluxvla_core.report.command import Report
-from fluxvla_core.report.facts import Video
-from fluxvla_core.report.page import Shelf, running_mean
+from fluxvla_core.report.curves import curves, running_mean
+from fluxvla_core.report.facts import Training, Video
+from fluxvla_core.report.page import Shelf
 
 
 class Page(html.parser.HTMLParser):
@@ -193,6 +194,35 @@ def test_jinja2_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(RunFailed, match=r"needs the package 'jinja2'") as told:
         build_report(tmp_path)
     assert "pip install 'fluxvla-core[report]'" in str(told.value)
+
+
+def test_every_column_of_a_training_has_a_chart() -> None:
+    """What is measured at few steps is drawn from one to the next, and noise with its mean."""
+    steps = [float(n) for n in range(1, 41)]
+    nan = [math.nan] * 40
+    sparse = [1.0 / n if n % 10 == 0 else math.nan for n in range(1, 41)]
+    training = Training(
+        steps,
+        {
+            "time": steps,
+            "loss": [1.0 / n for n in steps],
+            "loss/cubes": [2.0 / n for n in steps],
+            "val_loss": sparse,
+            "data_wait": [0.1] * 40,
+            "mfu": nan,
+            "memory_gb": [1.5] * 40,
+        },
+    )
+    found = {chart["name"]: chart for chart in curves(training)}
+    assert list(found) == [
+        "Loss",
+        "Loss on cubes",
+        "Validation loss",
+        "Share of time spent waiting for data",
+        "Memory (GB)",
+    ]
+    assert [chart["smoothed"] for chart in found.values()] == [True, True, False, True, False]
+    assert 'd="M48.0 10.0L201.3' in found["Validation loss"]["svg"]
 
 
 def test_the_running_mean_skips_gaps() -> None:

@@ -13,26 +13,20 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.report.curves import curves
 from fluxvla_core.report.episode_view import episode_view, total_ms
 from fluxvla_core.report.facts import Episode, Evaluation, Facts, Training, Video
 from fluxvla_core.report.files import text_rows
 from fluxvla_core.report.read import read_facts
 from fluxvla_core.report.scale import duration, short
-from fluxvla_core.report.svg import Interval, Series, duration_bar, interval_chart, line_chart
+from fluxvla_core.report.svg import Interval, duration_bar, interval_chart
 from fluxvla_core.report.timeline import milliseconds
 
 # Videos are put into the page up to this many bytes in all; the rest is linked to.
 EMBEDDED_BYTES = 32_000_000
 MOST_VIDEOS = 12
-CURVES = (
-    ("loss", "Loss", True),
-    ("lr", "Learning rate", False),
-    ("grad_norm", "Gradient norm", True),
-    ("samples_per_s", "Samples per second", False),
-)
 # Episodes that are shown as a whole, the newest ones; all are in the list.
 SHOWN_EPISODES = 4
-SMOOTHED = ("loss", "grad_norm", "samples_per_s")
 
 
 def build_report(work_dir: Path | str, out: Path | str | None = None, title: str = "") -> Path:
@@ -226,37 +220,6 @@ def _training_tile(training: Training) -> dict[str, str]:
     if seconds:
         detail += f" after {duration(seconds)}"
     return {"name": "training steps", "figure": f"{training.steps[-1]:,.0f}", "detail": detail}
-
-
-def curves(training: Training) -> list[dict[str, Any]]:
-    """A chart for each column that was logged, noisy ones with their running mean."""
-    charts = []
-    for name, label, log in CURVES:
-        values = training.columns.get(name, ())
-        if not any(math.isfinite(v) for v in values):
-            continue
-        if name in SMOOTHED and len(values) > 20:
-            lines = [
-                Series("each step", training.steps, values, kind="faint"),
-                Series("running mean", training.steps, running_mean(values)),
-            ]
-        else:
-            lines = [Series(label, training.steps, values)]
-        chart = line_chart(lines, x_label="step", title=f"{label} over the steps", log=log)
-        charts.append({"name": label, "svg": chart, "smoothed": len(lines) > 1})
-    return charts
-
-
-def running_mean(values: Sequence[float], share: float = 0.03) -> list[float]:
-    """Exponential running mean over about ``share`` of all values; skips what is not finite."""
-    weight = 2.0 / (1.0 + max(1.0, share * len(values)))
-    means: list[float] = []
-    mean = math.nan
-    for value in values:
-        if math.isfinite(value):
-            mean = value if math.isnan(mean) else mean + weight * (value - mean)
-        means.append(mean)
-    return means
 
 
 def _evaluation(evaluation: Evaluation, shelf: Shelf) -> dict[str, Any]:

@@ -59,7 +59,7 @@ train_dataloader = dict(
 
 runner = dict(
     type="FSDPTrainRunner",
-    max_steps=4000,
+    max_steps=2500,
     learning_rate=1e-3,
     weight_decay=0.01,
     max_grad_norm=1.0,

@@ -116,3 +116,24 @@ def scene(libero):
     made = LiberoScene(suite_tasks("libero_object")[2])
     yield made
     made.close()
+
+
+@pytest.fixture
+def stock(libero):
+    """``stock(task, size=0)``: LIBERO's own environment, as its evaluation makes it."""
+    from fluxvla_libero.require import quiet
+    from fluxvla_libero.scene import ENV_SEED
+
+    def make(task, size=0):
+        with quiet():
+            made = libero.envs.OffScreenRenderEnv(
+                bddl_file_name=str(task.bddl), camera_heights=size or 64, camera_widths=size or 64
+            )
+        if not size:
+            for name, observable in made.env._observables.items():
+                observable.set_enabled("image" not in name)
+        made.seed(ENV_SEED)
+        made.reset()
+        return made
+
+    return make

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fluxvla_libero import require
+from fluxvla_libero.embodiment import NO_OP
 from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import LiberoEvalRunner
 from fluxvla_libero.expert import LiberoExpert, plan
@@ -41,6 +42,7 @@ def test_each_suite_has_the_step_limit_of_the_standard_protocol(suite, steps):
 
 def test_the_protocol_waits_ten_steps_and_shows_two_cameras_of_224_pixels():
     assert NUM_STEPS_WAIT == 10
+    assert NO_OP.tolist() == [0, 0, 0, 0, 0, 0, -1], "still, the gripper open"
     table = LiberoEvalRunner()._environment
     assert table["num_steps_wait"] == 10
     cameras = LiberoEnvironment()._cameras
@@ -164,7 +166,7 @@ def test_a_libero_that_was_never_set_up_is_not_asked_in_the_dark(monkeypatch, tm
         require.require_libero()
     assert "python -c 'import libero.libero', and answer" in str(caught.value)
     assert sys.stdin is stdin
-    monkeypatch.delitem(sys.modules, "libero")
+    sys.modules.pop("libero")
 
 
 def test_importing_runners_imports_no_simulator():

@@ -13,7 +13,7 @@ from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import LiberoEvalRunner
 from fluxvla_libero.expert import Expert, LiberoExpert
 from fluxvla_libero.inference_runner import LiberoInferenceRunner
-from fluxvla_libero.suites import suite_tasks
+from fluxvla_libero.suites import init_states, suite_tasks
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, SpecMismatch, UsageError
@@ -57,7 +57,7 @@ def act(environment, policy, seed=0, course=None, told=None, watch=None):
     return run_episode(environment, policy, task, seed, course or Course(), told, watch)
 
 
-def test_recorded_actions_replayed_give_the_recorded_success(environment):
+def test_recorded_actions_replayed_give_the_recorded_success(environment, stock):
     actions = []
 
     def watch(world, steps):
@@ -73,6 +73,14 @@ def test_recorded_actions_replayed_give_the_recorded_success(environment):
     assert replayed["state_hash"] == recorded["state_hash"]
     assert (replayed["calls"], replay.seed) == (1, 7)
     assert replay.observation["task_description"].startswith("pick up the salad dressing")
+    # And in LIBERO's own environment: its "done" is the success, in the same step.
+    own = stock(environment.scene.task)
+    own.set_init_state(init_states("libero_object", 2)[0])
+    for _ in range(10):
+        own.step([0, 0, 0, 0, 0, 0, -1])
+    dones = [own.step(action)[2] for action in actions]
+    assert dones == [False] * (len(actions) - 1) + [True]
+    own.close()
     # The other way round the gripper is never closed on anything.
     flipped = np.array(actions) * [1, 1, 1, 1, 1, 1, -1]
     assert not act(environment, Replay(flipped), course=Course(max_steps=len(actions)))["success"]

@@ -18,7 +18,6 @@ from fluxvla_libero.embodiment import (
     axis_angle,
     libero_spec,
 )
-from fluxvla_libero.environment import environment_table
 
 from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import FluxError, SpecMismatch
@@ -177,7 +176,7 @@ def test_a_missing_checkpoint_is_no_policy(tmp_path):
 @pytest.mark.parametrize(("arguments", "message"), MISMATCHES)
 def test_it_is_refused_before_a_scene_is_built(libero, tmp_path, save, arguments, message):
     path = save(tmp_path / "work", **arguments)
-    table = environment_table(cameras=tuple(CAMERAS))
+    table = {"type": "LiberoEnvironment", "cameras": tuple(CAMERAS)}
     worker = EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, Course()))
     task = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
     with pytest.raises(SpecMismatch) as caught:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fluxvla_libero.embodiment import NO_OP, axis_angle
-from fluxvla_libero.require import quiet
-from fluxvla_libero.scene import ENV_SEED, SHOWN_GROUPS, LiberoScene
+from fluxvla_libero.scene import SHOWN_GROUPS, LiberoScene
 from fluxvla_libero.suites import (
     MAX_STEPS,
     SUITES,
@@ -28,27 +27,13 @@ def shake(scene, seed, steps=12):
     return scene.state_hash()
 
 
-def stock(libero, task, size=0):
-    """LIBERO's own environment, as its evaluation makes it."""
-    with quiet():
-        made = libero.envs.OffScreenRenderEnv(
-            bddl_file_name=str(task.bddl), camera_heights=size or 64, camera_widths=size or 64
-        )
-    if not size:
-        for name, observable in made.env._observables.items():
-            observable.set_enabled("image" not in name)
-    made.seed(ENV_SEED)
-    made.reset()
-    return made
-
-
-def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
+def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
     """After other episodes in the scene, and from a model that LIBERO built anew."""
     init = init_states("libero_object", 2)
     scene.reset(init[1])
     shake(scene, 1)
     scene.reset(init[0])
-    env = stock(libero, scene.task, size=64)
+    env = stock(scene.task, size=64)
     seen = env.set_init_state(init[0])
     rng = np.random.default_rng(0)
     for _ in range(12):
@@ -83,7 +68,7 @@ def test_an_episode_goes_as_in_liberos_own_environment(libero, scene):
     env.close()
 
 
-def test_what_cannot_move_stands_where_libero_puts_it(libero):
+def test_what_cannot_move_stands_where_libero_puts_it(stock):
     """libero_goal has a cabinet and a stove, which the fixed states say nothing about."""
     task = suite_tasks("libero_goal")[0]
     state = init_states("libero_goal", 0)[3]
@@ -91,7 +76,7 @@ def test_what_cannot_move_stands_where_libero_puts_it(libero):
     scene.reset(seed=5)
     shake(scene, 2, 3)
     scene.reset(state)
-    env = stock(libero, task)
+    env = stock(task)
     env.set_init_state(state)
     np.testing.assert_array_equal(scene.model.body_pos, env.sim.model.body_pos)
     for _ in range(5):

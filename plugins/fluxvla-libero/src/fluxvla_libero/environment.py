@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -256,8 +256,3 @@ class LiberoEnvironment:
             self.close()
             self._scene = LiberoScene(where, self._render)
         return self._scene
-
-
-def environment_table(**values: Any) -> dict[str, Any]:
-    """The config table of a LiberoEnvironment."""
-    return {"type": "LiberoEnvironment", **values}

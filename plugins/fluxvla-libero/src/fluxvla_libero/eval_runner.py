@@ -11,7 +11,6 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate.drawing import RENDERS
 from fluxvla_core.evaluate.runner import EvalRunner
 from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
-from fluxvla_libero.environment import environment_table
 from fluxvla_libero.suites import NUM_STEPS_WAIT, check_suite, choose_tasks
 
 TRIALS = 50
@@ -117,12 +116,13 @@ class LiberoEvalRunner(EvalRunner):
         super().__init__(
             cfg=cfg,
             context=self.context,
-            environment=environment_table(
-                suite=task_suite_name,
-                cameras=tuple(CAMERAS),
-                render=render,
-                num_steps_wait=num_steps_wait,
-            ),
+            environment={
+                "type": "LiberoEnvironment",
+                "suite": task_suite_name,
+                "cameras": tuple(CAMERAS),
+                "render": render,
+                "num_steps_wait": num_steps_wait,
+            },
             policy=policy,
             ckpt_path=ckpt_path,
             episodes=num_trials_per_task,

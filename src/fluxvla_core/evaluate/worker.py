@@ -97,10 +97,15 @@ class Settings:
 class EpisodeWorker:
     """Runs episodes in one process: a function from a job to the record of its episode.
 
-    The environment is made at once, policies when they are first needed; both are kept.
+    Environment and policy are made at once, the untrained twin when it is first needed; all are
+    kept.
 
     Args:
         link: to a ``PolicyServer``, where there are served policies.
+
+    Raises:
+        SpecMismatch: the policy is for another robot, or wants cameras that are not there.
+        FluxError: environment or policy cannot be had.
     """
 
     def __init__(self, settings: Settings, link: Connection | None = None) -> None:
@@ -108,6 +113,9 @@ class EpisodeWorker:
         self._link = link
         self.environment: Environment = build_environment_from_cfg(settings.environment)
         self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
+        # Before the first episode: one that does not fit is refused before a scene is built, and
+        # loading it is no part of an episode's time.
+        self.actor(POLICY)
 
     def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
         """The record of an episode: JSON values.
@@ -119,7 +127,6 @@ class EpisodeWorker:
         if isinstance(job, EpisodeKey):
             job = Job(job)
         settings, key = self._settings, job.key
-        # First of all, so that a policy that does not fit is refused before a scene is built.
         actor, cameras = self.actor(key.group)
         tasks = self.environment.spec.tasks
         if settings.live is not None:

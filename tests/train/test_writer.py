@@ -27,6 +27,17 @@ def write(work_dir, step, disk=None, text=b"weights"):
         return writer.commit()
 
 
+def write_together(work_dir, step, disk=None):
+    """Two ranks write one checkpoint; what kills one of them here kills both."""
+    first, second = (CheckpointWriter(work_dir, step, 0, disk, rank=rank) for rank in (0, 1))
+    first.begin("optimizer")
+    for writer in (second, first):
+        writer.write_bytes(f"optimizer/rank-0000{writer.rank}.safetensors", b"p" * step)
+    first.write_bytes("model.safetensors", b"weights")
+    first.join([first.report(), second.report()])
+    return first.commit()
+
+
 class Killed(BaseException):
     """Stands for SIGKILL: nothing handles it, and nothing more reaches the disk."""
 
@@ -54,14 +65,15 @@ class Failing(Disk):
         return value
 
 
-def operations(tmp_path):
+def operations(tmp_path, write):
     counting = Failing(10**9, None, False)
     write(tmp_path / "count", 10, counting)
     return counting.done
 
 
-def test_a_kill_at_any_file_operation_keeps_the_checkpoint_before(tmp_path):
-    total = operations(tmp_path)
+@pytest.mark.parametrize("write", [write, write_together])
+def test_a_kill_at_any_file_operation_keeps_the_checkpoint_before(tmp_path, write):
+    total = operations(tmp_path, write)
     assert total > 15
     for number in range(1, total + 1):
         work = tmp_path / str(number)
@@ -78,9 +90,10 @@ def test_a_kill_at_any_file_operation_keeps_the_checkpoint_before(tmp_path):
         assert latest(work).step == 30
 
 
+@pytest.mark.parametrize("write", [write, write_together])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_an_error_at_any_file_operation_keeps_the_checkpoint_before(tmp_path, number):
-    for at in range(1, operations(tmp_path) + 1):
+def test_an_error_at_any_file_operation_keeps_the_checkpoint_before(tmp_path, number, write):
+    for at in range(1, operations(tmp_path, write) + 1):
         work = tmp_path / str(at)
         write(work, 10)
         with pytest.raises(RunFailed) as caught:
@@ -97,6 +110,18 @@ def test_an_error_at_any_file_operation_keeps_the_checkpoint_before(tmp_path, nu
             if latest(work).step == 10
             else [["step-000000010", "step-000000020"], ["step-000000020", "step-000000010"]]
         )
+
+
+def test_a_rank_that_does_not_see_the_folder_says_so(tmp_path):
+    first = CheckpointWriter(tmp_path / "here", 5, 0)
+    second = CheckpointWriter(tmp_path / "elsewhere", 5, 0, rank=1)
+    first.begin("optimizer")
+    second.write_bytes("optimizer/rank-00001.safetensors", b"x")
+    first.join([second.report()])
+    seen = "No such file or directory, on rank 1, which may not see the first rank's work dir"
+    with pytest.raises(RunFailed, match=seen):
+        first.commit()
+    assert not (tmp_path / "elsewhere").exists()
 
 
 def test_a_limit_on_file_sizes_is_a_full_disk(tmp_path):

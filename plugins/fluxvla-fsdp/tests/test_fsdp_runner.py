@@ -17,7 +17,13 @@ from torch.distributed.tensor import DTensor
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
-from fluxvla_core.testing.training import differences, run_ranks, tiny_config, train
+from fluxvla_core.testing.training import (
+    checkpoint_differences,
+    differences,
+    run_ranks,
+    tiny_config,
+    train,
+)
 from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
 
 
@@ -45,12 +51,19 @@ STRATEGIES = {
 
 
 def every_strategy(work_dir):
-    """Train with each; every rank writes down what it made of the model."""
+    """Train with each, and again from the middle; every rank writes down what it made of it."""
     torch.distributed.init_process_group("gloo")
     for name in STRATEGIES:
-        table = {"type": "FSDPTrainRunner", "max_steps": 6, "sharding_strategy": name}
-        config = tiny_config(table, batch=2)
+        table = {
+            "type": "FSDPTrainRunner",
+            "max_steps": 6,
+            "save_iter_interval": 3,
+            "sharding_strategy": name,
+        }
+        config = tiny_config(table, batch=2, dropout=0.0)
         model = train({"config": config, "work_dir": str(work_dir / name)}).model
+        middle = folders(work_dir / name)[0]
+        train({"config": config, "work_dir": str(work_dir / f"{name}-on"), "resume": str(middle)})
         weight = model.blocks[0].linear.weight
         group = model.blocks[0]._get_fsdp_state()._fsdp_param_group
         sharded = {n for n, p in model.named_parameters() if isinstance(p, DTensor)}
@@ -64,14 +77,52 @@ def every_strategy(work_dir):
         (work_dir / f"{name}-{rank}.json").write_text(json.dumps(found))
 
 
-def test_what_each_strategy_splits_and_that_all_train_alike(tmp_path):
-    assert run_ranks(2, every_strategy, tmp_path) == [0, 0]
-    for name, expected in STRATEGIES.items():
-        for rank in range(2):
-            assert json.loads((tmp_path / f"{name}-{rank}.json").read_text()) == expected
-    first, *others = (latest(tmp_path / name).tensors("model.safetensors") for name in STRATEGIES)
-    for other in others:
-        assert all(torch.allclose(first[n], other[n], atol=1e-6) for n in first)
+@pytest.fixture(scope="module")
+def strategies(tmp_path_factory):
+    work_dir = tmp_path_factory.mktemp("strategies")
+    assert run_ranks(2, every_strategy, work_dir) == [0, 0]
+    return work_dir
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_what_a_strategy_splits(strategies, name):
+    for rank in range(2):
+        assert json.loads((strategies / f"{name}-{rank}.json").read_text()) == STRATEGIES[name]
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_goes_on_bit_for_bit(strategies, name):
+    whole, on = (latest(strategies / d).path for d in (name, f"{name}-on"))
+    assert checkpoint_differences(whole, on) == []
+
+
+def test_all_strategies_train_as_one_process_does(strategies, tmp_path):
+    config = tiny_config({"type": "OneProcessRunner", "max_steps": 6}, batch=4, dropout=0.0)
+    train({"config": config, "work_dir": str(tmp_path)})
+    alone = latest(tmp_path).tensors("model.safetensors")
+    for name in STRATEGIES:
+        found = latest(strategies / name).tensors("model.safetensors")
+        gaps = [float((alone[n] - found[n]).abs().max()) for n in alone if n != "batches"]
+        assert max(gaps) < 1e-5, name
+
+
+def two_machines(work_dir):
+    """Four processes, two to a machine: both machines hold the same two halves."""
+    os.environ["LOCAL_WORLD_SIZE"] = "2"
+    table = {"type": "FSDPTrainRunner", "max_steps": 6, "sharding_strategy": "hybrid-shard"}
+    model = train({"config": tiny_config(table, batch=1, dropout=0.0), "work_dir": work_dir}).model
+    weight = model.blocks[0].linear.weight
+    assert (list(weight.device_mesh.shape), weight.to_local().shape[0]) == ([2, 2], 4)
+
+
+def test_hybrid_over_two_machines_saves_every_part_once(strategies, tmp_path):
+    assert run_ranks(4, two_machines, tmp_path) == [0] * 4
+    saved = latest(tmp_path)
+    parts = [n for n in saved.manifest.files if n.startswith("optimizer/")]
+    assert parts == ["optimizer/rank-00000.safetensors", "optimizer/rank-00001.safetensors"]
+    full = latest(strategies / "full-shard").tensors("model.safetensors")
+    found = saved.tensors("model.safetensors")
+    assert all(torch.allclose(full[n], found[n], atol=1e-5) for n in full if n != "batches")
 
 
 def nodes(work_dir):

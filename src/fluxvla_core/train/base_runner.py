@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
+    from fluxvla_core.train.parts import Stored
+
 
 class BaseTrainRunner(TrainRun):
     """The training loop with everything around it; works as it is on one process.
@@ -345,6 +347,27 @@ class BaseTrainRunner(TrainRun):
         """Take an optimizer's state in the form of its ``state_dict``; whether it was taken."""
         self.optimizer.load_state_dict(state)
         return True
+
+    def _model_tensors(self) -> Mapping[str, Tensor]:
+        """Weights and buffers by name, to be saved; parts of them where they are sharded."""
+        from fluxvla_core.train.weights import model_tensors
+
+        return model_tensors(self.model)
+
+    def _optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+        """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""
+        from fluxvla_core.train.optim import named_state
+
+        return named_state(self.model, self.optimizer)
+
+    def _load_optimizer_tensors(
+        self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
+    ) -> bool:
+        """The inverse of :meth:`_optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
+        from fluxvla_core.train.optim import torch_state
+
+        state = torch_state(self.model, self.optimizer, tensors, described, where)
+        return self._load_optimizer_state(state)
 
     def resume(self) -> int:
         """Go on from the checkpoint that the run was told to; the step it stands at, 0 afresh.

@@ -33,7 +33,8 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     run.plan = run._plan(len(dataset), run._shards(dataset))
     run._saver = Saver(world, options.async_save, run.optimizer)
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))
-    run.left_out = left_out(run.model)
+    if run.left_out is None:
+        run.left_out = left_out(run.model)
     if options.ema_decay is not None:
         run.ema = Ema(trainable(run.model), options.ema_decay)
     run.resume()

@@ -20,7 +20,6 @@ from fluxvla_core.train.checkpoint import (
 )
 from fluxvla_core.train.distributed import World, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
-from fluxvla_core.train.optim import torch_state
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
 from fluxvla_core.train.shelf import clear_leftovers, prepare, set_aside_later
@@ -159,14 +158,8 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
     check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
     run._load_model_state(tensors)
-    state = torch_state(
-        run.model,
-        run.optimizer,
-        checkpoint.optimizer_tensors(),
-        checkpoint.json(OPTIMIZER_META),
-        where,
-    )
-    if run._load_optimizer_state(state) is False:
+    optimizer = checkpoint.optimizer_tensors(), checkpoint.json(OPTIMIZER_META)
+    if run._load_optimizer_tensors(*optimizer, where) is False:
         raise CheckpointError(
             f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
         )

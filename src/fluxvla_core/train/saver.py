@@ -81,8 +81,8 @@ class Saver:
         if not self.beside:
             self._run(job, lambda: write(self.world, files, warn))
             return
-        ready = _reached(self.world.device)
         gathered = [file.gathered() for file in files]
+        ready = _reached(self.world.device)
         job.thread = threading.Thread(
             target=self._run,
             args=(job, lambda: write(self._threads, self._held(job, gathered, ready), warn)),

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
@@ -18,13 +17,12 @@ from fluxvla_core.train import checkpoint as ckpt
 from fluxvla_core.train import lora
 from fluxvla_core.train.distributed import World, on_first, texts
 from fluxvla_core.train.ema import Ema
-from fluxvla_core.train.optim import named_state
 from fluxvla_core.train.parts import is_split, own_parts
 from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.shelf import rotate
 from fluxvla_core.train.state import rng_state
 from fluxvla_core.train.tensors import TensorFile
-from fluxvla_core.train.weights import LeftOut, model_tensors
+from fluxvla_core.train.weights import LeftOut
 from fluxvla_core.train.writer import CheckpointWriter, json_bytes
 
 if TYPE_CHECKING:
@@ -36,18 +34,19 @@ class Snapshot:
     """One moment of a run: the tensors as they are in memory, everything else as JSON values.
 
     Args:
-        model: unwrapped of what trains it.
-        left_out: frozen weights that are not saved.
+        model: weights and buffers of the model's file.
+        optimizer: its state by ``<parameter>/<key>``.
+        described: ``optimizer.json``.
         trainer: ``trainer.json``.
         adapter: what LoRA trains, by peft's names; it is not among the model's file.
         documents: file name -> JSON object, fixed for the run.
         folders: folder name -> what fills it.
     """
 
-    model: nn.Module
-    optimizer: torch.optim.Optimizer
+    model: Mapping[str, Tensor]
+    optimizer: Mapping[str, Tensor]
+    described: Mapping[str, Any]
     trainer: Mapping[str, Any]
-    left_out: LeftOut = field(default_factory=LeftOut)
     ema: Ema | None = None
     adapter: Mapping[str, Tensor] = field(default_factory=dict)
     documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -76,13 +75,14 @@ def save_snapshot(
     """
     world = saver.world
     writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
-    tensors, described = named_state(snapshot.model, snapshot.optimizer)
+    tensors = snapshot.optimizer
     split = any(map(is_split, tensors.values()))
-    values = {ckpt.OPTIMIZER_META: described, ckpt.TRAINER: snapshot.trainer, **snapshot.documents}
+    values = {ckpt.OPTIMIZER_META: snapshot.described, ckpt.TRAINER: snapshot.trainer}
     documents: dict[str, bytes] = {}
 
     def prepare() -> str:
-        documents.update({name: json_bytes(name, value) for name, value in values.items()})
+        for name, value in {**values, **snapshot.documents}.items():
+            documents[name] = json_bytes(name, value)
         writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
         # Now rather than in the thread: the training may use the same tokenizer meanwhile.
         for name, fill in snapshot.folders.items():
@@ -96,7 +96,8 @@ def save_snapshot(
     ]
     if split:
         parts = own_parts(tensors, world.first)
-        files.append(TensorFile.parts(part_file(world.rank), parts))
+        if parts:
+            files.append(TensorFile.parts(part_file(world.rank), parts))
     else:
         files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
 
@@ -128,8 +129,7 @@ def save_snapshot(
 
 
 def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
-    elsewhere = {*snapshot.left_out.names, *lora.adapter_names(snapshot.model)}
-    model = model_tensors(snapshot.model, elsewhere)
+    model = snapshot.model
     if saver.beside:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
@@ -160,8 +160,9 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         only_trainable: leave out frozen weights that the model brings itself.
     """
     without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
-    state = model_tensors(run.model)
-    adapter = {theirs: state[name] for name, theirs in lora.adapter_names(run.model).items()}
+    state, (optimizer, described) = run._model_tensors(), run._optimizer_tensors()
+    adapter = lora.adapter_names(run.model)
+    elsewhere = {*without.names, *adapter}
     documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
     if run.lora is not None:
         documents[lora.CONFIG] = run.lora.for_peft(run.options.init_from)
@@ -178,12 +179,12 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         "left_out": without.to_dict(),
     }
     return Snapshot(
-        run.model,
-        run.optimizer,
+        {name: tensor for name, tensor in state.items() if name not in elsewhere},
+        optimizer,
+        described,
         trainer,
-        without,
         run.ema,
-        adapter,
+        {theirs: state[name] for name, theirs in adapter.items()},
         documents,
         run_folders(run.dataset, run.tokenizer),
     )

@@ -41,14 +41,21 @@ class CheckpointWriter:
         disk: the file operations.
         rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
             by :meth:`report` and :meth:`join`.
+        final: another folder than that of the step.
     """
 
     def __init__(
-        self, work_dir: Path, step: int, epoch: int, disk: Disk | None = None, rank: int = 0
+        self,
+        work_dir: Path,
+        step: int,
+        epoch: int,
+        disk: Disk | None = None,
+        rank: int = 0,
+        final: Path | None = None,
     ) -> None:
         self.disk = disk or Disk()
         self.step, self.epoch, self.rank = step, epoch, rank
-        self.final = work_dir / FOLDER / step_name(step)
+        self.final = final or work_dir / FOLDER / step_name(step)
         self.folder = self.final.with_name(self.final.name + PARTIAL)
         self.files: dict[str, FileEntry] = {}
         self._error: OSError | None = None
@@ -86,8 +93,8 @@ class CheckpointWriter:
     def refuse(self, error: Exception) -> None:
         """Let :meth:`commit` fail with ``error``, unless something before it failed."""
         if self._error is None:
-            kind = OSError(None, f"{type(error).__name__}: {error}")
-            self._error = error if isinstance(error, OSError) else kind
+            told = OSError(f"{type(error).__name__}: {error}")
+            self._error = error if isinstance(error, OSError) else told
 
     @contextmanager
     def open(self, name: str) -> Iterator[HashedFile]:
@@ -150,7 +157,7 @@ class CheckpointWriter:
                 text = f"{text}, on rank {report['rank']}"
                 if number == errno.ENOENT:
                     text += ", which may not see the first rank's work dir"
-                self._error = OSError(number, text)
+                self._error = OSError(text) if number is None else OSError(number, text)
 
     def commit(self) -> Path:
         """Give the folder its final name and return it.

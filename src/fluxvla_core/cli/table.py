@@ -51,6 +51,9 @@ COMMANDS: Mapping[str, Entry] = {
     "eval compare": Entry(
         "fluxvla_core.cli.eval_commands:Compare", "compare two evaluations, pair by pair"
     ),
+    "export": Entry(
+        "fluxvla_core.cli.export_command:Export", "write what acts of a checkpoint into a folder"
+    ),
     "report": Entry("fluxvla_core.report.command:Report", "write the HTML report of a work dir"),
     "version": Entry("fluxvla_core.cli.version:Version", "print the versions"),
 }

@@ -14,6 +14,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "runners": ("AlohaInferenceRunner",),
     },
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
+    "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-libero": {

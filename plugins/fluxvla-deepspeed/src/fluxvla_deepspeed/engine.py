@@ -1,0 +1,165 @@
+"""DeepSpeed's engine around a model and its optimizer, and their state by parameter name.
+
+ZeRO trains flat fp32 copies of which every process holds a part. The names, shapes and values of
+the parameters that they are made of are put together again for checkpoints, which are therefore
+those of any other strategy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.train.distributed import World
+from fluxvla_core.train.parts import Stored
+
+
+def start(
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    stage: int,
+    max_grad_norm: float | None,
+    compute_dtype: torch.dtype | None,
+    world: World,
+) -> Any:
+    """DeepSpeed's engine for ``model``, with ``optimizer`` inside its ZeRO ``stage``.
+
+    Args:
+        max_grad_norm: gradients are scaled down to this norm; None leaves them.
+        compute_dtype: of matrix products; None for fp32.
+    """
+    if world.device.type == "cpu":
+        os.environ.setdefault("DS_ACCELERATOR", "cpu")
+    import deepspeed
+
+    if world.device.type == "cpu":
+        # Its shared-memory kernels would be compiled on first use, and gloo is there already.
+        deepspeed.ops.__compatible_ops__["deepspeed_shm_comm"] = False
+    config: dict[str, Any] = {
+        # Batches are counted, accumulated and divided by the core's loop.
+        "train_micro_batch_size_per_gpu": 1,
+        "gradient_accumulation_steps": 1,
+        "gradient_clipping": max_grad_norm or 0.0,
+        "zero_optimization": {"stage": stage},
+        "zero_allow_untested_optimizer": True,
+    }
+    if compute_dtype is not None:
+        # Weights and gradients stay fp32 on the wire, as with the other strategies.
+        config["torch_autocast"] = {
+            "enabled": True,
+            "dtype": str(compute_dtype).removeprefix("torch."),
+            "lower_precision_safe_modules": [],
+        }
+    engine, *_ = deepspeed.initialize(
+        model=model, optimizer=optimizer, config=config, dist_init_required=False
+    )
+    return engine
+
+
+def gathered(parameters: Iterable[nn.Parameter], stage: int) -> AbstractContextManager[object]:
+    """Inside, the parameters are whole, and what the first rank changes is everybody's after it."""
+    if stage < 3:
+        return nullcontext()
+    from deepspeed.zero import GatheredParameters
+
+    context: AbstractContextManager[object] = GatheredParameters(list(parameters), modifier_rank=0)
+    return context
+
+
+def put_master_weights(
+    parameters: Mapping[str, nn.Parameter], values: Mapping[str, Tensor]
+) -> None:
+    """Let ZeRO's fp32 copies of ``parameters`` be the full ``values`` of the same names."""
+    from deepspeed.utils import safe_set_full_fp32_param
+
+    for name, parameter in parameters.items():
+        if name in values:
+            safe_set_full_fp32_param(parameter, values[name].to(parameter.device, torch.float32))
+
+
+def read_state(
+    engine: Any, inner: torch.optim.Optimizer, parameters: Mapping[str, nn.Parameter]
+) -> dict[str, Tensor]:
+    """The state of ``inner`` as whole tensors ``<parameter>/<key>``; all ranks call it."""
+    from deepspeed.utils import safe_get_full_optimizer_state
+
+    flats = [flat for flat in _flats(engine) if flat in inner.state]
+    if not flats:
+        return {}
+    _link(engine, inner)
+    found: dict[str, Tensor] = {}
+    state = inner.state[flats[0]]
+    for name, parameter in parameters.items():
+        for key, value in state.items():
+            if value.shape == flats[0].shape:
+                full = safe_get_full_optimizer_state(parameter, key)
+                found[f"{name}/{key}"] = full.detach().clone()
+            else:
+                # A count of steps: the same for all.
+                found[f"{name}/{key}"] = value.detach().clone()
+    return found
+
+
+def put_state(
+    engine: Any,
+    inner: torch.optim.Optimizer,
+    parameters: Mapping[str, nn.Parameter],
+    tensors: Mapping[str, Tensor | Stored],
+) -> None:
+    """The inverse of :func:`read_state`, before the first step."""
+    from deepspeed.utils import safe_set_full_optimizer_state
+
+    shapes = {name: _shape(parameter) for name, parameter in parameters.items()}
+    keys = {place.rpartition("/")[2] for place in tensors}
+    split = {
+        key
+        for key in keys
+        if all(tensors[f"{name}/{key}"].shape == shape for name, shape in shapes.items())
+    }
+    name = next(iter(parameters))
+    for flat in _flats(engine):
+        inner.state[flat] = {
+            key: torch.zeros_like(flat)
+            if key in split
+            else _whole(tensors[f"{name}/{key}"]).to(flat.device)
+            for key in sorted(keys)
+        }
+    _link(engine, inner)
+    for name, parameter in parameters.items():
+        for key in sorted(split):
+            value = _whole(tensors[f"{name}/{key}"]).to(parameter.device)
+            safe_set_full_optimizer_state(parameter, value, key)
+
+
+def _link(engine: Any, inner: torch.optim.Optimizer) -> None:
+    """Let parameters know where in the flat state theirs is.
+
+    Stages 1 and 2 do so themselves after the step of their first group, when the other groups have
+    no state yet.
+    """
+    from deepspeed.utils.mixed_precision_linkage import lazy_init_hp_params_optimizer_state
+
+    zero = engine.optimizer
+    if hasattr(zero, "single_partition_of_fp32_groups"):
+        for group, flat in zip(zero.bit16_groups, _flats(engine), strict=True):
+            lazy_init_hp_params_optimizer_state(group, flat, inner.state)
+
+
+def _flats(engine: Any) -> list[Tensor]:
+    """ZeRO's flat fp32 copies of this rank, which the inner optimizer steps."""
+    zero = engine.optimizer
+    stages_1_and_2 = getattr(zero, "single_partition_of_fp32_groups", None)
+    return list(zero.fp32_partitioned_groups_flat if stages_1_and_2 is None else stages_1_and_2)
+
+
+def _shape(parameter: nn.Parameter) -> torch.Size:
+    return torch.Size(getattr(parameter, "ds_shape", parameter.shape))
+
+
+def _whole(tensor: Tensor | Stored) -> Tensor:
+    return tensor[tuple(slice(0, n) for n in tensor.shape)].clone()

@@ -1,0 +1,129 @@
+"""DeepSpeedTrainRunner: the same training as in one process, in every stage, and exact resume."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.testing.train_runner import TrainRunnerConformance
+from fluxvla_core.testing.training import (
+    checkpoint_differences,
+    run_ranks,
+    tiny_config,
+    train,
+)
+from fluxvla_core.train.checkpoint import folders, latest
+
+installed = pytest.mark.skipif(find_spec("deepspeed") is None, reason="DeepSpeed is not installed")
+STAGES = (1, 2, 3)
+
+
+@installed
+@pytest.mark.slow
+class TestDeepSpeedTrainRunner(TrainRunnerConformance):
+    """Every start of processes imports DeepSpeed for seconds: at night only."""
+
+    entry_point = "DeepSpeedTrainRunner"
+
+
+def config(batch=2, **settings):
+    table = {
+        "max_steps": 6,
+        "save_iter_interval": 3,
+        "weight_decay": 0.1,
+        "max_grad_norm": 0.5,
+        "grad_accumulation_steps": 2,
+        "lr_scheduler_type": "linear-warmup+cosine-decay",
+        **settings,
+    }
+    return tiny_config(table, batch, dropout=0.0)
+
+
+def every_stage(work_dir, stages=STAGES):
+    """Train with each stage, and again from its own middle and from that of one process."""
+    torch.distributed.init_process_group("gloo")
+    for stage in stages:
+        table = {"type": "DeepSpeedTrainRunner", "zero_stage": stage}
+        runs = {f"{stage}": None, f"{stage}-on": f"{stage}", f"{stage}-from-one": "one"}
+        for name, before in runs.items():
+            resume = None if before is None else str(folders(work_dir / before)[0])
+            run = {"config": config(**table), "work_dir": str(work_dir / name), "resume": resume}
+            train(run)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    work_dir = tmp_path_factory.mktemp("stages")
+    one = config(4, type="OneProcessRunner")
+    train({"config": one, "work_dir": str(work_dir / "one")})
+    assert run_ranks(2, every_stage, work_dir) == [0, 0]
+    for stage in STAGES:
+        resume = str(folders(work_dir / f"{stage}")[0])
+        train({"config": one, "work_dir": str(work_dir / f"one-from-{stage}"), "resume": resume})
+    return work_dir
+
+
+def gap(a, b):
+    ours, theirs = (latest(d).tensors("model.safetensors") for d in (a, b))
+    assert ours.keys() == theirs.keys()
+    return max(float((ours[n] - theirs[n]).abs().max()) for n in ours if n != "batches")
+
+
+@installed
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_goes_on_bit_for_bit(runs, stage):
+    whole, on = (latest(runs / d).path for d in (f"{stage}", f"{stage}-on"))
+    assert checkpoint_differences(whole, on) == []
+
+
+@installed
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_trains_as_one_process_does(runs, stage):
+    assert gap(runs / f"{stage}", runs / "one") < 1e-5
+    rows = [
+        [json.loads(line) for line in (runs / d / "metrics.jsonl").open()]
+        for d in (f"{stage}", "one")
+    ]
+    for ours, theirs in zip(*rows, strict=True):
+        assert ours["lr"] == theirs["lr"]
+        assert abs(ours["loss"] - theirs["loss"]) < 1e-5
+        assert abs(ours["grad_norm"] - theirs["grad_norm"]) < 1e-4
+
+
+@installed
+@pytest.mark.parametrize("stage", STAGES)
+def test_checkpoints_go_to_one_process_and_back(runs, stage):
+    assert gap(runs / f"{stage}-from-one", runs / "one") < 1e-5
+    assert gap(runs / f"one-from-{stage}", runs / "one") < 1e-5
+    ours, theirs = (folders(runs / d)[0] for d in (f"{stage}", "one"))
+    names = [{p.relative_to(d).as_posix() for p in d.rglob("*")} for d in (ours, theirs)]
+    assert names[0] - names[1] == {"rng/rank-00001.safetensors"}
+
+
+def build(work_dir, **settings):
+    tree = config(type="DeepSpeedTrainRunner", **settings)
+    context = RunContext(config=tree, section="runner", work_dir=work_dir)
+    return build_runner_from_cfg(tree["runner"], context)
+
+
+def test_unknown_stages_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="zero_stage must be 1, 2 or 3, got 4"):
+        build(tmp_path, zero_stage=4)
+
+
+def test_averages_need_whole_weights(tmp_path):
+    with pytest.raises(ConfigError, match="ema_decay does not go together with zero_stage 3"):
+        build(tmp_path, zero_stage=3, ema_decay=0.9)
+
+
+def test_without_deepspeed_the_command_that_brings_it_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("fluxvla_deepspeed.runner.find_spec", lambda name: None)
+    with pytest.raises(ConfigError) as caught:
+        build(tmp_path)
+    assert "needs the package deepspeed, which is not installed" in str(caught.value)
+    assert "pip install --no-build-isolation 'fluxvla-deepspeed[deepspeed]'" in str(caught.value)

@@ -12,6 +12,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import RUNNERS
 
 SPEC = embodiment.aloha_spec(cameras=())
@@ -79,6 +80,17 @@ def run(tmp_path, operator, policy, **arguments):
 
 def test_it_is_found_by_its_name():
     assert RUNNERS.get("AlohaInferenceRunner") is AlohaInferenceRunner
+
+
+def test_the_one_in_real_time_asks_for_a_policy_that_goes_on_from_a_chunk(tmp_path):
+    with pytest.raises(ConfigError, match="chunk_joining is 'rtc', and Closing cannot go on"):
+        run(tmp_path, Still(), Closing(0.5), type="AlohaRTCInferenceRunner")
+    policy = Closing(0.5)
+    policy.continue_action = lambda observation, rest: policy.predict_action(observation)
+
+    _, result = run(tmp_path, Still(), policy, type="AlohaRTCInferenceRunner")
+
+    assert result["outcome"] == "max_steps"
 
 
 @pytest.mark.parametrize(("threshold", "ends_at"), [(None, 0.04), (0.05, 0.0)])

@@ -102,3 +102,29 @@ def test_losses_are_of_all_ranks_and_every_rank_hears_of_another_ones_nan(tmp_pa
         == said[1]
         == "1.5\nthe loss is nan at step 2\n    rank 1: loss nan on samples [7, 9]"
     )
+
+
+def test_the_loss_of_each_dataset():
+    """Of three datasets one has no sample in the second step."""
+    window = Window(ONE, {"cubes": 10, "cups": 5, "plates": 100})
+    losses = [torch.tensor([1.0, 3.0, 5.0]), torch.tensor([7.0, 9.0])]
+    ids = [torch.tensor([0, 9, 10]), torch.tensor([14, 15])]
+    means = [part.mean() for part in losses]
+    window.add(1, 0.0, 1e-3, means, ids, None, 5, 0.0, losses)
+    window.add(2, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, losses[:1])
+    window.add(3, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, [None])
+    window.add(4, 0.0, 1e-3, means[:1], [None], None, 3, 0.0, losses[:1])
+    found = [record.by_dataset for record in window.fetch()]
+    assert found == [
+        {"cubes": 2.0, "cups": 6.0, "plates": 9.0},
+        {"cubes": 2.0, "cups": 5.0},
+        {},
+        {},
+    ]
+
+
+def test_one_dataset_has_no_loss_of_its_own():
+    window = Window(ONE, {"cubes": 10})
+    each = torch.tensor([1.0])
+    window.add(1, 0.0, 1e-3, [each.mean()], [torch.tensor([0])], None, 1, 0.0, [each])
+    assert window.fetch()[0].by_dataset == {}

@@ -72,6 +72,25 @@ def test_masked_actions_do_not_matter(model):
     assert torch.equal(model(**batch)["loss"], model(**other)["loss"])
 
 
+def test_each_samples_loss_is_told_and_their_mean_is_the_loss(model):
+    batch = make_batch()
+    found = model(**batch)
+    assert found["sample_losses"].shape == (5,)
+    assert not found["sample_losses"].requires_grad
+    assert found["sample_losses"].mean().item() == pytest.approx(found["loss"].item(), rel=1e-6)
+    alone = model(**{k: v[2:3] for k, v in batch.items()})["loss"]
+    assert found["sample_losses"][2].item() == pytest.approx(alone.item(), rel=1e-5)
+
+
+def test_a_head_that_only_knows_its_loss_is_enough(model, monkeypatch):
+    batch = make_batch()
+    expected = model(**batch)["loss"]
+    head = model.vla_head
+    monkeypatch.delattr(type(head), "errors")
+    monkeypatch.setattr(type(head), "loss", lambda self, *inputs: expected)
+    assert model(**batch) == {"loss": expected}
+
+
 def test_the_mean_of_two_halves_is_the_loss_of_the_whole(model):
     batch = make_batch(size=4)
     halves = [model(**{k: v[i : i + 2] for k, v in batch.items()})["loss"] for i in (0, 2)]

@@ -62,6 +62,8 @@ class CompactVLA(nn.Module):
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar}``.
 
+        A head that tells ``errors`` gives ``sample_losses`` ``(B,)`` too, for the records.
+
         Args:
             images: ``(B, 3N, H, W)`` normalised.
             lang_tokens, lang_masks: ``(B, L)`` int64 and bool.
@@ -70,7 +72,11 @@ class CompactVLA(nn.Module):
             noise: ``(B, K, T, D)``; ``time``: ``(B, K)``: K draws for each sample.
         """
         context = self._context(images, lang_tokens, lang_masks, states)
-        return {"loss": self.vla_head.loss(context, actions, action_masks, noise, time)}
+        if not hasattr(self.vla_head, "errors"):
+            return {"loss": self.vla_head.loss(context, actions, action_masks, noise, time)}
+        errors = self.vla_head.errors(context, actions, action_masks, noise, time)
+        each = errors.detach().reshape(len(actions), -1).mean(1)
+        return {"loss": errors.mean(), "sample_losses": each}
 
     def predict_action(
         self,

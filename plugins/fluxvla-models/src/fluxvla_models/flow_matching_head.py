@@ -86,12 +86,12 @@ class FlowMatchingHead(nn.Module):
             hidden = block(hidden, condition)
         return self.chunk_out(self.norm(hidden)).unflatten(1, (self.horizon, self.action_dim))
 
-    def loss(
+    def errors(
         self, context: Tensor, actions: Tensor, masks: Tensor, noise: Tensor, time: Tensor
     ) -> Tensor:
-        """Mean squared error of the estimate over all draws.
+        """Squared errors of the estimate, ``(B * K, T, D)``, the draws of a sample in a row.
 
-        The mean is over every element, padded ones counting as zero error: a denominator that
+        The loss is the mean of all of them, padded ones counting as zero: a denominator that
         depended on the masks would make the gradient depend on how samples share batches.
 
         Args:
@@ -106,7 +106,13 @@ class FlowMatchingHead(nn.Module):
         repeated = context[:, None].expand(-1, draws, -1)
         found = self.estimate(mixed.flatten(0, 1), time.flatten(), repeated.flatten(0, 1))
         error = (found - clean.flatten(0, 1)).square()
-        return (error * masks.repeat_interleave(draws, 0)[..., None]).mean()
+        return error * masks.repeat_interleave(draws, 0)[..., None]
+
+    def loss(
+        self, context: Tensor, actions: Tensor, masks: Tensor, noise: Tensor, time: Tensor
+    ) -> Tensor:
+        """The mean of :meth:`errors`."""
+        return self.errors(context, actions, masks, noise, time).mean()
 
     def sample(self, context: Tensor, noise: Tensor, guide: Guide | None = None) -> Tensor:
         """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps.

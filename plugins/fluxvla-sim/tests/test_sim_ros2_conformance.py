@@ -32,9 +32,10 @@ class OverRos2(OperatorConformance):
     ready_within_s = 60.0
 
     @pytest.fixture(scope="class", autouse=True)
-    def simulation(self, ros_domain):
+    @classmethod
+    def simulation(cls, ros_domain):
         run = "import sys; from fluxvla_core.cli.main import main; sys.exit(main())"
-        words = [sys.executable, "-c", run, "sim", *self.words, "--ros2", *SMALL]
+        words = [sys.executable, "-c", run, "sim", *cls.words, "--ros2", *SMALL]
         with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
             yield
             process.terminate()

@@ -352,7 +352,8 @@ class TestConformance(OperatorConformance):
     heavy_modules = ("torch", "rclpy", "rtde_control", "rtde_receive", "cv2")
 
     @pytest.fixture(scope="class", autouse=True)
-    def robot(self, request):
+    @classmethod
+    def robot(cls):
         with FakeUR() as fake:
-            request.cls.arguments = {"robot_ip": fake.ip, **PATIENT}
+            cls.arguments = {"robot_ip": fake.ip, **PATIENT}
             yield fake

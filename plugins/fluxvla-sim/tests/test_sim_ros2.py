@@ -283,7 +283,11 @@ class TestInSimulation:
         assert found["real_time_factor"] == 0.5
         assert 0.0 < found["real_time_kept"] < 1.5
 
+        aside = HOME.copy()
+        aside[0] = 0.5
+        drive(operator, aside, lambda state: np.allclose(state, aside, atol=0.06))
         operator.begin_episode("hand the cube over to the left arm", 0)
+        np.testing.assert_allclose(operator.get_frame().state, HOME, atol=0.02)
         assert (operator.facts()["seed"], operator.facts()["steps"]) == (20, 0)
         assert operator.last_action is None, "or a stop would send the arm back there"
 

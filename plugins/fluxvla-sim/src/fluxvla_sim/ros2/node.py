@@ -35,6 +35,8 @@ from fluxvla_sim.ros2.judge import Judge
 from fluxvla_sim.world import CONTROL_HZ, Scene
 
 _FACTS_EVERY = 5
+# Simulated seconds after a reset in which no command is taken.
+_SETTLE_S = 0.1
 # A process that was stopped for longer than this goes on from now, instead of catching up.
 _FAR_BEHIND_S = 0.5
 _WELL = "well"
@@ -236,9 +238,12 @@ class RobotNode:
 
     def _hear(self, topic: str) -> Callable[[Any], None]:
         def hear(message: Any) -> None:
+            now = self._simulated(time.monotonic())
             try:
                 with self._lock:
-                    self._body.hear(topic, message, self._simulated(time.monotonic()))
+                    if self._is_late(message, now):
+                        return
+                    self._body.hear(topic, message, now)
                     self._commanded = True
             except BadMessage as error:
                 # What a driver does with nonsense: nothing.
@@ -251,8 +256,18 @@ class RobotNode:
 
         return hear
 
+    def _is_late(self, message: Any, now: float) -> bool:
+        """Whether a command was under way when the episode began: it was for the one before."""
+        if now - self._reset_s < _SETTLE_S:
+            return True
+        stamp = message.header.stamp if hasattr(message, "header") else None
+        sent = None if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+        # Commands need not be stamped.
+        return bool(sent) and sent < self._reset_at
+
     def _reset(self, seed: int) -> None:
         with self._lock:
+            self._reset_s = self._simulated(time.monotonic())
             self._scene.reset(max(seed, 0))
             self._body.reset(self._scene.state)
             self._judge.reset(max(seed, 0))

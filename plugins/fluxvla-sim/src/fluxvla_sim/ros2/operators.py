@@ -33,6 +33,7 @@ STRING, INT64 = "std_msgs.msg:String", "std_msgs.msg:Int64"
 RESET_S = 10.0
 """How long a simulator may take to begin an episode, in its own seconds."""
 _LOOK_S = 0.01
+_SETTLE_S = 0.2
 _KEPT = 0.95
 
 
@@ -112,8 +113,11 @@ class InSimulation(RosOperator):
             return facts["resets"] > before and facts["seed"] == seed
 
         self._wait(begun, f"the simulator did not begin an episode with seed {seed}")
-        at = self.facts()["reset_at"]
-        # What was drawn before still shows the episode before.
+        # A robot that jumps is nothing that matching in time reckons with: a picture of the new
+        # episode must not find the state of the old one within the skew that is allowed. Nor does
+        # the simulator take commands in an episode's first 0.1 s.
+        wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)
+        at = self.facts()["reset_at"] + round(wait_s * 1e9)
         streams = [spec.name for spec in self._specs_of(STATE, CAMERA)]
         self._wait(
             lambda: all(self._stamp(name) >= at for name in streams),

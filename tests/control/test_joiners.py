@@ -41,26 +41,26 @@ def test_parameters_reach_the_joiner():
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("latest-only", "chunk_joining: method 'latest-only'; did you mean 'latest_only'?"),
-        ("best", "chunk_joining: method 'best'; there are synchronous, latest_only, temporal_"),
-        ({"fade_s": 1}, "chunk_joining: method None; there are"),
+        ("latest-only", "method 'latest-only'; did you mean 'latest_only'?"),
+        ("best", "method 'best'; there are synchronous, latest_only, temporal_"),
+        ({"fade_s": 1}, "method None; there are"),
         (
             {"method": "overlap", "fades": 1},
-            "chunk_joining: overlap takes no 'fades'; did you mean 'fade_s'?",
+            "overlap takes no 'fades'; did you mean 'fade_s'?",
         ),
         (
             {"method": "synchronous", "fade_s": 1},
-            "chunk_joining: synchronous takes no 'fade_s'; it takes nothing",
+            "synchronous takes no 'fade_s'; it takes nothing",
         ),
         (
             {"method": "latest_only", "every_s": 1},
-            "chunk_joining: latest_only takes no 'every_s'; it takes nothing",
+            "latest_only takes no 'every_s'; it takes nothing",
         ),
-        ({"method": "overlap", "fade_s": 0}, "chunk_joining: overlap: fade_s must be a positive"),
-        ({"method": "overlap", "fade_s": "x"}, "chunk_joining: overlap: must be real number"),
+        ({"method": "overlap", "fade_s": 0}, "overlap: fade_s must be a positive"),
+        ({"method": "overlap", "fade_s": "x"}, "overlap: must be real number"),
         (
             {"method": "temporal_ensemble", "coefficient": float("nan")},
-            "chunk_joining: temporal_ensemble: coefficient must be a number, got nan",
+            "temporal_ensemble: coefficient must be a number, got nan",
         ),
         (
             {"method": "rtc", "schedule": "expo"},

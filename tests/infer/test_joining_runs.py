@@ -89,7 +89,7 @@ def test_a_method_that_is_not_there_is_named_with_its_place(bench):
     with pytest.raises(ConfigError) as caught:
         BaseInferenceRunner(context=context, operator=bench.arm, chunk_joining="rct")
     assert str(caught.value).startswith(
-        "arm.py:7: inference.chunk_joining: chunk_joining: method 'rct'; did you mean 'rtc'?"
+        "arm.py:7: inference.chunk_joining: chunk_joining method 'rct'; did you mean 'rtc'?"
     )
 
 

@@ -35,20 +35,20 @@ def make_joiner(value: str | Mapping[str, Any] | None, every_s: float = 0.0) -> 
     options = dict(value) if isinstance(value, Mapping) else {"method": value or "synchronous"}
     method = options.pop("method", None)
     if method not in METHODS:
-        raise ConfigError(f"chunk_joining: method {method!r}{_hint(method, METHODS)}")
+        raise ConfigError(f"method {method!r}{_hint(method, METHODS)}")
     kind: Any = STREAMED.get(str(method), Synchronous)
     taken = [name for name in inspect.signature(kind).parameters if name != "every_s"]
     for name in options:
         if name not in taken:
-            raise ConfigError(f"chunk_joining: {method} takes no {name!r}{_hint(name, taken)}")
+            raise ConfigError(f"{method} takes no {name!r}{_hint(name, taken)}")
     if kind is Synchronous:
         return Synchronous()
     try:
         joiner: Joiner = kind(every_s=every_s, **options)
     except TypeError as error:
-        raise ConfigError(f"chunk_joining: {method}: {error}") from error
+        raise ConfigError(f"{method}: {error}") from error
     except ConfigError as error:
-        raise ConfigError(f"chunk_joining: {method}: {error.what}") from error
+        raise ConfigError(f"{method}: {error.what}") from error
     return joiner
 
 

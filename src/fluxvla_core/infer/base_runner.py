@@ -365,8 +365,7 @@ class BaseInferenceRunner:
         try:
             joiner = make_joiner(value)
         except ConfigError as error:
-            where = self.context.where(f"{self.context.section}.chunk_joining")
-            raise ConfigError(error.what, where=where) from error
+            raise self._wrong("chunk_joining", error.what) from error
         if self.async_execution and not joiner.streamed:
             raise self._wrong("chunk_joining", f"is {value!r}, and async_execution is set")
         return value

@@ -124,7 +124,7 @@ def test_in_real_time_the_policy_is_told_what_is_executed_meanwhile(bench, make_
     bench.run(chunk_joining="rtc", max_publish_step=75)
 
     told = [rest for rest in going.told if rest is not None]
-    assert going.told[:2] == [None, None], "nothing is under way at first"
+    assert going.told[0] is None, "nothing is under way at first"
     assert len(told) >= 3
     # 0.12 s and more are two keyframes of 10 Hz at least; and never more than there are.
     assert all(2 <= rest.frozen <= 5 for rest in told)

@@ -11,7 +11,7 @@ from fluxvla_core.build import build_operator_from_cfg, build_policy_from_cfg
 from fluxvla_core.errors import ConfigError, DataError, NotReady, Rejected, SpecMismatch
 from fluxvla_core.record.recording import open_recording
 from fluxvla_core.record.replay_operator import ReplayOperator
-from fluxvla_core.record.replay_policy import ReplayPolicy
+from fluxvla_core.record.replay_policy import RecordingEnded, ReplayPolicy
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.testing import OperatorConformance
 
@@ -139,6 +139,14 @@ def test_on_a_robot_the_answer_that_warms_up_is_not_taken(bench, path, make_arm)
 
 
 @pytest.mark.realtime
+def test_an_answer_that_warms_a_policy_up_leaves_nothing_behind(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+    bench.run(max_publish_step=30)
+
+    assert bench.policy.seeds == [7, 7]
+
+
+@pytest.mark.realtime
 def test_a_recording_plays_in_real_time(bench, path):
     found = ReplayOperator(path, realtime=True)
     _, second = again(bench, path, operator=found)
@@ -181,6 +189,15 @@ def test_a_robot_that_is_not_connected_says_so(path):
     operator.connect()
     with pytest.raises(Rejected, match="elbow"):
         operator.send_action([0.0, np.nan, 0.0])
+
+
+def test_elsewhere_a_policy_without_answers_is_an_error(path):
+    policy = ReplayPolicy(path)
+    policy.reset(0)
+    for _ in open_recording(path).chunks():
+        policy.predict_action({})
+    with pytest.raises(RecordingEnded, match="ends here"):
+        policy.predict_action({})
 
 
 def test_what_a_policy_replays_is_one_of_two():

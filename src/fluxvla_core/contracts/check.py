@@ -31,7 +31,13 @@ _METHODS: Mapping[str, Mapping[str, int]] = {
 }
 # What a class may have besides (contracts.optional); checked where it is there.
 _OPTIONAL: Mapping[str, Mapping[str, int]] = {
-    "operators": {"get_state": 0, "task_done": 0, "task_success": 0, "begin_episode": 2},
+    "operators": {
+        "get_state": 0,
+        "task_done": 0,
+        "task_success": 0,
+        "begin_episode": 2,
+        "pictures_after": 2,
+    },
     "policies": {"continue_action": 2},
     "action_filters": {"bind": 1, "reset": 1},
 }

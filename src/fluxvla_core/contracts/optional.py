@@ -6,6 +6,7 @@ Each of these is used where it is there, and nothing is missing where it is not.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from fluxvla_core.contracts.continuation import Continuation
@@ -33,6 +34,27 @@ class ReadsState(Protocol):
 
     def get_state(self) -> npt.NDArray[np.float64]:
         """The newest ``(state_dim,)`` state. Called from the thread that sends commands."""
+
+
+class KeepsPictures(Protocol):
+    """An operator that keeps pictures for a while: recordings then have all that arrive."""
+
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[Sequence[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """Stamps and ``(H, W, 3)`` uint8 RGB pictures, oldest first, and how many ever arrived.
+
+        Called often, from a thread of its own; ``after`` is the stamp of the last one it has.
+        """
+
+
+class GoesItsOwnWay(Protocol):
+    """An operator that says with False that it does not do what it is told: a recorded robot.
+
+    Its tracking error is then no fault.
+    """
+
+    follows_commands: bool
 
 
 class BeginsEpisodes(Protocol):

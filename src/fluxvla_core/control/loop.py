@@ -81,6 +81,7 @@ class Loop:
         worker: where the policy thinks.
         interrupts: looked at while waiting; the beat looks at them too.
         latency_s: how long, in lockstep, an answer takes.
+        begin_anew: makes the policy forget the answer that warmed it up.
     """
 
     path: CommandPath
@@ -96,6 +97,7 @@ class Loop:
     worker: Worker
     interrupts: Interrupts
     latency_s: float = 0.0
+    begin_anew: Callable[[], None] = lambda: None
 
     def run(self) -> str:
         """Run until the beat says that the episode is over.
@@ -175,11 +177,13 @@ class Loop:
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
         """The first answer: nothing moves yet, and the policy may have to warm up.
 
-        It is asked twice on a robot: by the time of a long first answer, what it saw is old.
+        It is asked twice on a robot: by the time of a long first answer, what it saw is old. The
+        episode begins with the second one.
         """
         asked = self._ask()
         answer = self._idle(asked)
         if not self.lockstep:
+            self.begin_anew()
             asked = self._ask()
             answer = self._idle(asked)
         return answer, asked.last

@@ -25,6 +25,7 @@ from fluxvla_core.errors import FluxError, NotReady, OperatorError, RunFailed
 from fluxvla_core.infer.episode_record import EpisodeRecord
 from fluxvla_core.infer.plan import Answer, Plan, PolicyFailed
 from fluxvla_core.infer.tasks import Task
+from fluxvla_core.record.replay_policy import ENDED, RecordingEnded
 from fluxvla_core.safety.gates import FreshnessGate, check_frame
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
@@ -159,6 +160,7 @@ class Episode:
             worker=plan.worker,
             interrupts=plan.interrupts,
             latency_s=plan.latency_s,
+            begin_anew=lambda: plan.policy.reset(self._seed),
         )
 
     def _first_reading(self) -> tuple[dict[str, Any], Frame | None]:
@@ -232,6 +234,8 @@ class Episode:
                 chunk = policy.predict_action(seen.observation)
             else:
                 chunk = policy.continue_action(seen.observation, rest)
+        except RecordingEnded as error:
+            raise EpisodeOver(ENDED) from error
         except FluxError:
             raise
         except Exception as error:
@@ -259,8 +263,6 @@ class Episode:
             plan.hooks.call("inferred", chunk=keyframes, latency_s=answer.seconds)
         stages = {"policy": answer.seconds, **getattr(policy, "stages", {})}
         self._record.chunk(keyframes, seen.at, stages)
-        if hasattr(policy, "taken"):
-            policy.taken()
         return keyframes[: plan.keyframes]
 
     def _execute(self, actions: Array, rate: Rate) -> None:

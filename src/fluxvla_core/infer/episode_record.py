@@ -58,6 +58,8 @@ class EpisodeRecord:
             robot=plan.robot.name,
             embodiment=spec.to_dict(),
             rate_hz=plan.rate_hz,
+            policy=type(plan.policy).__name__,
+            policy_source=str(getattr(plan.policy, "source", "")),
             action_rate_hz=plan.policy.action_rate_hz,
             horizon=plan.policy.horizon,
             lockstep=plan.robot.lockstep,

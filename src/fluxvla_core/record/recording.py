@@ -209,7 +209,7 @@ def read_lines(path: Path) -> tuple[list[Event], bool]:
 
 
 @dataclass(frozen=True)
-class Bag:
+class BagContent:
     """What a bag's file holds: events, and where its pictures are (topic, ns, place)."""
 
     file: McapFile
@@ -224,7 +224,7 @@ class Bag:
         return self.file.whole
 
 
-def read_bag(path: Path) -> Bag:
+def read_bag(path: Path) -> BagContent:
     """Go through an MCAP file, whole or cut short.
 
     Raises:
@@ -232,7 +232,7 @@ def read_bag(path: Path) -> Bag:
         RunFailed: rosbags is not installed.
     """
     unpacker = ros.Unpacker(ros.typestore())
-    found = Bag(McapFile(path), unpacker, [], [], 0)
+    found = BagContent(McapFile(path), unpacker, [], [], 0)
     offset = 0
     for entry in found.file.entries():
         if entry.kind == ros.IMAGE:

@@ -9,14 +9,18 @@ import numpy.typing as npt
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.control.loop import EpisodeOver
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError, DataError, RunFailed
 from fluxvla_core.record.recording import Recorded, open_recording
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 CHUNKS, COMMANDS = "chunks", "commands"
 ENDED = "recording_ended"
+"""An episode's outcome."""
+
+
+class RecordingEnded(RunFailed):
+    """A replayed policy has no answer left."""
 
 
 class ReplayPolicy:
@@ -78,20 +82,18 @@ class ReplayPolicy:
         self._next = 0
 
     def predict_action(self, observation: Observation) -> Array:
-        """``(horizon, dim)``: the next answer; the same one until ``taken`` is called.
+        """``(horizon, dim)``: the next answer.
 
         Raises:
-            EpisodeOver: there is none left.
+            RecordingEnded: there is none left; a robot's episode ends well with it.
         """
         if self._next >= len(self._chunks):
             cut = "" if self.recorded.whole else ", where it was cut short"
-            self._reporter.info(f"the recording {self.recorded.path} ends here{cut}")
-            raise EpisodeOver(ENDED)
-        return self._chunks[self._next].copy()
-
-    def taken(self) -> None:
-        """The last answer is being played; answers that only warm a policy up are not."""
+            text = f"the recording {self.recorded.path} ends here{cut}"
+            self._reporter.info(text)
+            raise RecordingEnded(text)
         self._next += 1
+        return self._chunks[self._next - 1].copy()
 
     @cached_property
     def _chunks(self) -> list[Array]:

@@ -80,6 +80,7 @@ def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
         if isinstance(began, (int, float))
         else None,
         "robot": summary.get("robot"),
+        "policy": " of ".join(filter(None, (start.get("policy"), start.get("policy_source")))),
         "commands": summary.get("steps"),
         "rate": f"{summary['rate_hz']:g} Hz" if summary.get("rate_hz") else None,
         "chunks of the policy": summary.get("chunks"),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
+
+import torch
 
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
 from fluxvla_core.testing.training import differences, run_ranks, tiny_config, train, train_all
+from fluxvla_core.train.checkpoint import latest
 
 
 class TestDDPTrainRunner(TrainRunnerConformance):
@@ -43,3 +47,25 @@ def unused(work_dir, find):
 def test_parameters_that_a_step_leaves_out_need_to_be_looked_for(tmp_path):
     assert run_ranks(2, unused, tmp_path / "find", True) == [0, 0]
     assert run_ranks(2, unused, tmp_path / "not", False) == [1, 1]
+
+
+def accumulated(work_dir, batch, parts):
+    """Train, and write down how often gradients were kept back instead of exchanged."""
+    kept = []
+    no_sync = torch.nn.parallel.DistributedDataParallel.no_sync
+    torch.nn.parallel.DistributedDataParallel.no_sync = lambda self: kept.append(1) or no_sync(self)
+    table = {"type": "DDPTrainRunner", "max_steps": 5, "grad_accumulation_steps": parts}
+    train({"config": tiny_config(table, batch, dropout=0.0), "work_dir": str(work_dir)})
+    (work_dir / f"kept-{os.environ['RANK']}").write_text(str(len(kept)))
+
+
+def test_accumulation_equals_the_big_batch_and_exchanges_once_a_step(tmp_path):
+    """Three of four backward passes keep their gradients; the fourth exchanges the sum."""
+    for name, batch, parts in (("big", 8, 1), ("split", 2, 4)):
+        assert run_ranks(2, accumulated, tmp_path / name, batch, parts) == [0, 0]
+        kept = [(tmp_path / name / f"kept-{rank}").read_text() for rank in (0, 1)]
+        assert kept == [str(5 * (parts - 1))] * 2
+    big, split = (latest(tmp_path / d).tensors("model.safetensors") for d in ("big", "split"))
+    for name in big:
+        if name != "batches":
+            assert torch.allclose(big[name], split[name], atol=2e-5), name

@@ -139,7 +139,7 @@ def test_every_task_is_counted_over_its_seeds(evaluate, section, tmp_path, liste
     assert records[0]["folder"] == "inference/001-1"
     assert records[0]["instruction"] == "go to the right"
     assert records[0]["steps"] < records[2]["steps"] == 25
-    assert found["settings"]["operator.type"] == "Simulated"
+    assert (found["mode"], found["settings"]["operator.type"]) == ("robot", "Simulated")
     assert found["settings"]["least_real_time_kept"] == 0.91
     assert any("right: 2/4 = 50% (95% interval" in line for line in listener.lines)
     assert ("evaluation", "results.json") in listener.artifacts

@@ -79,6 +79,18 @@ def test_is_bit_identical_to_gym_aloha(stock, world, name, seed):
     assert {0, 2, 4} <= rewards
 
 
+@pytest.mark.parametrize(
+    ("world", "name"), [(CUBE, "AlohaTransferCube"), (INSERTION, "AlohaInsertion")]
+)
+def test_reference_pictures_are_gym_alohas_byte_for_byte(stock, world, name):
+    scene, stock = world.open_scene("reference"), stock(name)
+    stock.reset(seed=5)
+    scene.reset(5)
+    theirs = stock._env.physics.render(height=480, width=640, camera_id="top")
+    np.testing.assert_array_equal(scene.render("top", 480, 640), theirs)
+    scene.close()
+
+
 def test_constants_are_gym_alohas():
     constants = pytest.importorskip("gym_aloha.constants")
     assert constants.PUPPET_GRIPPER_POSITION_CLOSE == arms.FINGER_CLOSED

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 
 FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-aloha": {
+        "action_filters": ("AlohaWorkspaceBox",),
         "operators": ("AlohaOperator",),
-        "runners": ("AlohaInferenceRunner",),
+        "runners": ("AlohaInferenceRunner", "AlohaRTCInferenceRunner"),
     },
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
@@ -35,10 +36,18 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
     "fluxvla-sim": {
         "commands": ("collect", "sim"),
-        "operators": ("AlohaSimOperator", "URSimOperator"),
-        "runners": ("AlohaSimEvalRunner",),
+        "environments": ("AlohaSimEnvironment", "URSimEnvironment"),
+        "operators": (
+            "AlohaSimOperator",
+            "AlohaSimROSOperator",
+            "URSimOperator",
+            "URSimROSOperator",
+        ),
+        "policies": ("SimExpert",),
+        "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
     },
     "fluxvla-ur": {
+        "action_filters": ("URWorkspaceBox",),
         "operators": ("UROperator", "URRTDEOperator"),
         "runners": ("URInferenceRunner",),
     },

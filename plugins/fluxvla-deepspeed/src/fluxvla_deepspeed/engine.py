@@ -65,9 +65,11 @@ def gathered(parameters: Iterable[nn.Parameter], stage: int) -> AbstractContextM
     """Inside, the parameters are whole, and what the first rank changes is everybody's after it."""
     if stage < 3:
         return nullcontext()
-    from deepspeed.zero import GatheredParameters
+    import deepspeed
 
-    context: AbstractContextManager[object] = GatheredParameters(list(parameters), modifier_rank=0)
+    context: AbstractContextManager[object] = deepspeed.zero.GatheredParameters(
+        list(parameters), modifier_rank=0
+    )
     return context
 
 

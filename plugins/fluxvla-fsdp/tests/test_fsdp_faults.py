@@ -15,6 +15,7 @@ from fluxvla_core.train import distributed
 from fluxvla_core.train.checkpoint import Checkpoint, latest
 from fluxvla_core.train.disk import Disk
 from fluxvla_core.train.loop import begin
+from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.stop import StopRequest
 
 
@@ -30,6 +31,7 @@ def two_ranks(work_dir):
         runner = build_runner_from_cfg(tree["runner"], context)
         dataset = TinyDataset()
         runner.run_setup(len(dataset))
+        runner.progress = Progress()
         begin(runner, dataset, StopRequest(runner.world)).close()
         operations = count_operations()
         train_a_step(runner)

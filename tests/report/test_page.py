@@ -134,6 +134,22 @@ def test_an_empty_work_dir_says_what_is_not_there(tmp_path: Path) -> None:
         assert page.shows(words), words
 
 
+def test_live_results_are_shown_apart_from_stepped_ones(complete: Path, tmp_path: Path) -> None:
+    work_dir = tmp_path / "run"
+    shutil.copytree(complete, work_dir)
+    results = json.loads((work_dir / "eval" / "results.json").read_text())
+    live = {"ticks": 600, "missed_share": 0.125, "stopped_by": {"starvation": 2}}
+    (work_dir / "eval_live").mkdir()
+    (work_dir / "eval_live" / "results.json").write_text(
+        json.dumps({**results, "mode": "live", "live": live})
+    )
+    page = Page(build_report(work_dir).read_text(encoding="utf-8"))
+    assert page.text.count("Success on unseen seeds") == 1
+    assert page.text.count("Success on unseen seeds, live") == 1
+    assert page.shows("12.5% of 600 ticks without a target of the policy")
+    assert page.shows("stopped by safety: starvation 2")
+
+
 def test_damaged_files_are_listed(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "environment.json").write_text("{")

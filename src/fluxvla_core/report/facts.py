@@ -74,7 +74,8 @@ class Behaviour:
 class Evaluation:
     """One evaluation: its groups, and videos in the order in which to show them.
 
-    ``details`` are plain values that the results state beside the rates.
+    ``details`` are plain values that the results state beside the rates; ``live`` says that the
+    world ran on the wall clock and did not wait for the policy.
     """
 
     name: str
@@ -82,6 +83,7 @@ class Evaluation:
     behaviours: Sequence[Behaviour] = ()
     videos: Sequence[Video] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
+    live: bool = False
 
 
 @dataclass(frozen=True)

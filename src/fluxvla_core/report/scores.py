@@ -41,6 +41,7 @@ def _evaluation(folder: Path, results: Mapping[str, Any]) -> Evaluation:
         behaviours=_behaviours(names, results.get("behaviours")),
         videos=_videos(folder, names, results.get("videos")),
         details=_details(results),
+        live=results.get("mode") == "live",
     )
 
 

@@ -96,7 +96,9 @@ def line_chart(
 
 def interval_chart(rows: Sequence[Interval], *, title: str, width: int = 860) -> str:
     """A dot with its interval for each row, on a common scale from 0 to 100 %."""
-    left, right, step, top = 240, 76, 30, 6
+    # About 7 pixels a letter.
+    left = max(240, 16 + 7 * max((len(row.name) for row in rows), default=0))
+    right, step, top = 76, 30, 6
     height = top + step * len(rows) + 30
     span = width - left - right
     parts = []

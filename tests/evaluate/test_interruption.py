@@ -144,6 +144,7 @@ def test_torchruns_processes_share_an_evaluation(tmp_path, config):
     assert results[0]["groups"] == results[1]["groups"]
 
 
+@pytest.mark.slow
 def test_the_tasks_of_a_slurm_array_share_an_evaluation(tmp_path, config):
     array = {"SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_COUNT": "2"}
     for index in ("2", "1"):

@@ -127,6 +127,20 @@ def test_parts_of_a_job_are_run_apart_and_merged(tmp_path, walking, monkeypatch,
     assert evaluate(tmp_path / "parts")["groups"] == result["groups"]
 
 
+def test_nproc_is_workers_but_for_torchruns_own_count(tmp_path, walking, monkeypatch):
+    def workers(**variables):
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+        context = RunContext(work_dir=tmp_path, nproc=5)
+        return EvalRunner(context=context, environment=WALK, workers=3).workers
+
+    assert workers() == 5
+    assert workers(SLURM_ARRAY_TASK_ID="0", SLURM_ARRAY_TASK_COUNT="2") == 5
+    assert workers(RANK="1", WORLD_SIZE="5") == 3
+    context = RunContext(work_dir=tmp_path)
+    assert EvalRunner(context=context, environment=WALK, live=True).workers == 1
+
+
 def test_videos_show_failures_first(tmp_path, walking):
     pytest.importorskip("av")
     result = evaluate(

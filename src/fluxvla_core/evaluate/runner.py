@@ -7,6 +7,7 @@ processes, nor the machines, nor an interruption changes anything but the time.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -140,8 +141,8 @@ class EvalRunner:
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
         self.shard = shard_of()
-        # Under a launcher, nproc is the number of launched processes, not of each one's workers.
-        own = self.context.nproc > 1 and self.shard.count == 1
+        # Under torchrun, nproc is the number of its processes, not of each one's workers.
+        own = self.context.nproc > 1 and "WORLD_SIZE" not in os.environ
         try:
             self._live: dict[str, Any] | None = plain(live_options(live))
         except ConfigError as error:

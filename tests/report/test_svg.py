@@ -62,6 +62,13 @@ def test_intervals() -> None:
     assert float(band.get("x1") or 0) < float(band.get("x2") or 0)
 
 
+def test_long_names_do_not_run_into_the_scale() -> None:
+    name = "trained policy, on the robot · transfer_cube"
+    svg = interval_chart([Interval(name, "", 0.0, 0.0, 0.2)], title="Success")
+    band = next(e for e in ET.fromstring(svg).iter("line") if e.get("class") == "band")
+    assert float(band.get("x1") or 0) > 7 * len(name)
+
+
 def test_durations_share_the_bar() -> None:
     svg = duration_bar([("train", 90.0), ("evaluate", 30.0)], title="Time")
     widths = [float(e.get("width") or 0) for e in ET.fromstring(svg).iter("rect")]

@@ -16,6 +16,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.distributed import PrefixStore  # type: ignore[attr-defined]
+from torch.distributed.rendezvous import rendezvous
 
 from fluxvla_core import errors
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
@@ -72,16 +74,24 @@ def start(device: str = "auto", group_of_one: bool = False) -> World:
     owned = False
     if not dist.is_initialized() and (size > 1 or group_of_one):
         backend = "nccl" if place.type == "cuda" else "gloo"
-        if size > 1:
-            dist.init_process_group(backend)
-        else:
-            store = dist.HashStore()  # type: ignore[attr-defined]
-            dist.init_process_group(backend, store=store, rank=0, world_size=1)
+        store = _attempts_store() if size > 1 else dist.HashStore()  # type: ignore[attr-defined]
+        dist.init_process_group(backend, store=store, rank=rank, world_size=size)
         owned = True
     if dist.is_initialized():
         rank, size = dist.get_rank(), dist.get_world_size()
     control = dist.new_group(backend="gloo") if size > 1 else None
     return World(rank, size, local_rank, place, owned, control)
+
+
+def _attempts_store() -> Any:
+    """Where ranks find each other, with names that no earlier attempt has used.
+
+    torchrun keeps one store over all restarts of a job; by the names of the last attempt ranks
+    would find addresses of processes that have ended.
+    """
+    store, _, _ = next(iter(rendezvous("env://")))
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    return PrefixStore(f"attempt-{attempt}", store)
 
 
 def _device(name: str, local_rank: int) -> torch.device:

@@ -8,7 +8,6 @@ moves, and tells what came of it.
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import re
@@ -75,6 +74,7 @@ class BenchArm(RosOperator):
     def __init__(self, state_topic: str = STATE, domain_id: int | None = None) -> None:
         super().__init__(domain_id, connect_timeout_s=20.0, rate_window_s=0.0)
         self.state_topic = state_topic
+        self.sent: list[list[float]] = []
 
     def streams(self) -> list[StreamSpec]:
         cameras = [camera_stream(c, f"/{c.name}/image") for c in ARM.cameras]
@@ -96,6 +96,7 @@ class BenchArm(RosOperator):
             time.sleep(0.01)
 
     def publish_action(self, action: Array) -> None:
+        self.sent.append(action.tolist())
         self.publish(COMMAND, joints.fill(message_class(JOINT_STATE)(), NAMES, action))
 
 
@@ -293,12 +294,13 @@ def play(stage: Stage, fault: Fault) -> Result:
         fault.after(stage)
         assert _settled(stage) == commands, "the arm was commanded after the run was over"
     positions = np.array([c for _, c in commands]).reshape(-1, len(NAMES))
-    check_limits(positions if fault.braked else positions[: -_resting(commands)])
+    whole = _with_overtaken(positions.tolist(), stage.operator.sent)
+    check_limits(whole if fault.braked else whole[: len(whole) - _resting(whole)])
     hold = None
-    if fault.outcome == STOP and began:
+    if fault.outcome == STOP and began and commands:
         strangers = [h["at"] for h in stage.ear.on(COMMAND) if tuple(h["name"]) != NAMES]
         fell_ill = min(strangers, default=stage.policy.spoiled or began[0])
-        hold = max(commands[-_resting(commands)][0] - fell_ill, 0.0)
+        hold = max(commands[-_resting(positions)][0] - fell_ill, 0.0)
     return Result(hold, said, ended - start, code, _record(stage.folder), positions)
 
 
@@ -313,10 +315,28 @@ def _settled(stage: Stage) -> list[tuple[float, list[float]]]:
         found = now
 
 
-def _resting(commands: list[tuple[float, list[float]]]) -> int:
+def _with_overtaken(received: list[list[float]], sent: list[list[float]]) -> Array:
+    """What was received, with the commands between that a newer one overtook: ``(N, 3)``.
+
+    A command that was not taken before the next is there is dropped, and a starved listener is
+    slow. The next one is no jump then: more time went by.
+
+    Raises:
+        AssertionError: something was received that was not sent, or in another order.
+    """
+    at = [0]
+    for command in received:
+        assert command in sent[at[-1] :], "what was received is not what was sent"
+        at.append(sent.index(command, at[-1]) + 1)
+    return np.array(sent[at[1] - 1 : at[-1]] if received else []).reshape(-1, len(NAMES))
+
+
+def _resting(positions: Array) -> int:
     """How many commands at the end are equal."""
-    last = commands[-1][1]
-    return len(list(itertools.takewhile(lambda c: c[1] == last, reversed(commands))))
+    if not len(positions):
+        return 0
+    moving = np.flatnonzero((positions != positions[-1]).any(axis=1))
+    return len(positions) - (int(moving[-1]) + 1 if moving.size else 0)
 
 
 def check_limits(positions: Array) -> None:

@@ -45,7 +45,7 @@ def main() -> int:
     """Measure, print and write; 1 if a fault was not named as it should be."""
     parser = argparse.ArgumentParser(allow_abbrev=False)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", default="", help="faults whose name contains this; not written")
+    parser.add_argument("--only", default="", help="measure these again, keep the others")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     faults = [fault for fault in FAULTS if args.only in fault.name]
@@ -61,16 +61,19 @@ def main() -> int:
                 mark = "" if agrees else "  NOT AS EXPECTED"
                 wrong += [fault.name] if mark else []
                 print(f"{fault.name}: {hold} {result.exit_code} {result.said}{mark}", flush=True)
+    found = {fault.name: measured(fault, results[fault.name]) for fault in faults}
+    if args.only:
+        kept = json.loads(args.out.read_text(encoding="utf-8"))["faults"]
+        found = {**kept, **found}
     summary = {
         "what": "from a fault to the receipt of the command at which the arm rests",
         "python": platform.python_version(),
         "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
         "rounds": args.rounds,
-        "faults": {fault.name: measured(fault, results[fault.name]) for fault in faults},
+        "faults": found,
     }
-    if not args.only:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     if wrong:
         print(f"not as expected: {', '.join(wrong)}", file=sys.stderr)
     return 1 if wrong else 0

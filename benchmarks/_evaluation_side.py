@@ -47,12 +47,17 @@ def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, 
         for _ in pool.run(warm):
             continue
         ledger = open_ledger(Path(folder) / "episodes.jsonl", {}, SilentReporter())
-        began = time.perf_counter()
+        began, own = time.perf_counter(), time.process_time()
         records = run_in_pool(pool, keys, ledger, SilentReporter())
-        seconds = time.perf_counter() - began
+        seconds, own = time.perf_counter() - began, time.process_time() - own
     assert all(record["steps"] == steps for record in records)
     memory = max(record["timing"]["memory_mb"] for record in records)
-    return {"steps_per_s": steps * episodes / seconds, "worker_mb": memory}
+    cpu = own + sum(record["cpu_s"] for record in records)
+    return {**_pace(steps * episodes, seconds, cpu), "worker_mb": memory}
+
+
+def _pace(steps: int, seconds: float, cpu: float) -> dict[str, float]:
+    return {"steps_per_s": steps / seconds, "cpu_ms_per_step": 1e3 * cpu / steps}
 
 
 class _Worker:
@@ -62,16 +67,25 @@ class _Worker:
     def __call__(self) -> Any:
         from fluxvla_core.evaluate.worker import EpisodeWorker
 
-        return EpisodeWorker(self.settings)
+        work, ended = EpisodeWorker(self.settings), time.process_time()
+
+        def measured(key: Any) -> Any:
+            nonlocal ended
+            record, before = work(key), ended
+            ended = time.process_time()
+            # Since the last episode's end: what it takes to send and to wait is in it.
+            return {**record, "cpu_s": ended - before}
+
+        return measured
 
 
 def bare(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The same environment in a loop, in as many processes, with nothing around it."""
     context = multiprocessing.get_context("spawn")
     ready, go = context.Barrier(processes + 1), context.Barrier(processes + 1)
-    share = episodes // processes
+    share, spent = episodes // processes, context.SimpleQueue()
     workers = [
-        context.Process(target=_loop, args=(n, share, steps, render, ready, go))
+        context.Process(target=_loop, args=(n, share, steps, render, ready, go, spent))
         for n in range(processes)
     ]
     for worker in workers:
@@ -79,13 +93,16 @@ def bare(processes: int, steps: int, episodes: int, render: str) -> dict[str, An
     ready.wait()
     began = time.perf_counter()
     go.wait()
+    cpu = sum(spent.get() for _ in workers)
+    seconds = time.perf_counter() - began
     for worker in workers:
         worker.join()
-    seconds = time.perf_counter() - began
-    return {"steps_per_s": steps * share * processes / seconds}
+    return _pace(steps * share * processes, seconds, cpu)
 
 
-def _loop(first: int, episodes: int, steps: int, render: str, ready: Any, go: Any) -> None:
+def _loop(
+    first: int, episodes: int, steps: int, render: str, ready: Any, go: Any, spent: Any
+) -> None:
     from fluxvla_sim.environment import AlohaSimEnvironment
 
     from fluxvla_core.spec.embodiment import Camera
@@ -102,9 +119,11 @@ def _loop(first: int, episodes: int, steps: int, render: str, ready: Any, go: An
     episode(10**6 + first)  # as the engine's workers have done one before the clock starts
     ready.wait()
     go.wait()
+    before = time.process_time()
     for seed in range(first * episodes, (first + 1) * episodes):
         episode(seed)
-    os._exit(0)  # what the simulator tidies up is not what is measured
+    spent.put(time.process_time() - before)
+    os._exit(0)
 
 
 def lerobot(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
@@ -138,16 +157,22 @@ def lerobot(processes: int, steps: int, episodes: int, render: str) -> dict[str,
     env = make_env(config, n_envs=processes, use_async_envs=True)["aloha"][0]
     env.reset(seed=list(range(processes)))
     rounds = max(1, episodes // processes)
-    began = time.perf_counter()
+    pids = [child.pid for child in multiprocessing.active_children() if child.pid is not None]
+    began, before = time.perf_counter(), time.process_time() + sum(map(_cpu_s, pids))
     for number in range(rounds):
         seeds = [number * processes + n for n in range(processes)]
         found = lerobot_eval.rollout(env, Still(), same, same, same, same, seeds=seeds)
         assert found["done"].shape == (processes, steps)
     seconds = time.perf_counter() - began
-    children = [child.pid for child in multiprocessing.active_children()]
-    memory = max(_peak_mb(pid) for pid in children if pid is not None)
+    cpu = time.process_time() + sum(map(_cpu_s, pids)) - before
+    memory = max(map(_peak_mb, pids))
     env.close()
-    return {"steps_per_s": steps * rounds * processes / seconds, "worker_mb": memory}
+    return {**_pace(steps * rounds * processes, seconds, cpu), "worker_mb": memory}
+
+
+def _cpu_s(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def _peak_mb(pid: int) -> float:

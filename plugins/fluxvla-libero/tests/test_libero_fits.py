@@ -19,9 +19,10 @@ from fluxvla_libero.embodiment import (
     libero_spec,
 )
 
+from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
 from fluxvla_core.errors import FluxError, SpecMismatch
-from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate import worker
 from fluxvla_core.evaluate.policies import Source, fit, make_policy
 from fluxvla_core.evaluate.rollout import Course
 from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
@@ -174,12 +175,19 @@ def test_a_missing_checkpoint_is_no_policy(tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "message"), MISMATCHES)
-def test_it_is_refused_before_a_scene_is_built(libero, tmp_path, save, arguments, message):
+def test_it_is_refused_before_a_scene_is_built(
+    libero, tmp_path, save, monkeypatch, arguments, message
+):
+    made = []
+
+    def build(table):
+        made.append(build_environment_from_cfg(table))
+        return made[0]
+
+    monkeypatch.setattr(worker, "build_environment_from_cfg", build)
     path = save(tmp_path / "work", **arguments)
     table = {"type": "LiberoEnvironment", "cameras": tuple(CAMERAS)}
-    worker = EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, Course()))
-    task = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
     with pytest.raises(SpecMismatch) as caught:
-        worker(EpisodeKey("policy", task, 0))
+        EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, Course()))
     assert message in str(caught.value)
-    assert worker.environment._scene is None, "nothing was built, let alone moved"
+    assert made[0]._scene is None, "nothing was built, let alone moved"

@@ -52,7 +52,5 @@ def test_an_arm_of_another_make_is_refused():
 
     box = URWorkspaceBox(*BOX.values(), TOOL)
     other = EmbodimentSpec("other", (Joint("elbow", "rad", -1, 1, 1, 1),), (), 50.0)
-    with pytest.raises(
-        ConfigError, match="there is no joint 'shoulder_pan_joint'"
-    ):
+    with pytest.raises(ConfigError, match="there is no joint 'shoulder_pan_joint'"):
         box.bind(other)

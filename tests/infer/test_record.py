@@ -233,9 +233,9 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     process = subprocess.Popen(
         [sys.executable, "-c", code], stderr=subprocess.PIPE, env={**os.environ}
     )
-    until = time.monotonic() + 60
+    until = time.monotonic() + 120
     bag = record / "001-1" / "001-1.mcap"
-    while not bag.exists() or bag.stat().st_size < 20_000:
+    while not bag.exists() or bag.stat().st_size < 5_000:
         assert process.poll() is None, process.communicate()[1].decode()
         assert time.monotonic() < until, "nothing was recorded"
         time.sleep(0.02)
@@ -245,7 +245,7 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     found = open_recording(record)
     assert found.whole == (ending != signal.SIGKILL)
     times, commands = found.commands()
-    assert len(commands) > 20
+    assert len(commands) > 10
     assert len(found.chunks()) > 0
     assert found.pictures["front"].read(len(found.pictures["front"]) - 1).shape == (24, 32, 3)
     outcome = "interrupted" if found.whole else "cut short"

@@ -69,6 +69,50 @@ def test_a_picture_is_written_once(tmp_path: Path) -> None:
     assert len(open_recording(tmp_path / "b").pictures[CAMERA]) == 1
 
 
+def test_a_picture_that_nobody_looked_at_loses_a_little_until_somebody_does(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    noise = np.random.default_rng(0).integers(100, 140, (4, 6, 3), dtype=np.uint8)
+    bag = Bag(tmp_path / "b", NAMES)
+    bag.add({**START, "embodiment": SPEC.to_dict()})
+    for t in (5.0, 5.1, 5.1):
+        bag.picture(CAMERA, t, noise, exact=False)
+    bag.picture(CAMERA, 5.1, noise)
+    bag.picture(CAMERA, 5.2, noise)
+    bag.picture(CAMERA, 5.2, noise, exact=False)
+    bag.close()
+
+    kinds = [(kind, ns) for _, kind, ns, _ in read_bag(tmp_path / "b" / "b.mcap").pictures]
+    assert len(kinds) == 4  # 5.0 and 5.1 as JPEG, 5.1 and 5.2 as they were
+    found = open_recording(tmp_path / "b").pictures[CAMERA]
+    assert found.times == pytest.approx([5.0, 5.1, 5.2])
+    lossy = found.read(0).astype(int)
+    assert 0 < np.abs(lossy - noise).max() < 40
+    assert (found.read(1) == noise).all()
+    assert (found.read(2) == noise).all()
+
+
+def test_without_opencv_every_picture_is_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fluxvla_core.record.ros_messages.has_jpeg", lambda: False)
+    bag = Bag(tmp_path / "b", NAMES)
+    bag.add({**START, "embodiment": SPEC.to_dict()})
+    bag.picture(CAMERA, 5.0, picture(7), exact=False)
+    bag.close()
+    assert (open_recording(tmp_path / "b").pictures[CAMERA].read(0) == 7).all()
+
+
+def test_jpegs_need_opencv_to_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cv2")
+    bag = Bag(tmp_path / "b", NAMES)
+    bag.add({**START, "embodiment": SPEC.to_dict()})
+    bag.picture(CAMERA, 5.0, picture(7), exact=False)
+    bag.close()
+    monkeypatch.setattr("fluxvla_core.record.ros_messages.has_jpeg", lambda: False)
+    with pytest.raises(DataError, match="the package 'cv2' is not installed"):
+        open_recording(tmp_path / "b").pictures[CAMERA].read(0)
+
+
 def test_the_newest_picture_by_a_time(folder: Path) -> None:
     pictures = open_recording(folder).pictures[CAMERA]
     assert [pictures.newest(t) for t in (4.9, 5.0, 5.05, 5.1, 99.0)] == [None, 0, 0, 1, 19]

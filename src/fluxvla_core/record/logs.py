@@ -21,7 +21,7 @@ from fluxvla_core.record import ros_messages as ros
 from fluxvla_core.record.mcap import zstd
 
 LINES = "trace.jsonl"
-# Pictures of one camera that are remembered as written.
+# Pictures of one topic that are remembered as written.
 _REMEMBERED = 256
 # On camera pictures a higher level saves a few percent and takes twice as long.
 _LEVEL = 1
@@ -33,8 +33,13 @@ class Log(Protocol):
     def add(self, event: Mapping[str, Any]) -> None:
         """Append one event: JSON values and arrays, with ``event`` and ``t``."""
 
-    def picture(self, camera: str, stamp: float, image: npt.NDArray[np.uint8]) -> None:
-        """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``."""
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
+        """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``.
+
+        One that need not be ``exact`` may lose a little: a camera's whole stream is large.
+        """
 
     def flush(self) -> None:
         """Give what is there to the system: a process that is killed then loses none of it."""
@@ -52,7 +57,9 @@ class JsonLines:
     def add(self, event: Mapping[str, Any]) -> None:
         self._file.write(json.dumps(event, default=ros.plain) + "\n")
 
-    def picture(self, camera: str, stamp: float, image: npt.NDArray[np.uint8]) -> None:
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
         return
 
     def flush(self) -> None:
@@ -66,7 +73,8 @@ class Bag:
     """A rosbag2 with one MCAP file; ``folder`` must not exist and is made.
 
     Log times are real time: that of the first event, and from there on the loop's clock, so that a
-    wall clock that is stepped meanwhile changes nothing. Each picture is written once.
+    wall clock that is stepped meanwhile changes nothing. A picture that was looked at is written
+    as it is, once; others become JPEGs, where OpenCV is installed.
 
     Args:
         folder: ``<folder>/<its name>.mcap`` and ``metadata.yaml``, which comes at the end.
@@ -89,6 +97,7 @@ class Bag:
         self._offset: int | None = None
         self._channels: dict[str, Any] = {}
         self._written: dict[str, deque[int]] = {}
+        self._has_jpeg = ros.has_jpeg()
         # Version 8 of the metadata is read by every release from Humble on.
         self._writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -101,14 +110,18 @@ class Bag:
         for topic, kind, data in self._packer.event(event, stamps, self._names):
             self._write(topic, kind, stamps["t"], data)
 
-    def picture(self, camera: str, stamp: float, image: npt.NDArray[np.uint8]) -> None:
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
         ns = self._ns(stamp)
-        written = self._written.setdefault(camera, deque(maxlen=_REMEMBERED))
-        if ns in written:
+        kind = ros.IMAGE if exact or not self._has_jpeg else ros.JPEG
+        topic = ros.camera_topic(camera, kind)
+        written = self._written.setdefault(topic, deque(maxlen=_REMEMBERED))
+        if ns in written or ns in self._written.get(ros.camera_topic(camera), ()):
             return
         written.append(ns)
-        data = self._packer.picture(camera, image, ns)
-        self._write(ros.camera_topic(camera), ros.IMAGE, ns, data)
+        pack = self._packer.picture if kind == ros.IMAGE else self._packer.jpeg
+        self._write(topic, kind, ns, pack(camera, image, ns))
 
     def flush(self) -> None:
         storage = self._writer.storage

@@ -26,6 +26,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 Array = npt.NDArray[np.float64]
 Event = dict[str, Any]
+Place = tuple[int, int, int]
 # Times are rounded to nanoseconds on their way into a file.
 _ROUNDING_S = 1e-6
 
@@ -38,18 +39,22 @@ class Pictures:
 
     def __init__(self, file: McapFile, unpacker: ros.Unpacker) -> None:
         self.times: list[float] = []
-        self._places: list[tuple[int, int, int]] = []
+        self._places: list[tuple[Place, str]] = []
         self._file = file
         self._unpacker = unpacker
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def add(self, time: float, place: tuple[int, int, int]) -> None:
-        """One more; out of order is allowed."""
+    def add(self, time: float, place: Place, kind: str) -> None:
+        """One more; out of order is allowed. Of two of one time the exact one is kept."""
         at = bisect_right(self.times, time)
+        if at and self.times[at - 1] == time:
+            if kind == ros.IMAGE:
+                self._places[at - 1] = place, kind
+            return
         self.times.insert(at, time)
-        self._places.insert(at, place)
+        self._places.insert(at, (place, kind))
 
     def newest(self, time: float) -> int | None:
         """Index of the newest picture that had arrived by ``time``; None before the first."""
@@ -58,7 +63,8 @@ class Pictures:
 
     def read(self, index: int) -> npt.NDArray[np.uint8]:
         """``(H, W, 3)`` uint8 RGB, a fresh array."""
-        return self._unpacker.picture(self._file.read(self._places[index]))[1]
+        place, kind = self._places[index]
+        return self._unpacker.picture(self._file.read(place), kind)
 
 
 class Recorded:
@@ -210,12 +216,12 @@ def read_lines(path: Path) -> tuple[list[Event], bool]:
 
 @dataclass(frozen=True)
 class BagContent:
-    """What a bag's file holds: events, and where its pictures are (topic, ns, place)."""
+    """What a bag's file holds: events, and where its pictures are (topic, type, ns, place)."""
 
     file: McapFile
     unpacker: ros.Unpacker
     events: list[Event]
-    pictures: list[tuple[str, int, tuple[int, int, int]]]
+    pictures: list[tuple[str, str, int, Place]]
     offset: int
 
     @property
@@ -235,8 +241,8 @@ def read_bag(path: Path) -> BagContent:
     found = BagContent(McapFile(path), unpacker, [], [], 0)
     offset = 0
     for entry in found.file.entries():
-        if entry.kind == ros.IMAGE:
-            found.pictures.append((entry.topic, entry.ns, entry.place))
+        if entry.kind in ros.PICTURES:
+            found.pictures.append((entry.topic, entry.kind, entry.ns, entry.place))
             continue
         event = unpacker.add(entry.topic, entry.kind, entry.ns, entry.data)
         if event is not None:
@@ -252,13 +258,13 @@ def _read(path: Path) -> Recorded:
         return Recorded(path, events, {}, whole)
     bag = read_bag(file)
     cameras = Recorded(path, bag.events, {}, bag.whole).embodiment.camera_names
-    by_topic = {ros.camera_topic(camera): camera for camera in cameras}
+    by_topic = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
     found: dict[str, Pictures] = {}
-    for topic, ns, place in bag.pictures:
+    for topic, kind, ns, place in bag.pictures:
         camera = by_topic.get(topic)
         if camera is not None:
             kept = found.setdefault(camera, Pictures(bag.file, bag.unpacker))
-            kept.add((ns - bag.offset) / 1e9, place)
+            kept.add((ns - bag.offset) / 1e9, place, kind)
     return Recorded(path, bag.events, found, bag.whole)
 
 

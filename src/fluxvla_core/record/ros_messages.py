@@ -2,12 +2,14 @@
 
 What ROS has a type for is a message of that type, so that any ROS tool plots it: joint vectors are
 ``sensor_msgs/JointState``, a policy's chunk is a ``trajectory_msgs/JointTrajectory``, pictures are
-``sensor_msgs/Image``. The rest of the event is JSON in a ``std_msgs/String``, which comes after
-those messages and completes the event. No value is written twice.
+``sensor_msgs/Image``, or ``CompressedImage`` where nobody looked at them. The rest of the event is
+JSON in a ``std_msgs/String``, which comes after those messages and completes the event. No value is
+written twice.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +36,10 @@ STRING = "std_msgs/msg/String"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 IMAGE = "sensor_msgs/msg/Image"
+JPEG = "sensor_msgs/msg/CompressedImage"
+PICTURES = (IMAGE, JPEG)
 
+_QUALITY = 90
 _FIELDS = {topic: field for field, topic in VECTORS.items()}
 
 
@@ -55,9 +60,15 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def camera_topic(camera: str) -> str:
+def camera_topic(camera: str, kind: str = IMAGE) -> str:
     """The topic of a camera's pictures; ``frame_id`` has the camera's true name."""
-    return CAMERAS + (re.sub(r"[^0-9A-Za-z_]", "_", camera) or "_")
+    topic = CAMERAS + (re.sub(r"[^0-9A-Za-z_]", "_", camera) or "_")
+    return topic if kind == IMAGE else f"{topic}/compressed"
+
+
+def has_jpeg() -> bool:
+    """Whether there is what makes JPEGs."""
+    return importlib.util.find_spec("cv2") is not None
 
 
 def nanoseconds(seconds: float) -> int:
@@ -122,6 +133,20 @@ class Packer:
             data=np.ascontiguousarray(image).reshape(-1),
         )
         packed: memoryview = self._store.serialize_cdr(message, IMAGE)
+        return packed
+
+    def jpeg(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
+        """The CDR of a ``CompressedImage``: ``(H, W, 3)`` uint8 RGB; loses a little."""
+        import cv2
+
+        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        done, coded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        if not done:
+            raise RunFailed(f"a picture of {camera} cannot be made a JPEG")
+        message = self._store.types[JPEG](
+            header=self._header(ns, camera), format="jpeg", data=np.asarray(coded).reshape(-1)
+        )
+        packed: memoryview = self._store.serialize_cdr(message, JPEG)
         return packed
 
     def _joints(self, values: Any, names: Sequence[str], ns: int) -> memoryview:
@@ -195,11 +220,27 @@ class Unpacker:
             return {**event, **parts}
         return None
 
-    def picture(self, data: memoryview) -> tuple[str, npt.NDArray[np.uint8]]:
-        """Camera and ``(H, W, 3)`` uint8 RGB, a fresh array."""
-        message = self._read(data, IMAGE)
-        shape = message.height, message.width, 3
-        return message.header.frame_id, np.array(message.data, np.uint8).reshape(shape)
+    def picture(self, data: memoryview, kind: str = IMAGE) -> npt.NDArray[np.uint8]:
+        """``(H, W, 3)`` uint8 RGB, a fresh array.
+
+        Raises:
+            DataError: it is a JPEG, and damaged, or there is nothing to decode it with.
+        """
+        message = self._read(data, kind)
+        if kind == IMAGE:
+            shape = message.height, message.width, 3
+            return np.array(message.data, np.uint8).reshape(shape)
+        if not has_jpeg():
+            raise DataError(
+                "the recording has JPEGs, and the package 'cv2' is not installed",
+                next="pip install 'fluxvla-core[record]'",
+            )
+        import cv2
+
+        bgr = cv2.imdecode(message.data, cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise DataError(f"a recorded picture of {message.header.frame_id} is no JPEG")
+        return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def _read(self, data: memoryview, kind: str) -> Any:
         return self._store.deserialize_cdr(data, kind)

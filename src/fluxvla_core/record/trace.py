@@ -236,7 +236,7 @@ class EpisodeTrace:
                 continue
             poll.take(found, received)
             for stamp, image in found:
-                self._log.picture(camera, stamp, image)
+                self._log.picture(camera, stamp, image, exact=False)
                 for _ in range(poll.frames_until(stamp, self.video_fps)):
                     self._film(camera, image)
 

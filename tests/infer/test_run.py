@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -313,3 +314,40 @@ def test_nothing_heavy_is_imported_to_drive_a_robot():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.realtime
+def test_while_the_policy_warms_up_the_arm_is_held_at_the_start_pose(bench, make_arm):
+    """Some drivers stop an arm that they hear nothing for."""
+    bench.arm = make_arm(realtime=True)
+
+    def warm_up(chunk):
+        time.sleep(0.5)
+        return chunk
+
+    bench.policy.faults[1] = warm_up
+
+    result = bench.run(prepare_pose=[0.05, 0.0, 0.5], max_publish_step=10)
+
+    assert result["steps"] == 10, "what is sent meanwhile is none of the episode's commands"
+    ready = [row["command"] for row in bench.trace() if row.get("phase") == "ready"]
+    assert len(ready) >= 10
+    np.testing.assert_array_equal(ready, [[0.05, 0.0, 0.5]] * len(ready))
+    bench.assert_within_limits()
+
+
+@pytest.mark.realtime
+def test_without_a_start_pose_nothing_is_sent_before_the_first_chunk(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+    sent = []
+    predict = bench.policy.predict_action
+
+    def slow(observation):
+        time.sleep(0.2)
+        sent.append(len(bench.arm.sent))
+        return predict(observation)
+
+    bench.policy.predict_action = slow
+    bench.run(max_publish_step=10)
+
+    assert sent[:2] == [0, 0]

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as NotYet
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -82,6 +81,8 @@ class Loop:
         interrupts: looked at while waiting; the beat looks at them too.
         latency_s: how long, in lockstep, an answer takes.
         begin_anew: makes the policy forget the answer that warmed it up.
+        holds: send the last command again at every beat while the first answer is awaited: the arm
+            was commanded before, and some drivers stop an arm that they hear nothing for.
     """
 
     path: CommandPath
@@ -98,6 +99,7 @@ class Loop:
     interrupts: Interrupts
     latency_s: float = 0.0
     begin_anew: Callable[[], None] = lambda: None
+    holds: bool = False
 
     def run(self) -> str:
         """Run until the beat says that the episode is over.
@@ -175,7 +177,7 @@ class Loop:
         return Asked(self.worker.submit(lambda: think(self.observe(last))), last, due)
 
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
-        """The first answer: nothing moves yet, and the policy may have to warm up.
+        """The first answer: nothing moves, and the policy may have to warm up.
 
         It is asked twice on a robot: by the time of a long first answer, what it saw is old. The
         episode begins with the second one.
@@ -206,22 +208,21 @@ class Loop:
         return self._idle(asked) if self.lockstep else asked.future.result()
 
     def _idle(self, asked: Asked) -> tuple[Seen, Any]:
-        """The answer, waited for in real time while nothing is sent."""
+        """The answer, waited for in real time; meanwhile the arm is held, if it was commanded."""
         until = time.monotonic() + self.settings.first_chunk_s
-        while True:
-            self.interrupts.check()
-            try:
-                return asked.future.result(timeout=_LOOK_S)
-            except NotYet:
-                # A policy may raise the same class; then the answer is there.
-                if asked.future.done():
-                    raise
+        while not asked.future.done():
             if time.monotonic() > until:
                 raise Starved(
                     f"the policy gave no chunk within {self.settings.first_chunk_s:g} s",
                     cause="it hangs, or it is far slower than this robot needs",
                     next="safety.first_chunk_s sets how long it may take to warm up",
                 )
+            if self.holds:
+                self.path.hold()
+            else:
+                self.interrupts.check()
+                wait((asked.future,), timeout=_LOOK_S)
+        return asked.future.result()
 
     def _receive(self, answer: tuple[Seen, Any], anchor: Array) -> None:
         seen, keyframes = answer

@@ -142,7 +142,7 @@ class Episode:
                 reset(self._limiter.last)
         self._rate.reset()
         self._tracking.reset()
-        self._phase = "run"
+        self._phase = "ready"
 
     def _loop(self) -> Loop:
         plan = self._plan
@@ -160,6 +160,7 @@ class Episode:
             worker=plan.worker,
             interrupts=plan.interrupts,
             latency_s=plan.latency_s,
+            holds=plan.start_pose is not None and not plan.robot.lockstep,
             begin_anew=lambda: plan.policy.reset(self._seed),
         )
 
@@ -256,6 +257,7 @@ class Episode:
         except BadChunk:
             self._record.refused("chunk", answer=answer.chunk)
             raise
+        self._phase = "run"
         keyframes = keyframes.copy()
         keyframes.flags.writeable = False
         if plan.hooks:
@@ -275,7 +277,7 @@ class Episode:
         plan, record = self._plan, self._record
         if self._phase == "over":
             return
-        supervised = self._phase in ("ramp", "run")
+        supervised = self._phase in ("ramp", "ready", "run")
         try:
             state, problem = plan.robot.state(), None
         except OperatorError as error:

@@ -46,7 +46,7 @@ def start(*words: str) -> tuple[int, str, str, int]:
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=600)
     return process.returncode, out, err, process.pid
 
 

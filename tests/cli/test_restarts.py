@@ -83,7 +83,7 @@ def start(work_dir: str, *words: str, module: tuple[str, ...] = ()) -> tuple[int
     command += ["--config", "tiny_config.py", "--plugin", "tiny.py", "--work-dir", work_dir]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     ended = subprocess.run(
-        [*command, *words], capture_output=True, text=True, timeout=300, env=environment
+        [*command, *words], capture_output=True, text=True, timeout=600, env=environment
     )
     return ended.returncode, ended.stdout, ended.stderr
 

@@ -75,7 +75,7 @@ def track(name: str, folder: Path, **environment: str) -> str:
         env={**os.environ, "HOME": str(folder), **environment},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     assert ended.returncode == 0, ended.stderr
     return ended.stdout

@@ -100,9 +100,9 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
         ("n_train_examples", plan.length, "number of samples in the dataset"),
         ("shuffle_episodes", plan.shards and plan.shards.together, "value of shuffle_episodes"),
     ):
-        if saved[key] != ours:
+        if saved.get(key) != ours:
             raise CheckpointError(
-                f"the {what} is {ours}, the checkpoint's run had {saved[key]}",
+                f"the {what} is {ours}, the checkpoint's run had {saved.get(key)}",
                 where=where,
                 cause="the rest of its epoch would be another one's",
                 next="set it back, or start a new run in another --work-dir",

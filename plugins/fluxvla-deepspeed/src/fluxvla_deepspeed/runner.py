@@ -53,7 +53,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
             raise ConfigError(
                 "DeepSpeedTrainRunner needs the package deepspeed, which is not installed",
                 where=self.context.where(f"{self.context.section}.type"),
-                next="pip install --no-build-isolation 'fluxvla-deepspeed[deepspeed]'",
+                next="pip install 'fluxvla-deepspeed[deepspeed]'",
             )
         self.zero_stage = zero_stage
         self._groups: list[list[str]] = []

@@ -94,7 +94,7 @@ class Heard:
         return bool(self.driver.heard)
 
     def _wait(self, condition, what: str) -> None:
-        until = time.monotonic() + 30
+        until = time.monotonic() + 120
         while not condition():
             assert time.monotonic() < until, what
             time.sleep(0.0005)

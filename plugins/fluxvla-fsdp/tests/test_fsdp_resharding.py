@@ -35,8 +35,8 @@ def config(ranks):
     return tiny_config(table, TOGETHER // ranks, dropout=0.0, width=7)
 
 
-def reload_and_go_on(ranks, source, work_dir):
-    """Save at once what was loaded, to ``work_dir/again``; then train to the end."""
+def reload(ranks, source, work_dir):
+    """Save at once what was loaded, to ``work_dir/again``."""
     context = RunContext(
         config=config(ranks), section="runner", work_dir=work_dir / "loaded", resume=str(source)
     )
@@ -47,7 +47,6 @@ def reload_and_go_on(ranks, source, work_dir):
     runner.save_checkpoint(work_dir / "again", runner.progress.step, 0)
     runner.settle_saves()
     distributed.stop(runner.world)
-    train({"config": config(ranks), "work_dir": work_dir / "on", "resume": str(source)})
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +71,9 @@ def losses(work_dir):
 @pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2), (2, 3)])
 def test_another_number_of_processes(runs, tmp_path, before, after):
     source = folders(runs / str(before))[0]
-    codes = run_ranks(after, reload_and_go_on, after, source, tmp_path)
-    assert codes == [0] * after
+    assert run_ranks(after, reload, after, source, tmp_path) == [0] * after
+    on = {"config": config(after), "work_dir": tmp_path / "on", "resume": str(source)}
+    assert run_ranks(after, train, on) == [0] * after
     saved, again = Checkpoint.open(source), Checkpoint.open(tmp_path / "again")
     for read in (lambda c: c.tensors(MODEL), lambda c: c.tensors("ema.safetensors"), optimizer):
         ours, theirs = read(saved), read(again)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.cli.parser import Parser, add_plugin_files, positive
 from fluxvla_core.errors import ConfigError, UsageError
+
+if TYPE_CHECKING:
+    from fluxvla_core.evaluate.demonstrating import Collection
 
 SIDES = {"env": "environment", "policy": "policy"}
 
@@ -49,8 +52,7 @@ class Collect:
         parser.once("--log-format", choices=("text", "json"), default="text", help="of progress")
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.cli.reporters import make_reporter
-        from fluxvla_core.evaluate.demonstrating import Collection, collect
+        from fluxvla_core.evaluate.demonstrating import Collection
         from fluxvla_core.plugins.files import load_plugin_files
 
         load_plugin_files(args.plugin_files)
@@ -66,18 +68,26 @@ class Collect:
             width=args.width,
             failures=args.failures,
         )
-        reporter = make_reporter(args.log_format)
-        try:
-            reporter.info(f"collecting {args.episodes} demonstrations into {Path(args.out)}")
-            found = collect(args.out, collection, args.workers, args.resume, reporter)
-            again = f", {found['retried']} tried again" if found["retried"] else ""
-            reporter.info(
-                f"{found['episodes']} episodes, {found['frames']} new frames{again} in "
-                f"{found['seconds']:.0f} s: {found['frames_per_s']:.1f} frames/s"
-            )
-        finally:
-            reporter.close()
+        record(collection, args)
         return 0
+
+
+def record(collection: Collection, args: argparse.Namespace) -> None:
+    """Collect, and tell about it, as ``args`` says: out, workers, resume and log_format."""
+    from fluxvla_core.cli.reporters import make_reporter
+    from fluxvla_core.evaluate.demonstrating import collect
+
+    reporter = make_reporter(args.log_format)
+    try:
+        reporter.info(f"collecting {collection.episodes} demonstrations into {Path(args.out)}")
+        found = collect(args.out, collection, args.workers, args.resume, reporter)
+        again = f", {found['retried']} tried again" if found["retried"] else ""
+        reporter.info(
+            f"{found['episodes']} episodes, {found['frames']} new frames{again} in "
+            f"{found['seconds']:.0f} s: {found['frames_per_s']:.1f} frames/s"
+        )
+    finally:
+        reporter.close()
 
 
 def arguments(env: str, policy: str, settings: Sequence[str]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 
@@ -49,9 +48,9 @@ class CollectCommand:
         )
 
     def run(self, args: Any) -> int:
-        from fluxvla_core.cli.reporters import make_reporter
+        from fluxvla_core.cli.collect_command import record
         from fluxvla_core.errors import UsageError
-        from fluxvla_core.evaluate.demonstrating import Collection, collect
+        from fluxvla_core.evaluate.demonstrating import Collection
         from fluxvla_sim.environment import ENVIRONMENTS
 
         if args.workers < 1:
@@ -69,15 +68,5 @@ class CollectCommand:
             height=args.height,
             width=args.width,
         )
-        reporter = make_reporter(args.log_format)
-        try:
-            reporter.info(f"collecting {args.episodes} demonstrations into {Path(args.out)}")
-            found = collect(args.out, collection, args.workers, args.resume, reporter)
-            again = f", {found['retried']} tried again" if found["retried"] else ""
-            reporter.info(
-                f"{found['episodes']} episodes, {found['frames']} frames{again} in "
-                f"{found['seconds']:.0f} s: {found['frames_per_s']:.1f} frames/s"
-            )
-        finally:
-            reporter.close()
+        record(collection, args)
         return 0

@@ -10,7 +10,6 @@ controls the arm for ``time`` seconds, ``lookahead_time`` (0.03 to 0.2 s) smooth
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import socket
@@ -418,13 +417,16 @@ class URRTDEOperator:
 
 
 def _disconnect(control: Any, receive: Any) -> None:
+    calls: list[Callable[[], Any]] = []
     if control is not None and control.isConnected():
-        with contextlib.suppress(Exception):
-            control.stopScript()
-    for each in (control, receive):
-        if each is not None:
-            with contextlib.suppress(Exception):
-                each.disconnect()
+        calls.append(control.stopScript)
+    calls += [each.disconnect for each in (control, receive) if each is not None]
+    for call in calls:
+        try:
+            call()
+        # What C++ throws arrives as this; the calls after a failed one matter no less.
+        except RuntimeError as error:
+            log.warning("ending the connection to the robot: %s: %s", call.__name__, error)
 
 
 def _check_safety(mode: int) -> None:

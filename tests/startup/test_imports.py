@@ -17,7 +17,7 @@ HEAVY = {
 }
 # Rooms that are about a heavy package may import it at the top of a module.
 AT_HOME = {
-    "torch": {"train", "data", "infer", "testing"},
+    "torch": {"checkpoints", "train", "data", "infer", "testing"},
     "numpy": {
         *("safety", "control", "transforms", "data", "infer", "evaluate", "record", "testing"),
         *("train", "metrics", "processors", "ros2"),

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -21,7 +22,6 @@ from fluxvla_core.testing.training import (
     train_all,
     unflushed,
 )
-from fluxvla_core.train.checkpoint import folders, latest
 from fluxvla_core.train.forward import compile_units
 from fluxvla_core.train.weights import load_for_inference
 

@@ -9,16 +9,16 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
+from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.checkpoints.disk import Disk
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, RunFailed, UsageError
 from fluxvla_core.infer.local_policy import load_policy
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
-from fluxvla_core.train.checkpoint import Checkpoint
-from fluxvla_core.train.disk import Disk
 from fluxvla_core.train.export import export
 from fluxvla_core.train.weights import left_out
-from fluxvla_core.train.writer import CheckpointWriter
 
 ARM = EmbodimentSpec(
     "arm",

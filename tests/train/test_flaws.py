@@ -16,6 +16,7 @@ import torch
 
 from fluxvla_core import train as room
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.testing.training import (
@@ -27,7 +28,6 @@ from fluxvla_core.testing.training import (
     train_all,
     unflushed,
 )
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.train.distributed import start
 from fluxvla_core.train.state import rank_seed
 

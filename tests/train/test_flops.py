@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.testing.training import (
     Notes,
     TinyDataset,
@@ -17,7 +18,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
-from fluxvla_core.train.checkpoint import folders
 from fluxvla_core.train.flops import Meter, known_peak, on_meta, training_flops
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -18,7 +19,6 @@ from fluxvla_core.testing.training import (
     unflushed,
 )
 from fluxvla_core.train import lora
-from fluxvla_core.train.checkpoint import folders, latest
 from fluxvla_core.train.lora import LoraOptions
 from fluxvla_core.train.weights import load_for_inference, start_from
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import TinyDataset, TinyVLA, tiny_config, unflushed
-from fluxvla_core.train.checkpoint import folders, latest
 from fluxvla_core.train.memory import explain, peak_bytes
 
 CUDA = (

@@ -9,6 +9,7 @@ import torch
 
 from fluxvla_core import OPTIMIZERS
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import CheckpointError, ConfigError, LoadFailed, PluginError
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -16,7 +17,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
-from fluxvla_core.train.checkpoint import folders, latest
 
 
 @pytest.fixture(autouse=True)

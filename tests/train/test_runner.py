@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints import disk
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, UsageError
 from fluxvla_core.plugins.registry import HOOKS
@@ -24,8 +26,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
-from fluxvla_core.train import disk
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
 
 
 @pytest.fixture(autouse=True)

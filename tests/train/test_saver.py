@@ -13,6 +13,8 @@ import time
 import pytest
 import torch
 
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders
+from fluxvla_core.checkpoints.disk import Disk
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import (
     KEYS,
@@ -22,8 +24,6 @@ from fluxvla_core.testing.training import (
     train,
 )
 from fluxvla_core.train import saver
-from fluxvla_core.train.checkpoint import Checkpoint, folders
-from fluxvla_core.train.disk import Disk
 
 
 def config(**settings):

@@ -10,8 +10,8 @@ import torch
 
 from fluxvla_core import RUNNERS, BaseTrainRunner, build_runner_from_cfg
 from fluxvla_core.build import RunContext
+from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.testing.training import KEYS, Notes, TinyDataset, tiny_config, train
-from fluxvla_core.train.checkpoint import latest
 
 
 @RUNNERS.register_module()

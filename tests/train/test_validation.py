@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.testing.training import (
     Notes,
@@ -23,7 +24,6 @@ from fluxvla_core.testing.training import (
     train_all,
     unflushed,
 )
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.train.validation import share_statistics
 from fluxvla_core.train.weights import load_for_inference
 

@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import nn
 
+from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.checkpoint import Checkpoint
 from fluxvla_core.train.ema import Ema
-from fluxvla_core.train.tensors import TensorFile
 from fluxvla_core.train.weights import (
     check_model_tensors,
     left_out,
@@ -19,7 +20,6 @@ from fluxvla_core.train.weights import (
     model_tensors,
     put_model_tensors,
 )
-from fluxvla_core.train.writer import CheckpointWriter
 
 
 class Encoder(nn.Module):

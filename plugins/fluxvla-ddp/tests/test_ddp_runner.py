@@ -7,9 +7,9 @@ import signal
 
 import torch
 
+from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
 from fluxvla_core.testing.training import differences, run_ranks, tiny_config, train, train_all
-from fluxvla_core.train.checkpoint import latest
 
 
 class TestDDPTrainRunner(TrainRunnerConformance):

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
 from fluxvla_core.testing.training import (
@@ -17,7 +18,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.train.checkpoint import folders, latest
 
 installed = pytest.mark.skipif(find_spec("deepspeed") is None, reason="DeepSpeed is not installed")
 STAGES = (1, 2, 3)

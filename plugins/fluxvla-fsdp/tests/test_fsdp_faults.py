@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, latest
+from fluxvla_core.checkpoints.disk import Disk
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
 from fluxvla_core.train import distributed
-from fluxvla_core.train.checkpoint import Checkpoint, latest
-from fluxvla_core.train.disk import Disk
 from fluxvla_core.train.loop import begin
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.stop import StopRequest

@@ -11,12 +11,12 @@ import torch.distributed.checkpoint as dcp
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
+from fluxvla_core.checkpoints.tensors import read_tensors
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config, train
 from fluxvla_core.train import distributed
-from fluxvla_core.train.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.train.loop import begin
 from fluxvla_core.train.stop import StopRequest
-from fluxvla_core.train.tensors import read_tensors
 
 TOGETHER = 12
 """Samples of a step, over all processes."""

@@ -15,6 +15,7 @@ import torch
 from torch.distributed.tensor import DTensor
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
 from fluxvla_core.testing.training import (
@@ -24,7 +25,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
 
 
 class TestFSDPTrainRunner(TrainRunnerConformance):

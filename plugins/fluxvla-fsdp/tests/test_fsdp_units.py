@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import (
     ACTIONS,
@@ -18,7 +19,6 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.train.checkpoint import latest
 
 WIDTH = 8
 

@@ -62,7 +62,7 @@ def save(drifting):
     """``save(work_dir, spec=…, camera=…)``: writes a checkpoint and gives its path."""
     safetensors = pytest.importorskip("safetensors.torch")
     torch = pytest.importorskip("torch")
-    from fluxvla_core.train.writer import CheckpointWriter
+    from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     def row(width: int) -> dict:
         low, high = [-1.0] * width, [1.0] * width

@@ -45,7 +45,7 @@ def trembling(tmp_path):
 
 def save(work_dir, camera="top"):
     """A checkpoint as training writes it."""
-    from fluxvla_core.train.writer import CheckpointWriter
+    from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     row = {"mean": [0.0] * 14, "std": [1.0] * 14, "min": [-3.0] * 14, "max": [3.0] * 14}
     row |= {"q01": row["min"], "q99": row["max"]}

@@ -131,7 +131,7 @@ def refuse_overwriting(work_dir: Path) -> None:
     Raises:
         UsageError: there are checkpoints, with both ways on.
     """
-    from fluxvla_core.train.checkpoint import folders, step_of
+    from fluxvla_core.checkpoints.checkpoint import folders, step_of
 
     found = folders(work_dir)
     if found:

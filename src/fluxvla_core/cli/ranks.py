@@ -39,7 +39,7 @@ def resume(asked: str | None, work_dir: Path) -> str | None:
     """What a training goes on from: ``--resume``, and after a restart what there is by then."""
     if attempt() == 0:
         return asked
-    from fluxvla_core.train.checkpoint import folders
+    from fluxvla_core.checkpoints.checkpoint import folders
 
     return "auto" if asked is None or folders(work_dir) else asked
 

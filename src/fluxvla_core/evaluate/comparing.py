@@ -186,7 +186,7 @@ def _ledgers(folder: Path) -> list[Path]:
 
 
 def _hash(checkpoint: Path) -> str:
-    from fluxvla_core.train.manifest import NAME, hash_file
+    from fluxvla_core.checkpoints.manifest import NAME, hash_file
 
     return hash_file(checkpoint / NAME)
 

@@ -170,8 +170,8 @@ class RandomPolicy:
 
 def _with_statistics(source: Source) -> tuple[Any, Any]:
     """The section's tables with the statistics' key in both."""
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.data.mixture import first_dataset
-    from fluxvla_core.train.checkpoint import Checkpoint
 
     assert source.ckpt_path is not None
     checkpoint, key = Checkpoint.open(source.ckpt_path), source.norm_stats_key

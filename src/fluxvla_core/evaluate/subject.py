@@ -15,9 +15,9 @@ def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: there is none, or the one that is named is damaged.
     """
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.manifest import NAME, hash_file
     from fluxvla_core.infer.local_policy import find_checkpoint
-    from fluxvla_core.train.checkpoint import Checkpoint
-    from fluxvla_core.train.manifest import NAME, hash_file
 
     path = find_checkpoint(ckpt_path, work_dir)
     checkpoint = Checkpoint.open(path)
@@ -35,7 +35,7 @@ def untrained_model(ckpt_path: str, device: str) -> Any:
     import torch
 
     from fluxvla_core.build import build_vla_from_cfg
-    from fluxvla_core.train.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
 
     with torch.random.fork_rng():
         torch.manual_seed(0)

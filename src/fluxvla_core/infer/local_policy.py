@@ -18,6 +18,7 @@ from fluxvla_core.build import (
     build_vla_from_cfg,
     parameters,
 )
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, newest_whole
 from fluxvla_core.contracts.continuation import Continuation
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
@@ -27,7 +28,6 @@ from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
 from fluxvla_core.infer.scaling import scaling_of
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.train.checkpoint import Checkpoint, newest_whole
 
 Array = npt.NDArray[np.float64]
 PRECISIONS = ("float32", "bf16")

@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.testing.training import (
     checkpoint_differences,
     differences,
@@ -29,7 +30,6 @@ from fluxvla_core.testing.training import (
     train,
     train_all,
 )
-from fluxvla_core.train.checkpoint import MODEL, Checkpoint, folders
 
 LENGTH = {
     "steps": {"max_steps": 9, "save_iter_interval": 4},

@@ -23,6 +23,9 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import ENVIRONMENT, folders
+from fluxvla_core.checkpoints.disk import Disk
+from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.rng import sample_rng
@@ -31,9 +34,6 @@ from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 from fluxvla_core.train import stop
 from fluxvla_core.train.base_runner import BaseTrainRunner
-from fluxvla_core.train.checkpoint import ENVIRONMENT, folders
-from fluxvla_core.train.disk import Disk
-from fluxvla_core.train.manifest import NAME as MANIFEST
 
 STATES, HORIZON, ACTIONS = 6, 2, 3
 KEYS = ("states", "actions", "noise", "sample_ids")

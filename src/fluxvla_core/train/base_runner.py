@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-    from fluxvla_core.train.parts import Stored
+    from fluxvla_core.checkpoints.parts import Stored
 
 
 class BaseTrainRunner(TrainRun):

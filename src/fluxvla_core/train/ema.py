@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from fluxvla_core.train.tensors import check_names, copy_whole
+from fluxvla_core.checkpoints.tensors import check_names, copy_whole
 
 
 class Ema:

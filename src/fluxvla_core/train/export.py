@@ -11,13 +11,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from fluxvla_core.build import build_vla_from_cfg
+from fluxvla_core.checkpoints import checkpoint as ckpt
+from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.checkpoints.disk import files_below
+from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError, UsageError
-from fluxvla_core.train import checkpoint as ckpt
-from fluxvla_core.train.checkpoint import Checkpoint
-from fluxvla_core.train.disk import files_below
-from fluxvla_core.train.tensors import TensorFile
 from fluxvla_core.train.weights import LeftOut, load_for_inference, model_tensors
-from fluxvla_core.train.writer import CheckpointWriter
 
 TRAINING_ONLY = ("runner", "val_dataloader")
 """Sections of the config that are not exported."""

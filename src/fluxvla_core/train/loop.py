@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from typing import Any
 
+from fluxvla_core.checkpoints.shelf import name_best
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.train.batches import StepSampler
@@ -16,7 +17,6 @@ from fluxvla_core.train.memory import GB, peak_bytes
 from fluxvla_core.train.optim import trainable
 from fluxvla_core.train.resuming import restore_rng
 from fluxvla_core.train.saver import Saver
-from fluxvla_core.train.shelf import name_best
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
 from fluxvla_core.train.validation import Validation

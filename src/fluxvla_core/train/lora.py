@@ -18,7 +18,7 @@ from fluxvla_core.errors import ConfigError
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from fluxvla_core.train.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
 
 FOLDER = "adapter"
 WEIGHTS = f"{FOLDER}/adapter_model.safetensors"

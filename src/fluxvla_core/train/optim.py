@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fluxvla_core.checkpoints.parts import Stored
+from fluxvla_core.checkpoints.tensors import like, whole
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.train.parts import Stored
 from fluxvla_core.train.schedule import Schedule
-from fluxvla_core.train.tensors import like, whole
 
 NamedState = dict[str, Tensor]
 

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import CheckpointError, UsageError
-from fluxvla_core.train.batches import StepPlan
-from fluxvla_core.train.checkpoint import (
+from fluxvla_core.checkpoints.checkpoint import (
     EMA,
     MODEL,
     OPTIMIZER_META,
@@ -18,11 +16,13 @@ from fluxvla_core.train.checkpoint import (
     folders,
     newest_whole,
 )
+from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, set_aside_later
+from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.train.batches import StepPlan
 from fluxvla_core.train.distributed import World, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
-from fluxvla_core.train.shelf import clear_leftovers, prepare, set_aside_later
 from fluxvla_core.train.state import rank_seed, seed_all, set_rng_state
 from fluxvla_core.train.weights import LeftOut, check_model_tensors
 

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.data.order import EpisodeShards
     from fluxvla_core.hooks import HookCaller
     from fluxvla_core.train.batches import StepPlan
-    from fluxvla_core.train.checkpoint import Checkpoint
     from fluxvla_core.train.distributed import World
     from fluxvla_core.train.ema import Ema
     from fluxvla_core.train.flops import Meter
@@ -122,7 +122,7 @@ class TrainRun:
         Raises:
             RunFailed: it could not be written; the earlier ones are as they were.
         """
-        from fluxvla_core.train.shelf import name_best
+        from fluxvla_core.checkpoints.shelf import name_best
 
         saved = self._saver.settle(wait) if self._saver is not None else None
         if saved is None or not self.world.first:

@@ -18,8 +18,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.train.distributed import World, agree
-from fluxvla_core.train.tensors import TensorFile
 
 
 @dataclass

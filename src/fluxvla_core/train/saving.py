@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.checkpoints import checkpoint as ckpt
+from fluxvla_core.checkpoints.parts import is_split, own_parts
+from fluxvla_core.checkpoints.shelf import rotate
+from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.resolved import environment
-from fluxvla_core.train import checkpoint as ckpt
 from fluxvla_core.train import lora
 from fluxvla_core.train.distributed import World, on_first, texts
 from fluxvla_core.train.ema import Ema
-from fluxvla_core.train.parts import is_split, own_parts
 from fluxvla_core.train.saver import Saver
-from fluxvla_core.train.shelf import rotate
 from fluxvla_core.train.state import rng_state
-from fluxvla_core.train.tensors import TensorFile
 from fluxvla_core.train.weights import LeftOut
-from fluxvla_core.train.writer import CheckpointWriter, json_bytes
 
 if TYPE_CHECKING:
     from fluxvla_core.train.strategy import Strategy

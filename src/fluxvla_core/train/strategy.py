@@ -12,17 +12,17 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from fluxvla_core.build import RunContext
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.parts import Stored
     from fluxvla_core.data.order import EpisodeShards
     from fluxvla_core.hooks import HookCaller
     from fluxvla_core.train.batches import StepPlan
-    from fluxvla_core.train.checkpoint import Checkpoint
     from fluxvla_core.train.distributed import World
     from fluxvla_core.train.ema import Ema
     from fluxvla_core.train.flops import Meter
     from fluxvla_core.train.forward import ForwardArguments
     from fluxvla_core.train.lora import LoraOptions
     from fluxvla_core.train.options import LoaderOptions, TrainOptions
-    from fluxvla_core.train.parts import Stored
     from fluxvla_core.train.progress import Progress
     from fluxvla_core.train.saver import Saver
     from fluxvla_core.train.weights import LeftOut

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
+from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.train import lora
-from fluxvla_core.train.checkpoint import EMA, MODEL, TRAINER, Checkpoint
-from fluxvla_core.train.tensors import check_names, like, read_tensors
 
 
 @dataclass(frozen=True)

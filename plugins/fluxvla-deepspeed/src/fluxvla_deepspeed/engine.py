@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fluxvla_core.checkpoints.parts import Stored
 from fluxvla_core.train.distributed import World
-from fluxvla_core.train.parts import Stored
 
 
 def start(

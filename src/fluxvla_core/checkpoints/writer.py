@@ -17,12 +17,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
+from fluxvla_core.checkpoints.checkpoint import FOLDER, step_name
+from fluxvla_core.checkpoints.disk import Disk, aside, files_below
+from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file
+from fluxvla_core.checkpoints.shelf import PARTIAL
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.train.checkpoint import FOLDER, step_name
-from fluxvla_core.train.disk import Disk, aside, files_below
-from fluxvla_core.train.manifest import NAME as MANIFEST
-from fluxvla_core.train.manifest import FileEntry, Manifest, hash_file
-from fluxvla_core.train.shelf import PARTIAL
 
 _FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 T = TypeVar("T")

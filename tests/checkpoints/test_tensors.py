@@ -11,9 +11,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
+from fluxvla_core.checkpoints.tensors import TensorFile, check_names, read_tensors
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.tensors import TensorFile, check_names, read_tensors
-from fluxvla_core.train.writer import CheckpointWriter
 
 
 def saved(tmp_path, tensors):

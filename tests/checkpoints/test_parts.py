@@ -10,10 +10,17 @@ import torch.distributed.checkpoint as dcp
 from safetensors.torch import save_file
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader
 
+from fluxvla_core.checkpoints.parts import (
+    PLACES,
+    SHAPES,
+    Region,
+    StoredTensors,
+    is_split,
+    own_parts,
+)
+from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.parts import PLACES, SHAPES, Region, StoredTensors, is_split, own_parts
-from fluxvla_core.train.tensors import TensorFile
-from fluxvla_core.train.writer import CheckpointWriter
 
 WHOLE = {
     "a": torch.arange(35, dtype=torch.float32).reshape(7, 5),

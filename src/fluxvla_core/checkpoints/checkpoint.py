@@ -26,15 +26,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.checkpoints.manifest import Manifest, hash_file, read_manifest
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.manifest import NAME as MANIFEST
-from fluxvla_core.train.manifest import Manifest, hash_file, read_manifest
 
 if TYPE_CHECKING:
     import torch
 
+    from fluxvla_core.checkpoints.parts import Stored
     from fluxvla_core.spec.embodiment import EmbodimentSpec
-    from fluxvla_core.train.parts import Stored
 
 FOLDER = "checkpoints"
 MODEL = "model.safetensors"
@@ -193,7 +193,7 @@ class Checkpoint:
         Raises:
             CheckpointError: the file is not there or cannot be read.
         """
-        from fluxvla_core.train.tensors import read_tensors
+        from fluxvla_core.checkpoints.tensors import read_tensors
 
         if not self.has(name):
             raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
@@ -205,7 +205,7 @@ class Checkpoint:
         Raises:
             CheckpointError: there is none, or it cannot be read.
         """
-        from fluxvla_core.train.parts import StoredTensors
+        from fluxvla_core.checkpoints.parts import StoredTensors
 
         names = sorted(n for n in self.manifest.files if n.startswith(OPTIMIZER_PARTS + "/"))
         if not names and not self.has(OPTIMIZER):

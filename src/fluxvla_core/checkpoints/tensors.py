@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 
+from fluxvla_core.checkpoints.parts import Region, Stored, describe_parts, is_split, local
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.train.parts import Region, Stored, describe_parts, is_split, local
-from fluxvla_core.train.writer import CheckpointWriter
 
 _DTYPES: Mapping[torch.dtype, str] = {
     torch.float64: "F64",

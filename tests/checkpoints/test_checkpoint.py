@@ -9,11 +9,11 @@ import sys
 
 import pytest
 
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, newest_whole
+from fluxvla_core.checkpoints.manifest import read_manifest
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest, newest_whole
-from fluxvla_core.train.manifest import read_manifest
-from fluxvla_core.train.writer import CheckpointWriter
 
 SPEC = EmbodimentSpec("arm", (Joint("j", "rad", -1.0, 1.0, 1.0, 1.0),), (), 10.0)
 
@@ -42,7 +42,7 @@ def test_what_a_checkpoint_says(tmp_path):
 
 def test_metadata_is_read_without_torch(tmp_path):
     code = (
-        "import sys; from fluxvla_core.train.checkpoint import latest\n"
+        "import sys; from fluxvla_core.checkpoints.checkpoint import latest\n"
         "found = latest(sys.argv[1]); found.verify(); found.embodiment(); found.config()\n"
         "sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
     )

@@ -10,11 +10,11 @@ import sys
 
 import pytest
 
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
+from fluxvla_core.checkpoints.disk import Disk
+from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, rotate, set_aside_later
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.train.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.train.disk import Disk
-from fluxvla_core.train.shelf import clear_leftovers, prepare, rotate, set_aside_later
-from fluxvla_core.train.writer import CheckpointWriter
 
 
 def write(work_dir, step, disk=None, text=b"weights"):
@@ -128,7 +128,7 @@ def test_a_limit_on_file_sizes_is_a_full_disk(tmp_path):
     """The provocation is real: the kernel refuses to let the file grow."""
     code = (
         "import sys, resource; from pathlib import Path\n"
-        "from fluxvla_core.train.writer import CheckpointWriter\n"
+        "from fluxvla_core.checkpoints.writer import CheckpointWriter\n"
         "def save(step, size):\n"
         "    with CheckpointWriter(Path(sys.argv[1]), step, 0) as writer:\n"
         "        writer.write_bytes('model.safetensors', b'x' * size)\n"

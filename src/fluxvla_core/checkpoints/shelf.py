@@ -6,9 +6,9 @@ import os
 import tempfile
 from pathlib import Path
 
+from fluxvla_core.checkpoints.checkpoint import FOLDER, folders, step_name, step_of
+from fluxvla_core.checkpoints.disk import Disk, aside
 from fluxvla_core.errors import UsageError
-from fluxvla_core.train.checkpoint import FOLDER, folders, step_name, step_of
-from fluxvla_core.train.disk import Disk, aside
 
 PARTIAL = ".partial"
 REMOVING = ".removing"

@@ -11,7 +11,6 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,6 @@ def fluxvla(root: Path, kind: str, workers: int) -> Iterable[Any]:
 
 
 def lerobot(root: Path, kind: str, workers: int) -> Iterable[Any]:
-    _declare_operators()
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from torch.utils.data import DataLoader
 
@@ -54,17 +52,6 @@ def lerobot(root: Path, kind: str, workers: int) -> Iterable[Any]:
             yield from DataLoader(dataset, BATCH, shuffle=True, num_workers=workers, drop_last=True)
 
     return forever()
-
-
-@cache
-def _declare_operators() -> Any:
-    """torchvision's wheel is built for CUDA; without it its import stops at these two."""
-    import torch
-
-    operators = torch.library.Library("torchvision", "DEF")
-    operators.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    operators.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    return operators
 
 
 SIDES = {"fluxvla": fluxvla, "lerobot": lerobot}

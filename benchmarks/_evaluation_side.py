@@ -129,10 +129,6 @@ def _loop(
 def lerobot(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """``lerobot-eval``'s own rollout over its asynchronous vector environment."""
     import torch
-
-    operators = torch.library.Library("torchvision", "DEF")
-    operators.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    operators.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     from lerobot.envs.configs import AlohaEnv
     from lerobot.envs.factory import make_env
     from lerobot.scripts import lerobot_eval

@@ -1,10 +1,10 @@
 """LeRobot in an environment of its own, to ask it whether it reads what we write and the reverse.
 
 LeRobot cannot share an environment with this project: it wants an older torch, its torchvision and
-its PyAV. Here it gets the torch of ``constraints.txt`` all the same, which its dataset code works
-with: torchvision is imported for its names only (the test's script declares the two operators
-that its import looks for), and torchcodec uses the FFmpeg that PyAV's wheel brings, so nothing has
-to be installed into the system.
+its PyAV. Here it gets the torch of ``constraints.txt`` all the same, which its datasets and
+policies work with: torchvision's compiled part cannot be loaded beside a CPU build of torch, and
+nothing here calls it; torchcodec uses the FFmpeg that PyAV's wheel brings, so nothing has to be
+installed into the system.
 
     python -m tools.lerobot_env          prints the environment's Python
 """
@@ -19,12 +19,13 @@ from tools import project, shell, torch_build
 from tools.envs import Env
 
 LEROBOT = ("lerobot==0.4.4", "torchcodec==0.13.0", "torchvision==0.28.0")
-# What LeRobot's dataset code imports, in the versions that go with 0.4.4.
+# What LeRobot's datasets and its commands import, in the versions that go with 0.4.4.
 NEEDS = (
     "accelerate",
     "av<16",
     "datasets>=4.8,<5",
     "deepdiff",
+    "diffusers",
     "draccus==0.10.0",
     "einops",
     "gymnasium",
@@ -35,6 +36,7 @@ NEEDS = (
     "packaging<26",
     "pandas<3",
     "pyarrow<30",
+    "pyserial",
     "safetensors",
     "termcolor",
 )
@@ -44,6 +46,14 @@ try:
 except Exception as error:
     missing = [line.strip() for line in str(error).splitlines() if "libpython" in line]
     raise SystemExit(missing[0] if missing else f"torchcodec: {error}")
+"""
+# Beside a torch for which torchvision's library is not built, its import stops at these operators.
+DECLARED = """
+# Added by tools/lerobot_env.py
+if not _has_ops():
+    _declared = torch.library.Library("torchvision", "DEF")
+    _declared.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    _declared.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 """
 FFMPEG = ("avcodec", "avdevice", "avfilter", "avformat", "avutil", "swresample", "swscale")
 
@@ -84,17 +94,29 @@ def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "le
 
     def install_parts(changed: list[str], fresh: bool) -> None:
         _pip(env, "--no-deps", *LEROBOT)
+        declare_operators(env)
         _link_ffmpeg(env)
         # Some Pythons (Debian's, unless libpython3.x is installed) lack the library it links to.
         env.run("python", "-c", TRY_CODEC, quiet=True, echo=False)
 
-    env.filled(base, {"lerobot": " ".join(LEROBOT)}, install_base, install_parts)
+    env.filled(base, {"lerobot": " ".join(LEROBOT) + DECLARED}, install_base, install_parts)
     return env
 
 
 def _pip(env: Env, *words: str) -> None:
     pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
     env.run(*pip, *words, quiet=True, echo=False)
+
+
+def declare_operators(env: Env) -> None:
+    """Let torchvision's names be imported where its compiled part cannot be; done again, no more.
+
+    Raises:
+        ValueError: torchvision is not there.
+    """
+    (module,) = env.root.glob("lib/python*/site-packages/torchvision/extension.py")
+    own = module.read_text(encoding="utf-8").partition(DECLARED.splitlines()[1])[0].rstrip()
+    module.write_text(f"{own}\n{DECLARED}", encoding="utf-8")
 
 
 def _link_ffmpeg(env: LeRobotEnv) -> None:

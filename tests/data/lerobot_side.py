@@ -13,14 +13,6 @@ import sys
 
 import numpy as np
 import torch
-
-if torch.version.cuda is None:
-    # torchvision's wheel is built for CUDA; beside a CPU build of torch its library cannot be
-    # loaded and the import stops at these two operators.
-    _operators = torch.library.Library("torchvision", "DEF")
-    _operators.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    _operators.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 

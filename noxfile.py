@@ -105,8 +105,8 @@ def bench(session: nox.Session) -> None:
         make_renderable(session, dev)
         named = session.posargs or sorted(p.stem for p in (ROOT / "benchmarks").glob("[!_]*.py"))
         for name in named:
-            script = ROOT / "benchmarks" / f"{name}.py"
-            step(name, lambda s=script: dev.run("python", s, cwd=ROOT, env=rendering.VARIABLES))
+            words = ["-m", f"benchmarks.{name}"]
+            step(name, lambda w=words: dev.run("python", *w, cwd=ROOT, env=rendering.VARIABLES))
 
 
 def check_lint(dev: envs.Env) -> None:

@@ -1,6 +1,6 @@
 """How long a checkpoint holds up the training, beside what a plain ``torch.save`` takes.
 
-    python benchmarks/checkpoint_save.py [--gigabytes 1] [--saves 4] [--steps 12]
+    python -m benchmarks.checkpoint_save [--gigabytes 1] [--saves 4] [--steps 12]
 
 One process trains a model of so many gigabytes with AdamW (its state is twice that). Before every
 save the same weights and optimizer state are written by ``torch.save`` to the same disk, without
@@ -13,9 +13,6 @@ under a tenth. Writes ``benchmarks/results/checkpoint_save.json``.
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
 import statistics
 import tempfile
 import time
@@ -25,11 +22,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from benchmarks import _results
 from fluxvla_core import RUNNERS, VLAS, BaseTrainRunner, RunContext, build_runner_from_cfg
 from fluxvla_core.testing.training import TinyDataset
 from fluxvla_core.train.saver import Saver
 
-RESULTS = Path(__file__).with_name("results") / "checkpoint_save.json"
 MOST_RATIO = 0.10
 WIDTH = 4096
 
@@ -137,12 +134,12 @@ def _writing(runner: Any) -> bool:
 
 def main() -> int:
     """Measure, print and write; 0 also when the goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--gigabytes", type=float, default=1.0)
     parser.add_argument("--saves", type=int, default=4)
     parser.add_argument("--steps", type=int, default=12)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("torch", "safetensors")
     layers = max(1, round(args.gigabytes * 1e9 / (WIDTH * WIDTH * 4)))
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
         found, taken = measure(layers, args.saves, args.steps, Path(folder))
@@ -152,6 +149,7 @@ def main() -> int:
     beside = [seconds for seconds, writing in taken[1:] if writing]
     slower = statistics.median(beside) / statistics.median(alone) if beside and alone else None
     result = {
+        **begun,
         "what": "seconds the step loop stands still for a checkpoint over those of torch.save",
         "goal_ratio": MOST_RATIO,
         "ratio": round(ratio, 4),
@@ -160,12 +158,9 @@ def main() -> int:
         "steps_beside_writing_over_steps_without": None if slower is None else round(slower, 3),
         "step_s": round(statistics.median(alone or beside), 3),
         "saves": [{k: round(v, 4) for k, v in save.items()} for save in found],
-        "torch": torch.__version__,
         "threads": torch.get_num_threads(),
-        "python": platform.python_version(),
-        "machine": platform.machine(),
     }
-    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    _results.keep(args.out, result, show=False)
     blocked = statistics.median(save["blocked_s"] for save in later)
     plain = statistics.median(save["plain_s"] for save in later)
     print(

@@ -1,6 +1,6 @@
 """What each way of joining chunks makes of a slow policy: success, time, and smoothness.
 
-    python benchmarks/chunk_joining.py [--checkpoint work_dirs/aloha_sim_transfer] [--episodes 5]
+    python -m benchmarks.chunk_joining [--checkpoint work_dirs/aloha_sim_transfer] [--episodes 5]
 
 The simulated ALOHA hands the cube over with the policy that the demo trains. The latency is
 simulated (time stands still while the policy thinks, and then passes), so that the figures do not
@@ -12,7 +12,6 @@ Writes ``benchmarks/results/chunk_joining.json``; without a trained policy it me
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from pathlib import Path
@@ -20,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.infer.local_policy import find_checkpoint, load_policy
 
-RESULTS = Path(__file__).parent / "results" / "chunk_joining.json"
 TASKS = {
     "1": "pick up the cube with the right arm and hold it",
     "2": "hand the cube over to the left arm",
@@ -74,12 +73,12 @@ def episode(policy: Any, method: str, latency: float, seed: int) -> dict[str, fl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = _results.options(__file__)
     parser.add_argument("--checkpoint", type=Path, default="work_dirs/aloha_sim_transfer")
     parser.add_argument("--episodes", type=int, default=5, help="for each row")
     parser.add_argument("--latencies", type=float, nargs="+", default=[0.0, 0.2, 0.4])
-    parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
+    begun = _results.head("fluxvla-sim", "torch", "mujoco")
     try:
         policy = load_policy(find_checkpoint(None, arguments.checkpoint))
     except CheckpointError as error:
@@ -98,8 +97,9 @@ def main() -> None:
                 f"acceleration {mean['acceleration_rms']:.2f} rad/s^2",
                 flush=True,
             )
-    arguments.out.parent.mkdir(exist_ok=True)
-    arguments.out.write_text(json.dumps({"episodes": arguments.episodes, "rows": rows}, indent=1))
+    _results.keep(
+        arguments.out, {**begun, "episodes": arguments.episodes, "rows": rows}, show=False
+    )
 
 
 if __name__ == "__main__":

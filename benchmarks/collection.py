@@ -1,6 +1,6 @@
 """How fast demonstrations are collected and policies evaluated in simulation.
 
-    python benchmarks/collection.py [--rounds 3] [--episodes 8]
+    python -m benchmarks.collection [--rounds 3] [--episodes 8]
 
 Three comparisons; in each the sides take turns, so that other work on the machine slows them alike,
 and the figure is the median over the rounds:
@@ -17,10 +17,7 @@ Loading libraries and the scene is left out everywhere. Writes
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import platform
 import shutil
 import statistics
 import sys
@@ -39,6 +36,7 @@ from fluxvla_sim.aloha.tasks import MAX_STEPS
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 
+from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluate.demonstrating import demonstrate
 from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
@@ -49,7 +47,6 @@ from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
 from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera
 
-RESULTS = Path(__file__).with_name("results") / "collection.json"
 CAMERA = Camera("top", 144, 192)
 PICTURES = 10
 
@@ -141,11 +138,11 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
 
 def main() -> int:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=8)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("fluxvla-sim", "mujoco", "gym-aloha")
     rounds, episodes = range(args.rounds), args.episodes
     sides = pictures()
     drawn = [{name: measure() for name, measure in sides.items()} for _ in rounds]
@@ -155,8 +152,7 @@ def main() -> int:
     both = [evaluating(2, episodes)[0] for _ in rounds]
     middle = statistics.median
     summary = {
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        **begun,
         "rounds": args.rounds,
         "picture_ms": {n: round(middle(d[n][0] for d in drawn), 1) for n in sides},
         "picture_cpu_ms": {n: round(middle(d[n][1] for d in drawn), 1) for n in sides},
@@ -176,9 +172,7 @@ def main() -> int:
         },
         "engine_share_of_bare_loop": round(middle(e / b for e, b in evaluated), 2),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

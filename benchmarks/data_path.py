@@ -1,23 +1,20 @@
 """Samples a second of the data path beside LeRobot's own ``LeRobotDataset``, on the same files.
 
-    python benchmarks/data_path.py [--rounds 3] [--seconds 4] [--episodes 4] [--frames 100]
+    python -m benchmarks.data_path [--rounds 3] [--seconds 4] [--episodes 4] [--frames 100]
 
 Makes two datasets of version 3.0 (three cameras of 480 x 640 in mp4; and none) and reads each at
 random through both sides' loaders, in batches of 8 with chunks of 50 actions, with 0 and 2
 workers. The sides take turns, each in its own environment (``tools/lerobot_env.py`` makes
-LeRobot's) with one thread a process; figures are medians over the rounds. Where
-the machine is shared, ratios of processor time (without workers) say more than those of rates.
-FluxVLA's pictures stay
-uint8, LeRobot's become float32, for that is what each hands to training. Goals: 3 times LeRobot's
-rate with video, 5 times without. Writes ``benchmarks/results/data_path.json``.
+LeRobot's) with one thread a process; figures are medians over the rounds. Where the machine is
+shared, ratios of processor time (without workers) say more than those of rates. FluxVLA's pictures
+stay uint8, LeRobot's become float32, for that is what each hands to training. Goals: 3 times
+LeRobot's rate with video, 5 times without. Writes ``benchmarks/results/data_path.json``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -28,14 +25,10 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks._data_path_side import CAMERAS, FPS, KINDS  # noqa: E402
-from tools import lerobot_env, shell  # noqa: E402
+from benchmarks import _lerobot, _results
+from benchmarks._data_path_side import CAMERAS, FPS, KINDS
 
 SIDE = Path(__file__).with_name("_data_path_side.py")
-RESULTS = Path(__file__).with_name("results") / "data_path.json"
 GOALS = {"mp4": 3.0, "parquet": 5.0}
 JOINTS = 14
 HEIGHT, WIDTH = 480, 640
@@ -130,19 +123,17 @@ def medians(found: Mapping[str, Sequence[float]]) -> dict[str, float]:
 
 def main() -> int:
     """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement, at least")
     parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--frames", type=int, default=100, help="of an episode")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head()
     sides: dict[str, tuple[str | Path, dict[str, str]]] = {"fluxvla": (sys.executable, {})}
-    try:
-        env = lerobot_env.prepare(lambda text: print(text, file=sys.stderr))
+    env = _lerobot.prepared()
+    if env is not None:
         sides["lerobot"] = (env.python, env.variables())
-    except (shell.StepFailed, OSError) as error:
-        print(f"without LeRobot, which cannot be installed: {error}", file=sys.stderr)
     runs: dict[str, list[Any]] = {side: [] for side in sides}
     with tempfile.TemporaryDirectory() as folder:
         make_datasets(Path(folder), args.episodes, args.frames)
@@ -150,16 +141,13 @@ def main() -> int:
             for side, (python, variables) in sides.items():
                 runs[side].append(measure(side, python, Path(folder), args.seconds, variables))
     summary = {
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        **begun,
         "dataset": f"{args.episodes} episodes of {args.frames} frames, {len(CAMERAS)} cameras "
         f"{HEIGHT} x {WIDTH}, h264",
         "rounds": args.rounds,
         **summarise(runs),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

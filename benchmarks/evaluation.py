@@ -1,6 +1,6 @@
 """How fast policies are evaluated, beside LeRobot's evaluation and beside bare stepping.
 
-    python benchmarks/evaluation.py [--rounds 3] [--checkpoint DIR]
+    python -m benchmarks.evaluation [--rounds 3] [--checkpoint DIR]
 
 gym-aloha's transfer task with a policy that costs nothing, in as many processes as there are cores
 (at most 4), the top camera looked at in 480 x 640 at every step: the engine with stock pictures
@@ -19,10 +19,8 @@ Goals: 1.5 times LeRobot's episodes a minute with stock pictures, 0.9 of bare st
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import platform
 import statistics
 import sys
 import tempfile
@@ -30,16 +28,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from tools import lerobot_env, rendering, shell  # noqa: E402
+from benchmarks import _lerobot, _results
+from tools import rendering, shell
 
 SIDE = Path(__file__).with_name("_evaluation_side.py")
-RESULTS = Path(__file__).with_name("results") / "evaluation.json"
 EPISODE = 300
-NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0", "pyserial", "diffusers")
-"""What LeRobot's evaluation imports, beside what its dataset code does."""
+NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0")
+"""The simulator, beside what LeRobot itself imports."""
 KEYS = {"engine, stock pictures": "times_lerobot", "engine": "times_lerobot_cheap_pictures"}
 GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
 # side -> words of _evaluation_side.py: side, steps, episodes for each process, pictures
@@ -57,22 +52,6 @@ def measure(python: Path | str, words: Mapping[str, Any], variables: Mapping[str
     command = [python, SIDE, *map(str, words.values())]
     output = shell.run(command, env={**variables, **threads}, quiet=True, echo=False)
     return json.loads(output.strip().splitlines()[-1])
-
-
-def lerobot_python(given: str | None) -> tuple[Path | str, dict[str, str]]:
-    """LeRobot's Python with the simulator in it, and its variables.
-
-    Raises:
-        StepFailed, OSError: it cannot be installed.
-    """
-    if given is not None:
-        return given, {**os.environ, "HF_HUB_OFFLINE": "1"}
-    env = lerobot_env.prepare(
-        lambda text: print(text, file=sys.stderr), ROOT / ".nox" / "lerobot-eval"
-    )
-    pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
-    env.run(*pip, *NEEDS, quiet=True, echo=False)
-    return env.python, {**os.environ, **env.variables()}
 
 
 def placements(checkpoint: str, workers: int, episodes: int) -> dict[str, float]:
@@ -104,18 +83,16 @@ def placements(checkpoint: str, workers: int, episodes: int) -> dict[str, float]
 
 def main() -> int:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--processes", type=int, default=min(4, os.cpu_count() or 1))
-    parser.add_argument("--lerobot", metavar="PYTHON", help="instead of installing one")
     parser.add_argument("--checkpoint", metavar="DIR")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("mujoco", "numpy")
     pythons: dict[str, tuple[Path | str, dict[str, str]]] = {}
-    try:
-        pythons["lerobot"] = lerobot_python(args.lerobot)
-    except (shell.StepFailed, OSError) as error:
-        print(f"without LeRobot, which cannot be installed: {error}", file=sys.stderr)
+    env = _lerobot.prepared(*NEEDS, folder="lerobot-eval")
+    if env is not None:
+        pythons["lerobot"] = (env.python, {**os.environ, **env.variables()})
     runs: dict[str, list[Any]] = {}
     for _ in range(args.rounds):
         for name, (side, steps, each, render) in SIDES.items():
@@ -146,8 +123,8 @@ def main() -> int:
             figures[key] = round(pace[name] / pace["lerobot"], 2)
             figures[f"{key}_by_cpu"] = round(cost["lerobot"] / cost[name], 2)
     summary = {
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        **begun,
+        **_lerobot.versions(env),
         "processes": args.processes,
         "rounds": args.rounds,
         "steps_per_s": {name: round(value, 2) for name, value in pace.items()},
@@ -167,9 +144,7 @@ def main() -> int:
     }
     if args.checkpoint:
         summary["policy_steps_per_s"] = placements(args.checkpoint, args.processes, 8)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

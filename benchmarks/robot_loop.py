@@ -1,6 +1,6 @@
 """A minute of driving a robot over ROS 2, beside the way it was done upstream.
 
-    python benchmarks/robot_loop.py [--seconds 60] [--rounds 1] [--minutes 10]
+    python -m benchmarks.robot_loop [--seconds 60] [--rounds 1] [--minutes 10]
 
 A driver process publishes three 640x480 rgb8 cameras at 30 Hz and two joint states at 100 Hz; a
 torch policy of 10 M parameters thinks all the time, on one core; commands go out at 50 Hz. The two
@@ -25,7 +25,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -45,13 +44,13 @@ from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC
 from fluxvla_aloha.runner import AlohaInferenceRunner
 
+from benchmarks import _results
 from fluxvla_core.build import RunContext
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 
-RESULTS = Path(__file__).with_name("results") / "robot_loop.json"
 RATE_HZ, HORIZON, EXECUTED = 50.0, 200, 25
 LATE_S = 0.002
 GOALS = {"late_share": 0.001, "jitter_p99_ms": 1.0, "copies": 1.05, "jitter": 5.0, "memory": 10.0}
@@ -287,7 +286,10 @@ SIDES: dict[str, Callable[[float, float], dict[str, Any]]] = {
 def side(name: str, seconds: float, prompt: float) -> dict[str, Any]:
     words = ["--side", name, "--seconds", str(seconds), "--prompt", str(prompt)]
     done = subprocess.run(
-        [sys.executable, __file__, *words], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "benchmarks.robot_loop", *words],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         sys.exit(f"{name} failed with {done.returncode}:\n{done.stderr[-3000:]}")
@@ -314,20 +316,19 @@ def summarise(rounds: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 def main() -> int:
     """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--prompt", type=float, default=8.0, help="seconds before upstream starts")
     parser.add_argument("--minutes", type=float, default=0.0, help="of our side alone, for memory")
     parser.add_argument("--side", choices=SIDES, help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("fluxvla-aloha", "rclpy", "torch")
     if args.side:
         print(json.dumps(SIDES[args.side](args.seconds, args.prompt)))
         return 0
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     rounds: dict[str, list[dict[str, Any]]] = {name: [] for name in SIDES}
-    load = os.getloadavg()[0]
     with claimed_domain() as domain:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         with drive():
@@ -336,16 +337,13 @@ def main() -> int:
                     found.append(side(name, args.seconds, args.prompt))
             long = [side("fluxvla", args.minutes * 60, 0.0)] if args.minutes else []
     summary = {
+        **begun,
         "what": "50 Hz commands while a torch policy thinks, three 640x480 cameras, two arms",
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, load before {load:.1f}",
         "seconds": args.seconds,
         **summarise(rounds),
         **({"minutes": args.minutes, "long": long[0]} if long else {}),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

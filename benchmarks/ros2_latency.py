@@ -1,6 +1,6 @@
 """From a camera to an observation: AlohaOperator beside a bare rclpy script.
 
-    python benchmarks/ros2_latency.py [--rounds 4] [--seconds 8]
+    python -m benchmarks.ros2_latency [--rounds 4] [--seconds 8]
 
 A driver process publishes three 640x480 rgb8 cameras at 30 Hz and two joint states at 100 Hz. The
 two sides take turns, each in a process of its own: the bare script keeps the newest message of each
@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -24,18 +23,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC
 
+from benchmarks import _results
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
 from fluxvla_core.testing.ros2_driver import Driver
+from fluxvla_core.testing.ros_domains import claimed_domain
 
-RESULTS = Path(__file__).with_name("results") / "ros2_latency.json"
 GOAL = 1.15
 ASKED_HZ = 10.0
 # The first answers pay for imports and caches.
@@ -139,7 +138,15 @@ def operator(seconds: float) -> dict[str, Any]:
 
 
 def side(name: str, seconds: float) -> dict[str, Any]:
-    command = [sys.executable, __file__, "--side", name, "--seconds", str(seconds)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.ros2_latency",
+        "--side",
+        name,
+        "--seconds",
+        str(seconds),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"{name} failed with {done.returncode}:\n{done.stderr[-2000:]}")
@@ -167,32 +174,30 @@ def summarise(sides: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 def main() -> int:
     """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--side", choices=("bare", "operator"), help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("fluxvla-aloha", "rclpy")
     if args.side:
         print(json.dumps({"bare": bare, "operator": operator}[args.side](args.seconds)))
         return 0
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     sides: dict[str, list[dict[str, Any]]] = {"bare": [], "operator": []}
-    with drive():
-        for _ in range(args.rounds):
-            for name, found in sides.items():
-                found.append(side(name, args.seconds))
+    with claimed_domain() as domain:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        with drive():
+            for _ in range(args.rounds):
+                for name, found in sides.items():
+                    found.append(side(name, args.seconds))
     summary = {
+        **begun,
         "what": "camera stamp to receipt, plus making an observation of three 640x480 cameras",
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
         "rounds": args.rounds,
         **summarise(sides),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

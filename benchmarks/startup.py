@@ -1,20 +1,16 @@
 """How long ``fluxvla --help`` and ``fluxvla plugins list`` take beside bare Python and LeRobot.
 
-    python benchmarks/startup.py [--lerobot PATH/TO/lerobot-train] [--rounds 15]
+    python -m benchmarks.startup [--rounds 15]
 
 The commands take turns, so that other work on the machine slows all of them alike; figures are
 medians over the rounds, of the time on the clock and of the processor time, which other work
 disturbs less; what the commands do is all computing. Goals: at most 100 ms of processor time more
-than bare Python, and at least 20 times faster than ``lerobot-train --help`` (an environment of its
-own: LeRobot needs an older torch). Writes ``benchmarks/results/startup.json``.
+than bare Python, and at least 20 times faster than ``lerobot-train --help`` (in an environment of
+its own, which ``tools/lerobot_env.py`` makes). Writes ``benchmarks/results/startup.json``.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -23,7 +19,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-RESULTS = Path(__file__).with_name("results") / "startup.json"
+from benchmarks import _lerobot, _results
+
 MOST_EXTRA_MS = 100.0
 LEAST_RATIO = 20.0
 
@@ -84,28 +81,26 @@ def summarise(clock: dict[str, float], processor: dict[str, float]) -> dict[str,
 
 def main() -> int:
     """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
-    parser.add_argument("--lerobot", type=Path, help="the lerobot-train of another environment")
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head()
     program = str(Path(sys.executable).with_name("fluxvla"))
     commands: dict[str, Sequence[str]] = {
         "python": [sys.executable, "-c", "pass"],
         "fluxvla --help": [program, "--help"],
         "fluxvla plugins list": [program, "plugins", "list"],
     }
-    if args.lerobot:
-        commands["lerobot-train --help"] = [str(args.lerobot), "--help"]
+    env = _lerobot.prepared()
+    if env is not None:
+        commands["lerobot-train --help"] = [str(env.bin / "lerobot-train"), "--help"]
     summary = {
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        **begun,
+        **_lerobot.versions(env),
         "rounds": args.rounds,
         **summarise(*measure(commands, args.rounds)),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(summary, indent=1))
+    _results.keep(args.out, summary)
     return 0
 
 

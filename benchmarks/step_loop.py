@@ -1,6 +1,6 @@
 """What a train runner's loop costs beside a hand-written torch loop.
 
-    python benchmarks/step_loop.py [--rounds 21] [--steps 10]
+    python -m benchmarks.step_loop [--rounds 21] [--steps 10]
 
 One process, DDP x2 and FSDP x2. In each, both loops live in the same processes with equal models,
 data, loader, optimizer and clipping, and take turns, so that other work on the machine slows both
@@ -13,10 +13,7 @@ sample order that resumes, listening to signals. Goal: within 5 %. Writes
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import platform
 import statistics
 import tempfile
 import time
@@ -30,11 +27,11 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, DistributedSampler
 
+from benchmarks import _results
 from fluxvla_core import VLAS, RunContext, build_runner_from_cfg
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.testing.training import run_ranks
 
-RESULTS = Path(__file__).with_name("results") / "step_loop.json"
 MOST_RATIO = 1.05
 TOKENS, WIDTH, LAYERS, BATCH, SAMPLES = 48, 128, 4, 8, 4096
 KEYS = ("tokens", "actions")
@@ -198,12 +195,12 @@ def summarise(taken: dict[str, list[float]]) -> dict[str, object]:
 
 def main() -> int:
     """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=21)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--only", choices=list(CASES), help="one case")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("torch", "fluxvla-ddp", "fluxvla-fsdp")
     found: dict[str, object] = {}
     for name, (kind, ranks) in CASES.items():
         if args.only and name != args.only:
@@ -221,19 +218,14 @@ def main() -> int:
         )
         print(f"    ratio {summary['ratio']} (processor time {summary['cpu_ratio']})")
     result = {
+        **begun,
         "what": "median time of a train runner's step over that of a hand-written torch loop",
         "goal_ratio": MOST_RATIO,
         "cases": found,
         "rounds": args.rounds,
         "steps_a_round": args.steps,
-        "load_average": os.getloadavg()[0],
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
-        "python": platform.python_version(),
-        "torch": torch.__version__,
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=1) + "\n")
-    print(f"written to {args.out}")
+    _results.keep(args.out, result, show=False)
     return 0
 
 

@@ -1,6 +1,6 @@
 """How long after each fault the arm rests, as somebody on the other side of DDS sees it.
 
-    python benchmarks/time_to_hold.py [--rounds 5] [--only WORDS]
+    python -m benchmarks.time_to_hold [--rounds 5] [--only WORDS]
 
 The real runner moves an arm of three joints over ROS 2; the faults are provoked for real
 (``_robot_fault_list``). The time is from the fault to the receipt, in another process, of the first
@@ -11,22 +11,16 @@ Loopback only. Writes ``benchmarks/results/time_to_hold.json``, which docs/safet
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import platform
 import statistics
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+from benchmarks import _results
 from benchmarks._robot_fault_list import FAULTS
 from benchmarks._robot_faults import Fault, Result, play, stage_crew
-
-RESULTS = Path(__file__).with_name("results") / "time_to_hold.json"
 
 
 def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:
@@ -43,11 +37,11 @@ def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:
 
 def main() -> int:
     """Measure, print and write; 1 if a fault was not named as it should be."""
-    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", default="", help="measure these again, keep the others")
-    parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
+    begun = _results.head("rclpy")
     faults = [fault for fault in FAULTS if args.only in fault.name]
     results: dict[str, list[Result]] = {fault.name: [] for fault in faults}
     wrong = []
@@ -66,14 +60,12 @@ def main() -> int:
         kept = json.loads(args.out.read_text(encoding="utf-8"))["faults"]
         found = {**kept, **found}
     summary = {
+        **begun,
         "what": "from a fault to the receipt of the command at which the arm rests",
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
         "rounds": args.rounds,
         "faults": found,
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    _results.keep(args.out, summary, show=False)
     if wrong:
         print(f"not as expected: {', '.join(wrong)}", file=sys.stderr)
     return 1 if wrong else 0

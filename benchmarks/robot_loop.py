@@ -3,7 +3,7 @@
     python -m benchmarks.robot_loop [--seconds 60] [--rounds 1] [--minutes 10]
 
 A driver process publishes three 640x480 rgb8 cameras at 30 Hz and two joint states at 100 Hz; a
-torch policy of 10 M parameters thinks all the time, on one core; commands go out at 50 Hz. The two
+torch policy of 10 M parameters thinks all the time, on one core; commands go out at 50 Hz. The
 sides take turns, each in a process of its own:
 
 * ``fluxvla``: ``AlohaInferenceRunner`` with ``async_execution`` and every safety rule.
@@ -11,6 +11,9 @@ sides take turns, each in a process of its own:
   (written anew for this): callbacks append raw messages to queues of 2000, the loop pops and
   converts what it needs, infers, and sends the chunk's commands itself. Before it starts it waits
   as they wait at their prompt for a task (``--prompt`` seconds), while the queues fill.
+
+* ``bare``: nothing but a loop that wakes at 50 Hz with a real-time priority, where it may have one,
+  while the cameras send: what this machine gives to anybody.
 
 Jitter is how far the time between two commands is from 20 ms, at the sender; late is a command more
 than 2 ms behind its deadline (upstream: behind the one before it). Memory is what the process has
@@ -46,6 +49,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
 from fluxvla_core.build import RunContext
+from fluxvla_core.control import priority
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
 from fluxvla_core.testing.ros2_driver import Driver
@@ -93,6 +97,14 @@ class TenMillion:
         return chunk
 
 
+def warm_policy() -> TenMillion:
+    """One whose libraries have what they want."""
+    policy = TenMillion()
+    for _ in range(3):
+        policy.predict_action({"images": {n: np.zeros((480, 640, 3), np.uint8) for n in range(3)}})
+    return policy
+
+
 class Memory:
     """This process's resident memory, looked at twice a second."""
 
@@ -138,7 +150,7 @@ def drive() -> Driver:
     return Driver(streams, sinks, environment={**os.environ, **profile})
 
 
-def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[str, Any]:
+def timings(sent: list[float], late: list[float]) -> dict[str, Any]:
     """Milliseconds of jitter, share of late commands."""
     jitter = np.abs(np.diff(sent) - 1 / RATE_HZ) * 1e3
     return {
@@ -147,6 +159,13 @@ def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[st
         "jitter_p99_ms": round(float(np.quantile(jitter, 0.99)), 3),
         "jitter_max_ms": round(float(jitter.max()), 1),
         "late_share": round(float(np.mean(np.array(late) > LATE_S)), 5),
+    }
+
+
+def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[str, Any]:
+    """Of a side that has a policy."""
+    return {
+        **timings(sent, late),
         "policy_p50_ms": round(statistics.median(policy.seconds) * 1e3, 1),
         "parameters": policy.parameters,
     }
@@ -155,7 +174,7 @@ def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[st
 def fluxvla(seconds: float, prompt: float) -> dict[str, Any]:
     # A starved machine may silence everybody for a while; that is not measured here.
     robot = AlohaOperator(max_age_s=10.0, max_skew_s=5.0, connect_timeout_s=60.0)
-    policy, sent = TenMillion(), []
+    policy, sent = warm_policy(), []
     copies = copies_per_frame(robot)
     publish = robot.publish_action
 
@@ -209,7 +228,7 @@ def upstream(seconds: float, prompt: float) -> dict[str, Any]:
     from rclpy.signals import SignalHandlerOptions
     from sensor_msgs.msg import Image, JointState
 
-    policy = TenMillion()
+    policy = warm_policy()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("upstream")
     topics = [(t, Image) for t in COBOT_MAGIC.images] + [
@@ -251,6 +270,19 @@ def upstream(seconds: float, prompt: float) -> dict[str, Any]:
     return {**figures(sent, late, policy), **found}
 
 
+def bare(seconds: float, prompt: float) -> dict[str, Any]:
+    """A loop that does nothing; ``late_share`` and jitter as the others have them."""
+    woke, late = [], []
+    with priority.first():
+        due = time.monotonic()
+        for _ in range(round(seconds * RATE_HZ)):
+            due += 1 / RATE_HZ
+            time.sleep(max(0.0, due - time.monotonic()))
+            woke.append(time.monotonic())
+            late.append(woke[-1] - due)
+    return timings(woke, late)
+
+
 def _to(queue: deque[Any]) -> Callable[[Any], None]:
     # rclpy asks for the callback's signature, which a built-in method has not.
     return lambda message: queue.append(message)
@@ -280,6 +312,7 @@ def popped(queues: dict[str, deque[Any]]) -> dict[str, Any] | None:
 SIDES: dict[str, Callable[[float, float], dict[str, Any]]] = {
     "fluxvla": fluxvla,
     "upstream": upstream,
+    "bare": bare,
 }
 
 
@@ -319,7 +352,7 @@ def main() -> int:
     parser = _results.options(__file__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--prompt", type=float, default=8.0, help="seconds before upstream starts")
+    parser.add_argument("--prompt", type=float, default=20.0, help="seconds before upstream starts")
     parser.add_argument("--minutes", type=float, default=0.0, help="of our side alone, for memory")
     parser.add_argument("--side", choices=SIDES, help=argparse.SUPPRESS)
     args = parser.parse_args()

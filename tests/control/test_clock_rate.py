@@ -166,3 +166,44 @@ def test_an_operators_own_clock_is_used_and_means_lockstep_unless_it_says_otherw
     assert not in_lockstep(MonotonicClock())
     Own.lockstep = False
     assert not in_lockstep(Robot.clock)
+
+
+def test_what_takes_a_while_is_made_ready_before_its_deadline():
+    clock = Stepped()
+    rate = Rate(50, clock, lead_s=0.002)
+    sent = []
+    for work in (0.0, 0.0005, 0.0015):
+        rate.wait()
+        sent.append(clock.now())
+        rate.sleep()
+        clock.time += work
+    rate.wait()
+
+    assert sent == pytest.approx([100.0, 100.02, 100.04])
+    assert clock.slept == pytest.approx([100.018, 100.02, 100.038, 100.04, 100.058, 100.06])
+    assert rate.late_s == 0.0
+
+
+def test_what_is_not_ready_in_time_is_late_by_what_it_took_longer():
+    clock = Stepped()
+    rate = Rate(50, clock, lead_s=0.002)
+    rate.wait()
+    rate.sleep()
+    clock.time += 0.005
+
+    assert rate.wait() == pytest.approx(0.003)
+    assert rate.sleep() == 0.0
+    assert rate.late_s == pytest.approx(0.003), "the wake for the next one was in time"
+
+
+def test_a_simulation_is_not_waited_for_before_a_command_either():
+    rate = Rate(50, SimulatedClock())
+    rate.sleep()
+
+    assert rate.wait() == 0.0
+
+
+@pytest.mark.parametrize("lead_s", [-0.001, 0.02])
+def test_a_lead_is_shorter_than_a_period(lead_s):
+    with pytest.raises(ValueError, match="a lead must be shorter than a period"):
+        Rate(50, lead_s=lead_s)

@@ -53,7 +53,7 @@ def checkpoint(tmp_path, monkeypatch):
     monkeypatch.setenv("WALKING_MODEL", "1")
     load_plugin_files([WALKING])
     from fluxvla_core.build import build_vla_from_cfg
-    from fluxvla_core.train.writer import CheckpointWriter
+    from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     embodiment = sys.modules["fluxvla_plugin_walking"].embodiment
     row = {"mean": [0.0], "std": [1.0], "min": [-3.0], "max": [3.0], "q01": [-3.0], "q99": [3.0]}

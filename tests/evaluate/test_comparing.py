@@ -114,7 +114,7 @@ def test_places_without_an_evaluation_are_refused(tmp_path):
 
 
 def test_a_checkpoint_stands_for_its_work_dir_if_it_was_the_one(tmp_path):
-    from fluxvla_core.train.manifest import hash_file
+    from fluxvla_core.checkpoints.manifest import hash_file
 
     folder = tmp_path / "checkpoints" / "step-000000100"
     folder.mkdir(parents=True)

@@ -73,7 +73,7 @@ def save(
     work_dir: Path, step: int = 100, gain: float = 2.0, ema: float | None = None, **changes: Any
 ) -> Path:
     """A checkpoint as training writes it."""
-    from fluxvla_core.train.writer import CheckpointWriter
+    from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     row = {"mean": MEAN, "std": STD, "min": [-1, -3], "max": [1, 3], "q01": [-1, -3], "q99": [1, 3]}
     dataset = {
@@ -296,7 +296,7 @@ def test_weights_of_another_model_and_damaged_files_are_refused(tmp_path):
     (path / "dataset_statistics.json").write_text("{}")
     with pytest.raises(CheckpointError, match=r"dataset_statistics.json is damaged"):
         load(path)
-    from fluxvla_core.train.writer import CheckpointWriter
+    from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     with CheckpointWriter(tmp_path, 400, 1) as writer:
         for name in ("config.resolved.json", "embodiment.json", "policy.json", "trainer.json"):

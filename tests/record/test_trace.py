@@ -15,11 +15,14 @@ from fluxvla_core.record.trace import EpisodeTrace, next_folder, slug
 def test_lines_come_in_order_with_arrays_as_lists(tmp_path):
     trace = EpisodeTrace(tmp_path / "e", None)
     for step in range(3):
-        trace.write({"step": step, "command": np.array([0.5, step]), "late": np.float64(0.25)})
+        chunk = np.arange(4.0).reshape(2, 2) + step
+        event = {"step": step, "command": np.array([0.5, step]), "late": np.float64(0.25)}
+        trace.write({**event, "chunk": chunk})
     trace.close({"outcome": "done"})
 
     lines = (tmp_path / "e" / "trace.jsonl").read_text().splitlines()
     assert [json.loads(line)["command"] for line in lines] == [[0.5, 0], [0.5, 1], [0.5, 2]]
+    assert json.loads(lines[2])["chunk"] == [[2.0, 3.0], [4.0, 5.0]]
     assert json.loads((tmp_path / "e" / "episode.json").read_text()) == {
         "outcome": "done",
         "dropped": {"frames": 0, "pictures": 0, "events": 0},

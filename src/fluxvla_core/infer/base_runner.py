@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from fluxvla_core.build import (
 )
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.optional import can_continue
+from fluxvla_core.control import priority
 from fluxvla_core.control.filters import SnapGripper, bind_filters
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.joiners import make_joiner
@@ -259,7 +261,8 @@ class BaseInferenceRunner:
                 hooks.call("run_started")
                 source.open()
                 self.robot.connect()
-                result = self._session.run()
+                with nullcontext() if self.robot.lockstep else priority.first():
+                    result = self._session.run()
                 ended = "ok"
             except Interrupted as signal:
                 ended = "interrupted"
@@ -296,6 +299,7 @@ class BaseInferenceRunner:
     def _execute_actions(self, actions: Array, rate: Any) -> None:
         """Send ``(N, D)`` commands that are within all limits, one at each beat of ``rate``."""
         for action in actions:
+            rate.wait()
             self.robot.send(action)
             rate.sleep()
 

@@ -33,6 +33,8 @@ from fluxvla_core.safety.stops import BadChunk, BadFrame
 from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
 
 Array = npt.NDArray[np.float64]
+# How long before its deadline a command is made ready, in seconds and as a share of the period.
+_LEAD_S, _LEAD_SHARE = 0.002, 0.1
 # After these the arm no longer obeys, or nobody knows whether it does: it is not commanded on.
 _NOT_BRAKED = ("operator", "tracking", "execute")
 
@@ -58,7 +60,8 @@ class Episode:
         self._seed = plan.seed + number
         self._folder = folder
         embodiment, settings = plan.robot.embodiment, plan.settings
-        self._rate = Rate(plan.rate_hz, plan.robot.clock)
+        lead_s = min(_LEAD_S, _LEAD_SHARE / plan.rate_hz)
+        self._rate = Rate(plan.rate_hz, plan.robot.clock, lead_s=lead_s)
         self._limiter = Limiter(
             embodiment,
             self._rate.period,

@@ -48,6 +48,13 @@ class Log(Protocol):
         """Finish the file."""
 
 
+def _json(value: Any) -> str:
+    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        return "[" + ", ".join(map(_json, value)) + "]"
+    return json.dumps(value, default=ros.plain)
+
+
 class JsonLines:
     """``trace.jsonl`` in ``folder``. It holds no pictures."""
 
@@ -55,7 +62,8 @@ class JsonLines:
         self._file = (folder / LINES).open("w", encoding="utf-8")
 
     def add(self, event: Mapping[str, Any]) -> None:
-        self._file.write(json.dumps(event, default=ros.plain) + "\n")
+        fields = (f"{json.dumps(key)}: {_json(value)}" for key, value in event.items())
+        self._file.write("{" + ", ".join(fields) + "}\n")
 
     def picture(
         self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True

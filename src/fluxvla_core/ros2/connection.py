@@ -18,6 +18,7 @@ from typing import Any
 
 from fluxvla_core.errors import ConfigError, Faulted
 from fluxvla_core.ros2 import qos
+from fluxvla_core.ros2.memory import keep_large_blocks
 from fluxvla_core.ros2.require import require_rclpy
 from fluxvla_core.ros2.stream import Stream
 
@@ -42,6 +43,7 @@ class Connection:
     def __init__(self, name: str, domain_id: int | None = None) -> None:
         rclpy = require_rclpy()
         _check_domain(domain_id)
+        keep_large_blocks()
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions

@@ -1,0 +1,80 @@
+"""Whoever sends commands goes first while a robot is driven, and is as before afterwards."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from fluxvla_core.control import priority
+
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="scheduling as Linux has it")
+
+
+def state():
+    return sys.getswitchinterval(), gc.get_freeze_count(), os.sched_getscheduler(0)
+
+
+def inside(code: str) -> list[str]:
+    """What a process prints; its whole surroundings are its own."""
+    begin = "import os, sys, gc; from fluxvla_core.control import priority\n"
+    done = subprocess.run([sys.executable, "-c", begin + code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+@on_linux
+def test_everything_is_as_before_afterwards_also_after_an_error():
+    before = state()
+
+    def fail() -> None:
+        with priority.first():
+            assert sys.getswitchinterval() == pytest.approx(priority.SWITCH_S)
+            assert gc.get_freeze_count() > 0
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert state() == before
+
+
+@on_linux
+def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has_not():
+    seen = []
+    with priority.first() as real_time:
+        mine = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        thread = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))
+        thread.start()
+        thread.join()
+        child = inside("print(os.sched_getscheduler(0))")
+
+    assert mine == (os.SCHED_FIFO if real_time else os.SCHED_OTHER)
+    assert seen == [os.SCHED_OTHER]
+    assert child == [str(os.SCHED_OTHER)]
+
+
+@on_linux
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs a right to be given up")
+def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
+    printed = inside(
+        "import resource; resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0)); os.setuid(65534)\n"
+        "with priority.first() as real_time: print(real_time, os.sched_getscheduler(0))"
+    )
+
+    assert printed == ["False", str(os.SCHED_OTHER)]
+
+
+@on_linux
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs the right to raise it")
+def test_a_priority_that_somebody_chose_is_kept():
+    printed = inside(
+        "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(7))\n"
+        "with priority.first() as changed: print(changed, os.sched_getparam(0).sched_priority)\n"
+        "print(os.sched_getscheduler(0) == os.SCHED_RR)"
+    )
+
+    assert printed == ["False", "7", "True"]

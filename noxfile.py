@@ -30,7 +30,12 @@ nox.options.default_venv_backend = "none"
 
 EXTRAS = "data,train,report"
 TESTED_EXTRAS = f"{EXTRAS},record,lora,tensorboard,trackio,wandb"
-SIMULATORS = {"fluxvla-libero": "libero", "fluxvla-metaworld": "metaworld"}
+# Extras of plugins that some Pythons and platforms cannot have: their tests are skipped there.
+OPTIONAL = {
+    "fluxvla-deepspeed": "deepspeed",
+    "fluxvla-libero": "libero",
+    "fluxvla-metaworld": "metaworld",
+}
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow"]
 ALONE = ["-m", "realtime and not slow"]
@@ -120,13 +125,13 @@ def dev_env(session: nox.Session) -> envs.Env:
     dists = project.distributions(ROOT)
     pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
     needs = nox.project.dependency_groups(pyproject, "dev")
-    simulators = {extra: optional(dists, dist, extra) for dist, extra in SIMULATORS.items()}
+    extras = {extra: requirements_of(dists, dist, extra) for dist, extra in OPTIONAL.items()}
 
     def install(changed: list[str], fresh: bool) -> None:
         words: list[str] = []
         for dist in (d for d in dists if d.name in changed):
-            extras = f"[{TESTED_EXTRAS}]" if dist.path == ROOT else ""
-            words += ["-e", f"{dist.path}{extras}"]
+            tested = f"[{TESTED_EXTRAS}]" if dist.path == ROOT else ""
+            words += ["-e", f"{dist.path}{tested}"]
         session.log(f"installing in editable mode: {', '.join(changed)}")
         env.pip_install("--no-build-isolation", *words, constraints=project.CONSTRAINTS)
         add_model_files(env)
@@ -137,10 +142,13 @@ def dev_env(session: nox.Session) -> envs.Env:
     def base() -> None:
         install_base(session, env, needs)
         install_ros2(session, env, pyproject["project"]["optional-dependencies"]["ros2"])
-        for simulator, requirements in simulators.items():
-            install_simulator(session, env, simulator, requirements)
+        for extra, requirements in extras.items():
+            install_optional(session, env, extra, requirements)
+        # Robosuite asks for the OpenCV with windows; it lies in the files of the headless one,
+        # which the core brings, and needs a desktop's libraries to be imported.
+        env.run("python", "-m", "pip", "uninstall", "--yes", "--quiet", "opencv-python")
 
-    env.filled(base_of((*needs, *sum(simulators.values(), ()))), parts, base, install)
+    env.filled(base_of((*needs, *sum(extras.values(), ()))), parts, base, install)
     return env
 
 
@@ -204,24 +212,20 @@ def install_ros2(session: nox.Session, env: envs.Env, requirements: list[str]) -
         session.warn(f"no ROS 2 for this Python and platform, its tests are skipped: {error}")
 
 
-def optional(dists: list[project.Distribution], dist: str, extra: str) -> tuple[str, ...]:
+def requirements_of(dists: list[project.Distribution], dist: str, extra: str) -> tuple[str, ...]:
     (path,) = (d.path for d in dists if d.name == dist)
     found = nox.project.load_toml(path / "pyproject.toml")
     return tuple(found["project"]["optional-dependencies"][extra])
 
 
-def install_simulator(
+def install_optional(
     session: nox.Session, env: envs.Env, name: str, requirements: tuple[str, ...]
 ) -> None:
-    """One that some Pythons and platforms cannot have: its tests are skipped there."""
-    session.log(f"installing the simulator {name}")
+    session.log(f"installing {name}")
     try:
         env.pip_install(*requirements, constraints=project.CONSTRAINTS)
     except shell.StepFailed as error:
         session.warn(f"no {name} for this Python and platform, its tests are skipped: {error}")
-    # Robosuite asks for the OpenCV with windows; it lies in the files of the headless one, which
-    # the core brings, and needs a desktop's libraries to be imported.
-    env.run("python", "-m", "pip", "uninstall", "--yes", "--quiet", "opencv-python")
 
 
 def make_renderable(session: nox.Session, env: envs.Env) -> None:

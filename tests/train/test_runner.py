@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,67 +10,23 @@ import numpy as np
 import pytest
 import torch
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints import disk
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, UsageError
+from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed
 from fluxvla_core.plugins.registry import HOOKS
 from fluxvla_core.testing.training import (
     KEYS,
     TinyDataset,
-    checkpoint_differences,
-    differences,
     tiny_config,
     unflushed,
 )
+from tests.train.runs import Said, make, run
 
 
 @pytest.fixture(autouse=True)
 def _fast():
     with unflushed():
         yield
-
-
-class Said(SilentReporter):
-    def __init__(self):
-        self.lines, self.steps, self.artifacts = [], [], []
-
-    def info(self, text):
-        self.lines.append(text)
-
-    def warn(self, text):
-        self.lines.append(f"warning: {text}")
-
-    def progress(self, name, done, total, **fields):
-        self.steps.append((name, done, total, fields))
-
-    def artifact(self, kind, path):
-        self.artifacts.append((kind, path.name))
-
-
-def make(work_dir, resume=None, batch=4, model=None, reporter=None, hooks=None, **settings):
-    table = {"type": "OneProcessRunner", **settings}
-    if "max_epochs" not in settings:
-        table.setdefault("max_steps", 6)
-    config = tiny_config(table, batch, **(model or {}))
-    if hooks:
-        config["hooks"] = hooks
-    context = RunContext(
-        config=config,
-        section="runner",
-        work_dir=Path(work_dir),
-        resume=resume,
-        reporter=reporter or Said(),
-    )
-    return build_runner_from_cfg(config["runner"], context)
-
-
-def run(work_dir, resume=None, length=37, **settings):
-    runner = make(work_dir, resume, **settings)
-    runner.run_setup(length)
-    runner.run(TinyDataset(length))
-    return runner
 
 
 def test_a_run_ends_with_a_checkpoint_that_is_enough_by_itself(tmp_path):
@@ -152,115 +106,6 @@ def test_epochs_can_save_by_steps_too_and_only_the_newest_are_kept(tmp_path):
     ]
 
 
-def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
-    run(tmp_path)
-    with pytest.raises(UsageError) as caught:
-        make(tmp_path).run_setup(37)
-    assert str(caught.value) == (
-        f"{tmp_path} already has checkpoints, up to step-000000006\n"
-        "  next: go on from there with --resume auto, or name another --work-dir"
-    )
-    run(tmp_path / "other")
-    with pytest.raises(UsageError, match="already has checkpoints"):
-        make(tmp_path, resume=str(tmp_path / "other/checkpoints/step-000000006")).run_setup(37)
-
-
-def test_auto_starts_afresh_and_says_so(tmp_path):
-    said = Said()
-    run(tmp_path, resume="auto", reporter=said)
-    assert said.lines == [f"no checkpoint in {tmp_path} yet: training starts afresh"]
-
-
-def test_a_path_must_exist(tmp_path):
-    with pytest.raises(CheckpointError, match="there is no checkpoint at"):
-        make(tmp_path, resume=str(tmp_path / "checkpoints/step-000000003")).run_setup(37)
-
-
-def test_a_finished_run_has_nothing_left_to_do(tmp_path):
-    run(tmp_path)
-    before = latest(tmp_path).manifest
-    run(tmp_path, resume="auto")
-    assert latest(tmp_path).manifest == before
-    assert len(folders(tmp_path)) == 1
-
-
-def test_more_steps_go_on_from_the_end_as_if_they_had_been_asked_for(tmp_path):
-    run(tmp_path / "whole", max_steps=9, save_iter_interval=6)
-    run(tmp_path / "twice", save_iter_interval=6)
-    run(tmp_path / "twice", resume="auto", max_steps=9, save_iter_interval=6)
-    # The configs differ in max_steps, and nothing else does.
-    assert differences(tmp_path / "whole", tmp_path / "twice") == [
-        "step-000000006/config.resolved.json"
-    ]
-
-
-def test_resume_from_in_the_config_and_the_command_line_before_it(tmp_path):
-    run(tmp_path, save_iter_interval=2, max_keep_ckpts=0)
-    said = Said()
-    here = f"{tmp_path}/checkpoints/step-00000000"
-    make(tmp_path, reporter=said, resume_from=f"{here}4").run_setup(37)
-    assert said.lines == [
-        "warning: a later checkpoint is set aside as step-000000006.set-aside",
-        f"resuming from {here}4 (step 4)",
-    ]
-    said = Said()
-    make(tmp_path, f"{here}2", reporter=said, resume_from=f"{here}4").run_setup(37)
-    assert said.lines[-1] == f"resuming from {here}2 (step 2)"
-
-
-def test_a_damaged_newest_one_is_named_and_passed_over_by_auto_and_refused_by_path(tmp_path):
-    run(tmp_path / "whole", save_iter_interval=2, max_keep_ckpts=0)
-    run(tmp_path / "hurt", save_iter_interval=2, max_keep_ckpts=0)
-    newest = folders(tmp_path / "hurt")[-1]
-    data = bytearray((newest / "model.safetensors").read_bytes())
-    data[-1] ^= 1
-    (newest / "model.safetensors").write_bytes(data)
-    with pytest.raises(CheckpointError) as caught:
-        make(tmp_path / "hurt", resume=str(newest)).run_setup(37)
-    assert "model.safetensors is damaged" in str(caught.value)
-    assert f"the one before it is whole: {folders(tmp_path / 'hurt')[-2]}" in str(caught.value)
-    said = Said()
-    run(tmp_path / "hurt", resume="auto", reporter=said, save_iter_interval=2, max_keep_ckpts=0)
-    assert said.lines[0].startswith(
-        f"warning: not resuming from a damaged checkpoint: {newest}: model.safetensors is damaged"
-    )
-    assert differences(tmp_path / "whole", tmp_path / "hurt") == []
-
-
-def test_when_all_are_damaged_nothing_starts_afresh(tmp_path):
-    run(tmp_path)
-    (folders(tmp_path)[0] / "policy.json").write_text("{}")
-    with pytest.raises(CheckpointError, match=r"policy\.json is damaged"):
-        make(tmp_path, resume="auto").run_setup(37)
-
-
-def resume_error(tmp_path, length=37, **settings):
-    run(tmp_path, max_steps=2)
-    with pytest.raises(CheckpointError) as caught:
-        run(tmp_path, resume="auto", length=length, **settings)
-    assert caught.value.exit_code == 2
-    return str(caught.value)
-
-
-def test_another_models_checkpoint_is_refused(tmp_path):
-    """T3, T8 of the field notes: wrong weights and optimizer states resumed with a warning."""
-    message = resume_error(tmp_path, model={"width": 16})
-    assert "the weights of the checkpoint are not this model's" in message
-    assert "of another size: blocks.0.linear.bias: (8,) in the checkpoint, (16,) here" in message
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"seed": 7}, "the seed is 7, the checkpoint's run had 42"),
-        ({"length": 38}, "the number of samples in the dataset is 38, the checkpoint's run had 37"),
-        ({"ema_decay": 0.9}, "ema_decay is set, and the checkpoint's run kept no averaged"),
-    ],
-)
-def test_another_runs_checkpoint_is_refused(tmp_path, settings, message):
-    assert message in resume_error(tmp_path, **settings)
-
-
 def test_a_few_episodes_at_a_time(tmp_path):
     """The loop sees them, and a resumed run cannot change how many."""
     seen = []
@@ -295,42 +140,6 @@ def test_an_optimizer_that_is_not_taken_is_an_error(tmp_path, monkeypatch):
     runner.run_setup(37)
     with pytest.raises(CheckpointError, match="OneProcessRunner did not take the checkpoint's opt"):
         runner.run(TinyDataset())
-
-
-def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):
-    said = Said()
-    run(tmp_path, max_steps=2)
-    runner = run(tmp_path, resume="auto", reporter=said, batch=8, max_steps=3)
-    assert said.lines[-1] == (
-        "warning: steps use 8 samples now and 4 in the checkpoint's run: the order of samples "
-        "stays, the result will differ"
-    )
-    assert runner.progress.cursor.samples == 2 * 4 + 8
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_saves_and_the_run_goes_on_exactly(tmp_path, number):
-    """O3 of the field notes: no SIGTERM handling."""
-
-    class Interrupting(TinyDataset):
-        def get_sample(self, index, epoch):
-            self.asked = getattr(self, "asked", 0) + 1
-            if self.asked == 4 * 3:
-                os.kill(os.getpid(), number)
-            return super().get_sample(index, epoch)
-
-    run(tmp_path / "whole", max_keep_ckpts=0)
-    runner = make(tmp_path / "cut", max_keep_ckpts=0)
-    runner.run_setup(37)
-    with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else RunFailed) as caught:
-        runner.run(Interrupting())
-    assert f"step 3 in {tmp_path}/cut" in str(caught.value)
-    assert [p.name for p in folders(tmp_path / "cut")] == ["step-000000003"]
-    run(tmp_path / "cut", resume="auto", max_keep_ckpts=0)
-    assert [p.name for p in folders(tmp_path / "cut")] == ["step-000000003", "step-000000006"]
-    ends = [folders(tmp_path / name)[-1] for name in ("whole", "cut")]
-    assert checkpoint_differences(*ends) == []
-    assert "metrics.jsonl" not in differences(tmp_path / "whole", tmp_path / "cut")
 
 
 def test_a_nan_names_its_sample_and_spoils_no_checkpoint(tmp_path):

@@ -7,6 +7,7 @@ torch policy of 10 M parameters thinks all the time, on one core; commands go ou
 sides take turns, each in a process of its own:
 
 * ``fluxvla``: ``AlohaInferenceRunner`` with ``async_execution`` and every safety rule.
+* ``recording``: the same with ``--record``: everything into a bag, pictures too.
 * ``upstream``: the same policy and topics, driven as FluxVLA's ROS 1 operators and runners do it
   (written anew for this): callbacks append raw messages to queues of 2000, the loop pops and
   converts what it needs, infers, and sends the chunk's commands itself. Before it starts it waits
@@ -37,6 +38,7 @@ import time
 import tracemalloc
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from benchmarks import _results
 from fluxvla_core.build import RunContext
 from fluxvla_core.control import priority
+from fluxvla_core.record.recording import open_recording
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
 from fluxvla_core.testing.ros2_driver import Driver
@@ -171,7 +174,7 @@ def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[st
     }
 
 
-def fluxvla(seconds: float, prompt: float) -> dict[str, Any]:
+def fluxvla(seconds: float, prompt: float, record: bool = False) -> dict[str, Any]:
     # A starved machine may silence everybody for a while; that is not measured here.
     robot = AlohaOperator(max_age_s=10.0, max_skew_s=5.0, connect_timeout_s=60.0)
     policy, sent = warm_policy(), []
@@ -194,12 +197,13 @@ def fluxvla(seconds: float, prompt: float) -> dict[str, Any]:
             max_publish_step=round(seconds * RATE_HZ),
             safety={"max_age_s": 10.0, "max_skew_s": 5.0, "starvation_s": 120.0},
             record_fps=None,
+            record=folder if record else None,
         )
         runner.run_setup()
         runner.run()
-        (trace,) = Path(folder).glob("inference/*/trace.jsonl")
-        rows = [json.loads(line) for line in trace.read_text().splitlines()]
-    late = [r["ms"]["late"] / 1e3 for r in rows if r["event"] == "command" and r["phase"] == "run"]
+        (summary,) = Path(folder).rglob("episode.json")
+        rows = open_recording(summary.parent).of("command")
+    late = [r["ms"]["late"] / 1e3 for r in rows if r["phase"] == "run"]
     return {**figures(sent[: len(late)], late, policy), "copies": copies, **memory.summary()}
 
 
@@ -311,6 +315,7 @@ def popped(queues: dict[str, deque[Any]]) -> dict[str, Any] | None:
 
 SIDES: dict[str, Callable[[float, float], dict[str, Any]]] = {
     "fluxvla": fluxvla,
+    "recording": partial(fluxvla, record=True),
     "upstream": upstream,
     "bare": bare,
 }

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.checkpoints.checkpoint import folders, latest
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -19,6 +19,7 @@ from fluxvla_core.testing.training import (
     unflushed,
 )
 from fluxvla_core.train import lora
+from fluxvla_core.train.export import export
 from fluxvla_core.train.lora import LoraOptions
 from fluxvla_core.train.weights import load_for_inference, start_from
 
@@ -124,6 +125,23 @@ def test_peft_reads_the_adapter_and_agrees_with_the_merged_model(tmp_path, base)
     theirs = PeftModel.from_pretrained(plain, str(found.path / "adapter"))
     assert loss_of(merged) == pytest.approx(loss_of(theirs), rel=1e-5)
     assert abs(loss_of(merged) - before) > 1e-4
+
+
+@pytest.mark.parametrize("ema", [None, 0.5])
+def test_an_export_has_the_adapter_merged_and_needs_no_base(tmp_path, base, ema):
+    moved = tmp_path / "base"
+    shutil.copytree(base, moved)
+    run(tmp_path / "run", init_from=str(moved), lora=LORA, ema_decay=ema)
+    acts, alone = TinyVLA(), TinyVLA()
+    load_for_inference(acts, latest(tmp_path / "run"))
+    exported = export(tmp_path / "run", tmp_path / "policy")
+    shutil.rmtree(moved)
+    shutil.rmtree(tmp_path / "run")
+
+    load_for_inference(alone, Checkpoint.open(exported))
+    assert not (exported / "adapter").exists()
+    for name, tensor in acts.state_dict().items():
+        assert torch.equal(alone.state_dict()[name], tensor), name
 
 
 def test_averaged_adapters_act(tmp_path, base):

@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
 from itertools import islice
+from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -110,3 +115,40 @@ def test_an_error_of_the_collator_arrives_too(workers):
 def test_negative_workers_are_refused():
     with pytest.raises(ConfigError, match="per_device_num_workers must be at least 0, got -1"):
         make_loader(Noisy(), collate, EpochSampler(4, 2), -1)
+
+
+TRAINER = """
+import multiprocessing, sys, time
+import numpy as np
+from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.sampler import EpochSampler
+
+class Numbers:
+    def get_sample(self, index, epoch):
+        return {"x": np.int64(index)}
+
+if __name__ == "__main__":
+    loader = make_loader(
+        Numbers(), DictCollator(["x"]), EpochSampler(10, 2), 2, multiprocessing_context=sys.argv[1]
+    )
+    batches = iter(loader)
+    next(batches)
+    print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("context", ["fork", "forkserver", "spawn"])
+def test_workers_end_with_a_trainer_that_is_killed(tmp_path, context):
+    script = tmp_path / "trainer.py"
+    script.write_text(TRAINER)
+    with subprocess.Popen([sys.executable, str(script), context], stdout=PIPE) as trainer:
+        workers = [Path("/proc", pid) for pid in trainer.stdout.readline().decode().split()]
+        assert len(workers) == 2
+        trainer.kill()
+    until = time.monotonic() + 120
+    while any(worker.exists() for worker in workers):
+        assert time.monotonic() < until, "a worker is still there"
+        time.sleep(0.05)

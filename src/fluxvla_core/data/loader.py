@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import wait
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
@@ -68,11 +72,28 @@ def make_loader(
         pin_memory=pin_memory,
         prefetch_factor=prefetch_factor if num_workers else None,
         multiprocessing_context=multiprocessing_context if num_workers else None,
+        worker_init_fn=_end_with_trainer if num_workers else None,
         # The loader draws a base seed for its workers; from the global generator that draw
         # would make a resumed run differ from an uninterrupted one.
         generator=torch.Generator().manual_seed(0),
     )
     return Loader(inner, sampler)
+
+
+def _end_with_trainer(worker: int) -> None:
+    """End a worker whose trainer was killed.
+
+    torch's own watch looks at the parent process. With ``forkserver``, Python 3.14's default, that
+    is the server, which in turn lives as long as its children: they would stay for good.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "runs in a worker"
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, name="fluxvla-trainer-watch", daemon=True).start()
 
 
 class _Failed:

@@ -5,7 +5,7 @@ Hardware", arXiv 2304.13705, sections IV and appendix C) in the size that LeRobo
 default; ``_act_agreement.py`` compares both with equal weights. What is faster here than there
 leaves loss and gradients as they are:
 
-- frozen batch norms are part of their convolutions' weights, and pictures lie channels last;
+- frozen batch norms are part of their convolutions' weights;
 - attention gives no weights back;
 - of the last layer of the action encoder only the one token that is used goes on;
 - actions beyond an episode's end, which neither the action encoder's attention nor the loss sees,
@@ -69,12 +69,11 @@ class ResNet18(nn.Module):
         shapes = [(64, 64, 1), (64, 64, 1), (64, 128, 2), (128, 128, 1)]
         shapes += [(128, 256, 2), (256, 256, 1), (256, 512, 2), (512, 512, 1)]
         self.blocks = nn.Sequential(*(BasicBlock(*shape) for shape in shapes))
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, x: Tensor) -> Tensor:
         """``(B, 3, H, W)`` -> ``(B, 512, H / 32, W / 32)``."""
-        x = F.relu_(self.stem(x.contiguous(memory_format=torch.channels_last)))
-        out: Tensor = self.blocks(F.max_pool2d(x, 3, 2, 1))
+        x = F.max_pool2d(F.relu_(self.stem(x)), 3, 2, 1)
+        out: Tensor = self.blocks(x)
         return out
 
 

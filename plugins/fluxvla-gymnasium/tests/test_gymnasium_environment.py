@@ -15,6 +15,7 @@ from fluxvla_gymnasium.success import is_done
 
 from fluxvla_core.build import RunContext, build_environment_from_cfg, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
+from fluxvla_core.testing import EnvironmentConformance
 
 needs_mujoco = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
 needs_aloha = pytest.mark.skipif(
@@ -52,6 +53,13 @@ def reacher(**arguments):
         "max_steps": 20,
         **arguments,
     }
+
+
+@needs_mujoco
+class TestGymnasiumEnvironment(EnvironmentConformance):
+    entry_point = "GymnasiumEnvironment"
+    arguments = {key: value for key, value in reacher().items() if key != "type"}  # noqa: RUF012
+    picture = None
 
 
 @needs_mujoco

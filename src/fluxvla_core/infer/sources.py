@@ -152,7 +152,10 @@ class Topic(TaskSource):
 
         self._connection = Connection("fluxvla_tasks", self._domain_id)
         self._string = message_class("std_msgs.msg:String")
-        self._status = self._connection.publisher(f"{self.topic}/status", self._string, depth=10)
+        # Latched: that tasks are waited for is said once, perhaps before anybody is found.
+        self._status = self._connection.publisher(
+            f"{self.topic}/status", self._string, depth=10, latched=True
+        )
         self._connection.node.create_subscription(
             self._string, self.topic, self._hear, qos.profile(qos.RELIABLE, 10)
         )

@@ -90,11 +90,17 @@ class Connection:
         return stream
 
     def publisher(
-        self, topic: str, message: Any, reliability: str = qos.RELIABLE, depth: int = 1
+        self,
+        topic: str,
+        message: Any,
+        reliability: str = qos.RELIABLE,
+        depth: int = 1,
+        latched: bool = False,
     ) -> Any:
         """A publisher; as it stands fit for commands: RELIABLE matches every subscription, and a
-        command that was overtaken by a newer one must never be sent again."""
-        return self.node.create_publisher(message, topic, qos.profile(reliability, depth))
+        command that was overtaken by a newer one must never be sent again. What is ``latched`` is
+        also told to those who ask for it when they come later."""
+        return self.node.create_publisher(message, topic, qos.profile(reliability, depth, latched))
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
         """Call back from the ROS thread, on the steady clock (wall clocks get stepped)."""

@@ -37,8 +37,9 @@ OPTIONAL = {
     "fluxvla-metaworld": "metaworld",
 }
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
-PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow"]
-ALONE = ["-m", "realtime and not slow"]
+SLOWEST = "--durations=15"
+PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow", SLOWEST]
+ALONE = ["-m", "realtime and not slow", SLOWEST]
 
 
 @nox.session

@@ -209,6 +209,7 @@ class Result:
         exit_code: of the program.
         record: ``episode.json``, None where there was no episode.
         commands: what the listener received, ``(N, 3)``.
+        provoked: whether the fault was there; a machine that stalls may stop the arm before.
     """
 
     hold_s: float | None
@@ -217,6 +218,7 @@ class Result:
     exit_code: int
     record: dict[str, Any] | None
     commands: Array
+    provoked: bool
 
 
 @contextmanager
@@ -256,13 +258,12 @@ def play(stage: Stage, fault: Fault) -> Result:
             the run was over.
     """
     began: list[float] = []
+    over = threading.Event()
 
     def provoke() -> None:
-        until = time.monotonic() + 60
         while len(stage.commands()) < MOVING:
-            if time.monotonic() > until:
+            if over.wait(0.005):
                 return
-            time.sleep(0.005)
         began.append(time.monotonic())
         fault.provoke(stage)
 
@@ -285,6 +286,7 @@ def play(stage: Stage, fault: Fault) -> Result:
         said, code = str(error), 130
     finally:
         ended = time.monotonic()
+        over.set()
         if thread.ident is not None:
             thread.join(60)
         for driver in stage.more:
@@ -301,7 +303,8 @@ def play(stage: Stage, fault: Fault) -> Result:
         strangers = [h["at"] for h in stage.ear.on(COMMAND) if tuple(h["name"]) != NAMES]
         fell_ill = min(strangers, default=stage.policy.spoiled or began[0])
         hold = max(commands[-_resting(positions)][0] - fell_ill, 0.0)
-    return Result(hold, said, ended - start, code, _record(stage.folder), positions)
+    provoked = fault.outcome == REFUSED or bool(began)
+    return Result(hold, said, ended - start, code, _record(stage.folder), positions, provoked)
 
 
 def _settled(stage: Stage) -> list[tuple[float, list[float]]]:

@@ -201,10 +201,11 @@ def fluxvla(seconds: float, prompt: float, record: bool = False) -> dict[str, An
         )
         runner.run_setup()
         runner.run()
+        used = memory.summary()
         (summary,) = Path(folder).rglob("episode.json")
         rows = open_recording(summary.parent).of("command")
     late = [r["ms"]["late"] / 1e3 for r in rows if r["phase"] == "run"]
-    return {**figures(sent[: len(late)], late, policy), "copies": copies, **memory.summary()}
+    return {**figures(sent[: len(late)], late, policy), "copies": copies, **used}
 
 
 def copies_per_frame(robot: AlohaOperator) -> float:

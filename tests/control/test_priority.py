@@ -78,3 +78,18 @@ def test_a_priority_that_somebody_chose_is_kept():
     )
 
     assert printed == ["False", "7", "True"]
+
+
+@on_linux
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs the right to raise it")
+def test_the_second_comes_right_behind_the_first():
+    printed = inside(
+        "import threading\n"
+        "seen = []\n"
+        "def work(): seen.append((priority.second(), os.sched_getparam(0).sched_priority))\n"
+        "with priority.first():\n"
+        "    thread = threading.Thread(target=work); thread.start(); thread.join()\n"
+        "    print(*seen[0], os.sched_getparam(0).sched_priority)\n"
+    )
+
+    assert printed == ["True", "49", "50"]

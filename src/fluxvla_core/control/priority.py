@@ -6,9 +6,11 @@ Three things keep a Python thread from its deadline, and each has a means of its
   earlier (``sys.setswitchinterval``);
 * a full garbage collection, which stops all threads for as long as it takes to look at every
   object of every imported library (``gc.freeze`` takes those out);
-* other processes. Where the system allows it (``RLIMIT_RTPRIO``, or root), the thread gets a
-  real-time priority, as ros2_control's controller manager takes one; elsewhere nothing is changed.
-  The kernel's own limit on real-time threads (``sched_rt_runtime_us``) stays in force.
+* other processes, which may also stop a thread that has the interpreter just then. Where the system
+  allows it (``RLIMIT_RTPRIO``, or root), the thread gets a real-time priority, as ros2_control's
+  controller manager takes one, and one that takes the interpreter often for an instant comes next
+  (``second``); elsewhere nothing is changed. The kernel's own limit on real-time threads
+  (``sched_rt_runtime_us``) stays in force.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ def first() -> Iterator[bool]:
     sys.setswitchinterval(min(interval, SWITCH_S))
     gc.collect()
     gc.freeze()
-    before = _raise()
+    before = _raise(PRIORITY)
     try:
         yield before is not None
     finally:
@@ -44,7 +46,15 @@ def first() -> Iterator[bool]:
         sys.setswitchinterval(interval)
 
 
-def _raise() -> tuple[int, int] | None:
+def second() -> bool:
+    """Let the calling thread go right behind the first, for good; whether it may.
+
+    For one that never computes for long, such as one that only stores what arrives.
+    """
+    return _raise(PRIORITY - 1) is not None
+
+
+def _raise(priority: int) -> tuple[int, int] | None:
     """What the thread had before; None if nothing was changed."""
     if sys.platform != "linux":
         return None
@@ -52,7 +62,7 @@ def _raise() -> tuple[int, int] | None:
     if before[0] & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:
         return None  # somebody has seen to it already
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except PermissionError:
         return None
     return before

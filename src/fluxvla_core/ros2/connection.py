@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from fluxvla_core.control import priority
 from fluxvla_core.errors import ConfigError, Faulted
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.memory import keep_large_blocks
@@ -141,6 +142,8 @@ class Connection:
             callback()
 
     def _spin(self) -> None:
+        # Whoever sends commands waits for the interpreter while this thread has it.
+        priority.second()
         main = threading.main_thread()
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without

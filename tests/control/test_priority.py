@@ -12,7 +12,13 @@ import pytest
 
 from fluxvla_core.control import priority
 
-on_linux = pytest.mark.skipif(sys.platform != "linux", reason="scheduling as Linux has it")
+on_linux = pytest.mark.skipif(
+    sys.platform != "linux" or os.sched_getscheduler(0) != os.SCHED_OTHER,
+    reason="needs Linux, and a thread that is an ordinary one",
+)
+as_root = pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs root's right to scheduling"
+)
 
 
 def state():
@@ -58,7 +64,9 @@ def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has
 
 
 @on_linux
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs a right to be given up")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs a right to be given up"
+)
 def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
     printed = inside(
         "import resource; resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0)); os.setuid(65534)\n"
@@ -69,7 +77,29 @@ def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
 
 
 @on_linux
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs the right to raise it")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
+)
+def test_a_user_with_a_limit_gets_it_and_gives_it_back_again_and_again():
+    printed = inside(
+        "import resource\n"
+        "try: resource.setrlimit(resource.RLIMIT_RTPRIO, (50, 50))\n"
+        "except ValueError: sys.exit(print('refused'))\n"
+        "os.setuid(65534)\n"
+        "for _ in range(2):\n"
+        "    with priority.first() as real_time: print(real_time)\n"
+        "print((os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK) == os.SCHED_OTHER)"
+    )
+
+    if printed == ["refused"]:
+        pytest.skip("nobody may be given that limit here")
+    assert printed == ["True", "True", "True"]
+
+
+@on_linux
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
+)
 def test_a_priority_that_somebody_chose_is_kept():
     printed = inside(
         "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(7))\n"
@@ -81,7 +111,9 @@ def test_a_priority_that_somebody_chose_is_kept():
 
 
 @on_linux
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="needs the right to raise it")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
+)
 def test_the_second_comes_right_behind_the_first():
     printed = inside(
         "import threading\n"
@@ -93,3 +125,16 @@ def test_the_second_comes_right_behind_the_first():
     )
 
     assert printed == ["True", "49", "50"]
+
+
+@on_linux
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
+)
+def test_the_second_for_now_is_an_ordinary_one_afterwards():
+    printed = inside(
+        "with priority.second_for_now(): print(os.sched_getparam(0).sched_priority)\n"
+        "print(os.sched_getparam(0).sched_priority, os.sched_getscheduler(0) == os.SCHED_OTHER)"
+    )
+
+    assert printed == ["49", "0", "True"]

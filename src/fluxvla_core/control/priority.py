@@ -8,9 +8,9 @@ Three things keep a Python thread from its deadline, and each has a means of its
   object of every imported library (``gc.freeze`` takes those out);
 * other processes, which may also stop a thread that has the interpreter just then. Where the system
   allows it (``RLIMIT_RTPRIO``, or root), the thread gets a real-time priority, as ros2_control's
-  controller manager takes one, and one that takes the interpreter often for an instant comes next
-  (``second``); elsewhere nothing is changed. The kernel's own limit on real-time threads
-  (``sched_rt_runtime_us``) stays in force.
+  controller manager takes one, and those that take the interpreter often for an instant come next
+  (``second``, ``second_for_now``); elsewhere nothing is changed. The kernel's own limit on
+  real-time threads (``sched_rt_runtime_us``) stays in force.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ def first() -> Iterator[bool]:
     try:
         yield before is not None
     finally:
-        if before is not None:
-            os.sched_setscheduler(0, before[0], os.sched_param(before[1]))
+        _restore(before)
         gc.unfreeze()
         sys.setswitchinterval(interval)
 
@@ -52,6 +51,27 @@ def second() -> bool:
     For one that never computes for long, such as one that only stores what arrives.
     """
     return _raise(PRIORITY - 1) is not None
+
+
+@contextmanager
+def second_for_now() -> Iterator[None]:
+    """The same until the block ends, for the short part of a thread that else computes for long."""
+    before = _raise(PRIORITY - 1)
+    try:
+        yield
+    finally:
+        _restore(before)
+
+
+def _restore(before: tuple[int, int] | None) -> None:
+    if before is None:
+        return
+    policy, priority = before[0], os.sched_param(before[1])
+    try:
+        os.sched_setscheduler(0, policy, priority)
+    except PermissionError:
+        # Who is not root may lower a priority, but not take this mark away again (sched(7)).
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, priority)
 
 
 def _raise(priority: int) -> tuple[int, int] | None:

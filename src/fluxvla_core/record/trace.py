@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.control import priority
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.record.logs import Bag, JsonLines, Log
 from fluxvla_core.record.video import VideoWriter
@@ -198,7 +199,9 @@ class EpisodeTrace:
 
     def _put(self, item: Any) -> None:
         if not isinstance(item, tuple):
-            self._log.add(item)
+            # It has the interpreter meanwhile, and whoever sends commands may be waiting for it.
+            with priority.second_for_now():
+                self._log.add(item)
             return
         camera, stamp, image = item
         if stamp is None:

@@ -128,13 +128,14 @@ def test_the_second_comes_right_behind_the_first():
 
 
 @on_linux
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
-)
-def test_the_second_for_now_is_an_ordinary_one_afterwards():
+@as_root
+def test_the_second_is_an_ordinary_one_while_it_computes_for_long():
     printed = inside(
-        "with priority.second_for_now(): print(os.sched_getparam(0).sched_priority)\n"
-        "print(os.sched_getparam(0).sched_priority, os.sched_getscheduler(0) == os.SCHED_OTHER)"
+        "def show(): print(os.sched_getparam(0).sched_priority)\n"
+        "with priority.ordinary(): show()\n"
+        "priority.second(); show()\n"
+        "with priority.ordinary(): show()\n"
+        "show()"
     )
 
-    assert printed == ["49", "0", "True"]
+    assert printed == ["0", "49", "0", "49"]

@@ -9,7 +9,7 @@ Three things keep a Python thread from its deadline, and each has a means of its
 * other processes, which may also stop a thread that has the interpreter just then. Where the system
   allows it (``RLIMIT_RTPRIO``, or root), the thread gets a real-time priority, as ros2_control's
   controller manager takes one, and those that take the interpreter often for an instant come next
-  (``second``, ``second_for_now``); elsewhere nothing is changed. The kernel's own limit on
+  (``second``); elsewhere nothing is changed. The kernel's own limit on
   real-time threads (``sched_rt_runtime_us``) stays in force.
 """
 
@@ -54,13 +54,20 @@ def second() -> bool:
 
 
 @contextmanager
-def second_for_now() -> Iterator[None]:
-    """The same until the block ends, for the short part of a thread that else computes for long."""
-    before = _raise(PRIORITY - 1)
+def ordinary() -> Iterator[None]:
+    """Let a thread that goes second be an ordinary one while it computes for long."""
+    if sys.platform != "linux":
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    raised = before[0] & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER
+    if raised:
+        _restore((os.SCHED_OTHER, 0))
     try:
         yield
     finally:
-        _restore(before)
+        if raised:
+            _restore(before)
 
 
 def _restore(before: tuple[int, int] | None) -> None:

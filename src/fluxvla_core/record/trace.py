@@ -172,6 +172,8 @@ class EpisodeTrace:
         return JsonLines(self.folder)
 
     def _run(self) -> None:
+        # Whoever sends commands waits for the interpreter while this thread has it.
+        priority.second()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -185,6 +187,10 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
+        with priority.ordinary():
+            self._finish()
+
+    def _finish(self) -> None:
         self._guard(self._poll)
         self.dropped["pictures"] += sum(poll.missed for poll in self._polls.values())
         self._guard(self._log.close)
@@ -199,15 +205,14 @@ class EpisodeTrace:
 
     def _put(self, item: Any) -> None:
         if not isinstance(item, tuple):
-            # It has the interpreter meanwhile, and whoever sends commands may be waiting for it.
-            with priority.second_for_now():
-                self._log.add(item)
+            self._log.add(item)
             return
         camera, stamp, image = item
-        if stamp is None:
-            self._film(camera, image)
-        else:
-            self._log.picture(camera, stamp, image)
+        with priority.ordinary():
+            if stamp is None:
+                self._film(camera, image)
+            else:
+                self._log.picture(camera, stamp, image)
 
     def _film(self, camera: str, image: Picture) -> None:
         assert self.video_fps is not None
@@ -230,10 +235,14 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
+        with priority.ordinary():
+            self._poll_all(self._source)
+
+    def _poll_all(self, source: Source) -> None:
         for camera in self._cameras:
             poll = self._polls.setdefault(camera, _Poll(self._looked))
             try:
-                found, received = self._source(camera, poll.newest)
+                found, received = source(camera, poll.newest)
             except FluxError:
                 # The loop reads the same stream, and says what is wrong with it.
                 continue

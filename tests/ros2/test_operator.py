@@ -27,10 +27,25 @@ def lasting_robot(lasting_drivers):
     return lasting_drivers([STATE, PICTURES], [COMMANDS], name="robot")
 
 
+def settled(robot):
+    """The last test's operator held its arm when it was closed; that too has arrived."""
+    before = None
+    while len(robot.heard) != before:
+        before = len(robot.heard)
+        time.sleep(0.15)
+
+
+def commanded(arm, robot, action):
+    """Send a command, and wait until it is there: one that a newer overtakes never arrives."""
+    arm.send_action(action)
+    wait_for(lambda: robot.on("/arm/command"))
+
+
 @pytest.fixture
 def robot(lasting_robot):
     """A robot that is well, and has heard nothing yet."""
     lasting_robot.tell(reset=True)
+    settled(lasting_robot)
     lasting_robot.heard.clear()
     yield lasting_robot
     lasting_robot.tell(reset=True)
@@ -113,7 +128,7 @@ class TestCommanding:
         assert robot.on("/arm/command") == []
 
     def test_stop_repeats_the_last_command(self, arm, robot):
-        arm.send_action([0.15, 0.1, 0.3])
+        commanded(arm, robot, [0.15, 0.1, 0.3])
         arm.stop()
         wait_for(lambda: len(robot.on("/arm/command")) == 2)
 
@@ -127,14 +142,14 @@ class TestCommanding:
         assert robot.on("/arm/command") == []
 
     def test_stop_holds_a_blocked_joint_where_it_is(self, arm, robot):
-        arm.send_action([0.9, 0.2, 0.0])
+        commanded(arm, robot, [0.9, 0.2, 0.0])
         arm.stop()
         wait_for(lambda: len(robot.on("/arm/command")) == 2)
 
         assert robot.on("/arm/command")[-1]["position"] == [0.1, 0.2, 0.0]
 
     def test_stop_holds_the_last_command_when_the_state_is_gone(self, arm, robot):
-        arm.send_action([0.9, 0.2, 0.0])
+        commanded(arm, robot, [0.9, 0.2, 0.0])
         robot.tell(fault="/arm/state=drop")
         frame_error(arm, "arm (/arm/state) is silent")
         arm.stop()
@@ -143,7 +158,7 @@ class TestCommanding:
         assert robot.on("/arm/command")[-1]["position"] == [0.9, 0.2, 0.0]
 
     def test_the_hold_of_close_arrives(self, arm, robot):
-        arm.send_action([0.15, 0.1, 0.3])
+        commanded(arm, robot, [0.15, 0.1, 0.3])
         arm.close()
         wait_for(lambda: len(robot.on("/arm/command")) == 2)
 

@@ -201,9 +201,11 @@ class TestRobot:
     def test_trajectories_name_their_joints_and_say_when(self, connect, drivers):
         driver = drivers(*robot(SCALED))
         operator = connect(controller=SCALED, trajectory_time_s=1.25)
-        operator.send_action([*POSE, 1.0])
-        operator.stop()
         topic = CONTROLLERS[SCALED][0]
+        operator.send_action([*POSE, 1.0])
+        # One that a newer overtakes never arrives.
+        wait_for(lambda: driver.on(topic))
+        operator.stop()
         wait_for(lambda: len(driver.on(topic)) == 2)
 
         heard, held = driver.on(topic)
@@ -222,10 +224,9 @@ class TestWhatTheRobotSays:
         assert operator.speed_scaling == pytest.approx(0.2)
         wanted = np.array([*POSE, 0.5])
         wanted[0] += 1.0
-        for _ in range(3):
+        for number in (1, 2, 3):
             operator.send_action(wanted)
-            time.sleep(0.05)
-        wait_for(lambda: len(driver.on(COMMANDS)) == 3)
+            wait_for(lambda n=number: len(driver.on(COMMANDS)) == n)
 
         sent = [POSE[0], *(heard["data"][0] for heard in driver.on(COMMANDS))]
         limit = operator.embodiment.joints[0].velocity * 0.2 / operator.embodiment.rate_hz

@@ -225,8 +225,12 @@ ROBOT = [
     Fault("camera freezes", ill(f"{CAM}=freeze"), rf"^cam \({CAM}\) {SILENT}", rule="freshness"),
     Fault("camera falls silent", ill(f"{CAM}=drop"), rf"^cam \({CAM}\) {SILENT}", rule="freshness"),
     Fault("camera is late", ill(f"{CAM}=delay:0.7"), r"^cam .*is (late|silent)", rule="freshness"),
+    # Whichever rule is there first: the state is too old, or too old for its picture.
     Fault(
-        "joint states stop", ill(f"{STATE}=drop"), rf"arm \({STATE}\) {SILENT}", rule="freshness"
+        "joint states stop",
+        ill(f"{STATE}=drop"),
+        rf"arm \({STATE}\) {SILENT}|streams cam and state are .* apart",
+        rule="freshness",
     ),
     Fault(
         "joint states are NaN",

@@ -64,9 +64,7 @@ def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has
 
 
 @on_linux
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs a right to be given up"
-)
+@as_root
 def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
     printed = inside(
         "import resource; resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0)); os.setuid(65534)\n"
@@ -77,9 +75,7 @@ def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
 
 
 @on_linux
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
-)
+@as_root
 def test_a_user_with_a_limit_gets_it_and_gives_it_back_again_and_again():
     printed = inside(
         "import resource\n"
@@ -97,9 +93,7 @@ def test_a_user_with_a_limit_gets_it_and_gives_it_back_again_and_again():
 
 
 @on_linux
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
-)
+@as_root
 def test_a_priority_that_somebody_chose_is_kept():
     printed = inside(
         "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(7))\n"
@@ -111,9 +105,7 @@ def test_a_priority_that_somebody_chose_is_kept():
 
 
 @on_linux
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs the right to raise it"
-)
+@as_root
 def test_the_second_comes_right_behind_the_first():
     printed = inside(
         "import threading\n"

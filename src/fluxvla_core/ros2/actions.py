@@ -36,14 +36,17 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
     return values
 
 
-def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array) -> Array:
+def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, age_s: float) -> Array:
     """The command that holds an arm: the last one, but for joints that were kept from following.
 
-    Grippers keep their last command always: what they hold is why they are behind it.
+    Grippers keep their last command always: what they hold is why they are behind it. A joint may
+    have gone on since it was measured, at its limit at most; where it can be at its last command by
+    now it is not sent back to where it was.
 
     Args:
         last: ``(dim,)`` last command.
         state: ``(state_dim,)`` as measured.
+        age_s: how long ago that was, in seconds.
     """
     where = dict(zip(embodiment.state_names, state, strict=True))
     target = last.copy()
@@ -51,6 +54,6 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array) -> Array:
         measured = where.get(joint.name)
         if joint.kind == "gripper" or measured is None:
             continue
-        if abs(measured - last[index]) > HOLD_REACH:
+        if abs(measured - last[index]) > HOLD_REACH + joint.velocity * age_s:
             target[index] = min(max(measured, joint.lower), joint.upper)
     return target

@@ -181,9 +181,7 @@ class RosOperator(ABC):
             BadMessage: the joint states are not what the embodiment describes.
             Faulted: the connection broke.
         """
-        newest = self._fresh()
-        states = {spec.name: newest[spec.name].message for spec in self._specs_of(STATE)}
-        return self.read_state(states)
+        return self._measured()[0]
 
     def pictures_after(
         self, camera: str, after: float
@@ -398,11 +396,18 @@ class RosOperator(ABC):
 
     def _hold_target(self, last: Array) -> Array:
         try:
-            state = self.get_state()
+            state, receipt = self._measured()
         except FluxError:
             # Where the arm is, nobody knows; its last command is where it goes or stays.
             return last
-        return hold_target(self.embodiment, last, state)
+        return hold_target(self.embodiment, last, state, time.monotonic() - receipt)
+
+    def _measured(self) -> tuple[Array, float]:
+        """The newest ``(state_dim,)`` state, and the receipt of the oldest message in it."""
+        newest = self._fresh()
+        states = {spec.name: newest[spec.name] for spec in self._specs_of(STATE)}
+        state = self.read_state({name: found.message for name, found in states.items()})
+        return state, min(found.receipt for found in states.values())
 
     def _flush(self) -> None:
         from rclpy.duration import Duration

@@ -53,6 +53,16 @@ def test_an_arm_that_stays_behind_trips_after_a_while():
     assert "turn is 0.4 away from its command for 0.25 s; 0.3 are allowed" in str(caught.value)
 
 
+def test_an_old_state_does_not_say_that_the_arm_stays_behind():
+    watch = TrackingWatch(ARM, SETTINGS)
+    state = np.array([0.6, 0.5, 1.0])
+    for turn in np.linspace(0.9, 2.5, 50):
+        watch.check(np.array([turn, 0.5, 0.0]), state, 10.0)
+
+    with pytest.raises(SafetyStop, match=r"turn is 1\.9 away from its command for 0\.30 s"):
+        watch.check(np.array([2.5, 0.5, 0.0]), state, 10.3)
+
+
 def test_catching_up_in_between_begins_the_time_anew():
     watch = TrackingWatch(ARM, SETTINGS)
     command = np.array([1.0, 0.5, 0.0])

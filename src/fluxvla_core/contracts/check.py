@@ -33,6 +33,7 @@ _METHODS: Mapping[str, Mapping[str, int]] = {
 _OPTIONAL: Mapping[str, Mapping[str, int]] = {
     "operators": {
         "get_state": 0,
+        "state_stamp": 0,
         "task_done": 0,
         "task_success": 0,
         "begin_episode": 2,

@@ -36,6 +36,16 @@ class ReadsState(Protocol):
         """The newest ``(state_dim,)`` state. Called from the thread that sends commands."""
 
 
+class StampsState(Protocol):
+    """An operator that knows how old what ``get_state`` gives may be: its joint states arrive.
+
+    An arm whose joint states are old is not taken for one that does not follow.
+    """
+
+    def state_stamp(self) -> float:
+        """When the newest state arrived, in seconds on the operator's clock."""
+
+
 class KeepsPictures(Protocol):
     """An operator that keeps pictures for a while: recordings then have all that arrive."""
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.control.interrupt import Interrupted
 from fluxvla_core.control.loop import EpisodeOver, Loop, Seen
 from fluxvla_core.control.path import CommandPath, Sent
@@ -221,11 +221,13 @@ class Episode:
             raise BadFrame(error.what, cause="a stream that was there is gone") from error
         state = self._checked(window, frame)
         now, age = clock.now(), 0.0
+        stamp = now
         if frame is not None:
             age = max(self._gate.check(frame.stamps, plan.cameras, now), 0.0)
+            stamp = frame.stamps[STATE]
             seconds = {"receipt": age, **seconds}
         if plan.robot.follows:
-            self._tracking.check(last, state, now)
+            self._tracking.check(last, state, stamp)
         self._record.seen(state, window["images"], frame, seconds)
         observation = {**window, "task_description": self._task.instruction}
         return Seen(observation, now - age)
@@ -299,7 +301,7 @@ class Episode:
             raise problem
         plan.interrupts.check()
         if state is not None and sent is not None and plan.robot.follows:
-            self._tracking.check(sent.command, state, plan.robot.clock.now())
+            self._tracking.check(sent.command, state, plan.robot.state_stamp())
         if self._phase != "run" or sent is None:
             return
         record.steps += 1

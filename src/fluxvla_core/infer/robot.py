@@ -84,6 +84,11 @@ class Robot:
         read = getattr(self.operator, "get_state", None)
         return None if read is None else np.asarray(read(), dtype=np.float64)
 
+    def state_stamp(self) -> float:
+        """When that state arrived, where the operator can tell (``state_stamp``); else now."""
+        tell = getattr(self.operator, "state_stamp", None)
+        return self.clock.now() if tell is None else float(tell())
+
     def success(self) -> bool | None:
         """Whether the task is done as of now, where the operator can tell (``task_success``)."""
         tell = getattr(self.operator, "task_success", None)

@@ -183,6 +183,16 @@ class RosOperator(ABC):
         """
         return self._measured()[0]
 
+    def state_stamp(self) -> float:
+        """Receipt of the oldest message that :meth:`get_state` reads now, on the monotonic clock.
+
+        Raises:
+            NotReady: not connected.
+        """
+        streams = self._connected().streams
+        newest = [streams[spec.name].newest() for spec in self._specs_of(STATE)]
+        return min(received.receipt for received in newest if received is not None)
+
     def pictures_after(
         self, camera: str, after: float
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:

@@ -95,27 +95,30 @@ class TrackingWatch:
         """Begin anew: the arm is where its command is."""
         self._since[:] = np.inf
 
-    def check(self, command: Array, state: npt.ArrayLike, now: float) -> None:
+    def check(self, command: Array, state: npt.ArrayLike, measured: float) -> None:
         """Compare the last command with where the arm is.
+
+        An old state says nothing about the arm now: it is not behind for longer than it was
+        measured to be.
 
         Args:
             command: ``(dim,)`` as sent.
             state: ``(state_dim,)`` as measured.
-            now: seconds, when it was measured.
+            measured: when that was, in seconds.
 
         Raises:
             NotFollowing: a joint has been too far behind for too long.
         """
         error = np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
         behind = error > self._allowed
-        self._since = np.where(behind, np.minimum(self._since, now), np.inf)
-        late = np.flatnonzero(behind & (now - self._since >= self._time))
+        self._since = np.where(behind, np.minimum(self._since, measured), np.inf)
+        late = np.flatnonzero(behind & (measured - self._since >= self._time))
         if late.size:
             index = int(late[np.argmax(error[late])])
+            seconds = measured - self._since[index]
             raise NotFollowing(
                 f"{self._names[index]} is {error[index]:.3g} away from its command "
-                f"for {now - self._since[index]:.2f} s; {self._allowed[index]:.3g} are allowed "
-                f"for {self._time:g} s",
+                f"for {seconds:.2f} s; {self._allowed[index]:.3g} are allowed for {self._time:g} s",
                 cause="the arm is blocked, its drive is off, or somebody else commands it",
                 next="free the arm; safety.tracking_error sets what is allowed",
             )

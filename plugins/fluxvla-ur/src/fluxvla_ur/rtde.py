@@ -199,6 +199,16 @@ class URRTDEOperator:
         """
         return np.append(self._reading().joints, self._gripper_position()[1])
 
+    def state_stamp(self) -> float:
+        """When the older of arm's and gripper's newest reading arrived, on the monotonic clock.
+
+        Raises:
+            NotReady: not connected.
+            Stale: the controller or the gripper is silent.
+            Faulted: the gripper reports a fault.
+        """
+        return min(self._reading().receipt, self._gripper_position()[0])
+
     def get_frame(self) -> Frame:
         """State and the newest pictures, in fresh arrays, with their receipt stamps.
 

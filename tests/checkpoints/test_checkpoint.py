@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from fluxvla_core.checkpoints import checkpoint
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, newest_whole
 from fluxvla_core.checkpoints.manifest import read_manifest
 from fluxvla_core.checkpoints.writer import CheckpointWriter
@@ -100,6 +104,46 @@ def test_a_lost_and_a_cut_file_are_named(tmp_path):
     (other / "model.safetensors").write_bytes(b"short")
     with pytest.raises(CheckpointError, match=r"model\.safetensors is damaged: 5 bytes instead of"):
         Checkpoint.open(other).verify()
+
+
+def test_a_file_that_cannot_be_read_is_named_and_passed_over(tmp_path, monkeypatch):
+    """A failing disk (EIO) or another user's file must not end ``--resume auto``."""
+    first, second = write(tmp_path, 1), write(tmp_path, 2)
+    read = checkpoint.hash_file
+
+    def failing(path):
+        if path == second / "model.safetensors":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return read(path)
+
+    monkeypatch.setattr(checkpoint, "hash_file", failing)
+    assert not Checkpoint.open(second).is_whole()
+    found, (refused,) = newest_whole(tmp_path)
+    assert found.path == first
+    assert str(refused) == (
+        f"{second}: model.safetensors cannot be read: Input/output error\n"
+        "  likely cause: its permissions, or a disk or mount that fails\n"
+        f"  next: the one before it is whole: {first}"
+    )
+
+
+def test_a_folder_that_cannot_be_looked_into_is_passed_over(tmp_path, monkeypatch):
+    first, second = write(tmp_path, 1), write(tmp_path, 2)
+    look, read = Path.is_file, Path.read_bytes
+
+    def denied(operation):
+        def act(path):
+            if path.parent == second:
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return operation(path)
+
+        return act
+
+    monkeypatch.setattr(Path, "is_file", denied(look))
+    monkeypatch.setattr(Path, "read_bytes", denied(read))
+    found, (refused,) = newest_whole(tmp_path)
+    assert found.path == first
+    assert "manifest.json cannot be read" in refused.what
 
 
 def test_a_damaged_one_without_a_whole_one_before_offers_nothing(tmp_path):

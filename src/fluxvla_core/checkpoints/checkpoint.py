@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.checkpoints.manifest import Manifest, hash_file, read_manifest
+from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file, read_manifest
 from fluxvla_core.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ CONFIG = "config.resolved.json"
 ENVIRONMENT = "environment.json"
 PROCESSORS = "processors"
 
+_CHANGED = "it was changed, or the disk lost a part of it, after it was saved"
+_UNREADABLE = "its permissions, or a disk or mount that fails"
 _STEP = re.compile(r"step-(\d{9,})")
 
 
@@ -91,7 +93,7 @@ class Checkpoint:
             raise CheckpointError(
                 f"{path} is a file; a checkpoint is a folder like {FOLDER}/{step_name(100)}"
             )
-        if not (path / MANIFEST).exists() and (found := latest(path)) is not None:
+        if not _has_manifest(path) and (found := latest(path)) is not None:
             return found
         try:
             return cls(path, read_manifest(path))
@@ -113,29 +115,25 @@ class Checkpoint:
         """Compare every file with the manifest, reading all of them.
 
         Raises:
-            CheckpointError: names the first file that is missing, cut short or changed, and
-                offers the newest earlier checkpoint that is whole.
+            CheckpointError: names the first file that is missing, cut short, changed or cannot be
+                read, and offers the newest earlier checkpoint that is whole.
         """
-        problem = self._damage()
-        if problem:
+        damage = self._damage()
+        if damage is not None:
+            problem, cause = damage
             raise CheckpointError(
-                problem,
-                where=str(self.path),
-                cause="it was changed, or the disk lost a part of it, after it was saved",
-                next=_offer_previous(self.path),
+                problem, where=str(self.path), cause=cause, next=_offer_previous(self.path)
             )
 
-    def _damage(self) -> str | None:
+    def _damage(self) -> tuple[str, str] | None:
+        """What is wrong with the first file that is not whole, and its likely cause."""
         for name, entry in sorted(self.manifest.files.items()):
-            path = self.path / name
-            if not path.is_file():
-                return f"{name} is missing from the checkpoint"
-            size = path.stat().st_size
-            if size != entry.size:
-                return f"{name} is damaged: {size} bytes instead of {entry.size}"
-            found = hash_file(path)
-            if found != entry.sha256:
-                return f"{name} is damaged: SHA-256 {found[:12]}… instead of {entry.sha256[:12]}…"
+            try:
+                problem = _difference(self.path / name, entry)
+            except OSError as error:
+                return f"{name} cannot be read: {error.strerror or error}", _UNREADABLE
+            if problem:
+                return f"{name} is {problem}", _CHANGED
         return None
 
     def is_whole(self) -> bool:
@@ -213,6 +211,27 @@ class Checkpoint:
         return StoredTensors([self.path / name for name in names or [OPTIMIZER]])
 
 
+def _difference(path: Path, entry: FileEntry) -> str | None:
+    """How the file at ``path`` differs from its entry in the manifest."""
+    if not path.is_file():
+        return "missing from the checkpoint"
+    size = path.stat().st_size
+    if size != entry.size:
+        return f"damaged: {size} bytes instead of {entry.size}"
+    found = hash_file(path)
+    if found != entry.sha256:
+        return f"damaged: SHA-256 {found[:12]}… instead of {entry.sha256[:12]}…"
+    return None
+
+
+def _has_manifest(folder: Path) -> bool:
+    """Whether there is one; also if that cannot be seen, so that its reader says why."""
+    try:
+        return (folder / MANIFEST).is_file()
+    except OSError:
+        return True
+
+
 def folders(place: str | Path) -> list[Path]:
     """Checkpoint folders of a work dir (or of its checkpoints folder), oldest step first.
 
@@ -223,7 +242,7 @@ def folders(place: str | Path) -> list[Path]:
     if not root.is_dir():
         return []
     found = sorted((step, path) for path in root.iterdir() if (step := step_of(path)) is not None)
-    return [path for _, path in found if (path / MANIFEST).is_file()]
+    return [path for _, path in found if _has_manifest(path)]
 
 
 def latest(place: str | Path) -> Checkpoint | None:

@@ -41,7 +41,7 @@ def test_times_add_up_and_a_save_is_left_out():
     assert window.began > 2.0
 
 
-def test_without_clipping_there_is_no_norm():
+def test_a_strategy_that_tells_no_norm_has_none():
     window = Window(ONE)
     window.add(1, 0.0, 1e-3, [torch.tensor(1.0)], [None], None, 8, 0.0)
     assert window.fetch()[0].grad_norm is None

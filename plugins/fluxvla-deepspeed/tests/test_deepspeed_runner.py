@@ -10,9 +10,11 @@ import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.train_runner import TrainRunnerConformance
 from fluxvla_core.testing.training import (
+    TinyVLA,
     checkpoint_differences,
     run_ranks,
     tiny_config,
@@ -103,6 +105,42 @@ def test_checkpoints_go_to_one_process_and_back(runs, stage):
     ours, theirs = (folders(runs / d)[0] for d in (f"{stage}", "one"))
     names = [{p.relative_to(d).as_posix() for p in d.rglob("*")} for d in (ours, theirs)]
     assert names[0] - names[1] == {"rng/rank-00001.safetensors"}
+
+
+@VLAS.register_module()
+class SteepVLA(TinyVLA):
+    """From its third batch on the gradient is not finite, though the loss is."""
+
+    def forward(self, **batch):
+        output = super().forward(**batch)
+        floor = float(self.batches < 3)
+        return {"loss": output["loss"] + (floor + 0.0 * self.head.bias.sum()).sqrt()}
+
+
+def steep(work_dir):
+    """Without clipping, each stage over a gradient that is not finite."""
+    torch.distributed.init_process_group("gloo")
+    for stage in STAGES:
+        table = {"type": "DeepSpeedTrainRunner", "zero_stage": stage, "max_grad_norm": None}
+        tree = config(**table, grad_accumulation_steps=1, save_iter_interval=1)
+        tree["model"] = {**tree["model"], "type": "SteepVLA"}
+        try:
+            train({"config": tree, "work_dir": str(work_dir / f"{stage}")})
+        except RunFailed as error:
+            (work_dir / f"{stage}.{torch.distributed.get_rank()}").write_text(error.what)
+
+
+@installed
+def test_without_clipping_a_gradient_that_is_not_finite_ends_the_run(tmp_path):
+    assert run_ranks(2, steep, tmp_path) == [0, 0]
+    for stage in STAGES:
+        for rank in range(2):
+            said = (tmp_path / f"{stage}.{rank}").read_text()
+            assert said.startswith("the gradient norm is inf at step 3, with loss")
+        rows = [json.loads(line) for line in (tmp_path / f"{stage}/metrics.jsonl").open()]
+        assert [row["step"] for row in rows] == [1, 2]
+        assert all(row["grad_norm"] > 0 for row in rows)
+        assert [p.name for p in folders(tmp_path / f"{stage}")][-1] == "step-000000002"
 
 
 def build(work_dir, **settings):

@@ -280,8 +280,16 @@ class BaseTrainRunner(TrainRun):
         loss.backward()  # type: ignore[no-untyped-call]
 
     def _update(self) -> Tensor | None:
-        """Clip, and let the optimizer step; the gradients' norm before, on the device."""
+        """Clip, and let the optimizer step; the gradients' norm before, on the device.
+
+        Where ``clip_grad_norm`` tells none it is the norm of what the optimizer uses: gradients
+        that are not finite must not go unseen.
+        """
+        from fluxvla_core.train.optim import gradient_norm
+
         norm = self.clip_grad_norm()
+        if norm is None:
+            norm = gradient_norm(self._optimized())
         self.optimizer.step()
         return norm
 
@@ -289,13 +297,16 @@ class BaseTrainRunner(TrainRun):
         """Called with the first batch, before the first step; must leave no trace."""
 
     def clip_grad_norm(self) -> Tensor | None:
-        """Scale the gradients down to ``max_grad_norm``; their norm before, on the device."""
+        """Scale the gradients down to ``max_grad_norm``; their norm before, on the device.
+
+        None says nothing of the norm, as where there is no ``max_grad_norm``.
+        """
         from fluxvla_core.train.optim import clip_
 
-        if self.max_grad_norm is None:
-            return None
-        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        return clip_(parameters, self.max_grad_norm)
+        return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
+
+    def _optimized(self) -> list[nn.Parameter]:
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
 
     def save_checkpoint(
         self,

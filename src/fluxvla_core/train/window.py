@@ -22,7 +22,7 @@ from fluxvla_core.train.distributed import World, texts, total
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One step over all ranks: mean loss, gradient norm (None without clipping), and times.
+    """One step over all ranks: mean loss, gradient norm (None if untold), and times.
 
     ``by_dataset`` is the mean loss of the samples of each dataset that the step used.
 

@@ -90,12 +90,13 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         self.vla.backward(loss, scale_wrt_gas=False)
 
     def _update(self) -> Tensor | None:
-        """Let the engine clip and step; the gradients' norm before clipping."""
+        """Let the engine clip and step; the gradients' norm before clipping.
+
+        The engine has it with and without clipping, and leaves out a step whose norm is not finite.
+        """
         import torch
 
         self.vla.step()
-        if self.max_grad_norm is None:
-            return None
         return torch.as_tensor(self.vla.get_global_grad_norm(), device=self.world.device).float()
 
     def _trained(self) -> dict[str, nn.Parameter]:

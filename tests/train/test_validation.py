@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import random
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import (
     Notes,
     TinyDataset,
@@ -105,6 +108,24 @@ def test_looking_changes_nothing(tmp_path):
     assert set(checkpoint_differences(*ends)) == {
         f"{ends[0].name}/{name}" for name in ("config.resolved.json", "trainer.json")
     }
+
+
+@VLAS.register_module()
+class NoisyVLA(TinyVLA):
+    """Draws noise in its forward pass, in training and in validation."""
+
+    def forward(self, **batch):
+        found = super().forward(**batch)
+        return {"loss": found["loss"] + torch.randn(()) * 0.1 + random.random() + np.random.rand()}
+
+
+def test_what_the_model_draws_is_the_same_every_time(tmp_path):
+    """Unchanged weights give an unchanged loss, however much the training has drawn by then."""
+    settings = {"val_iter_interval": 2, "learning_rate": 1e-12, "model": {"type": "NoisyVLA"}}
+    run(tmp_path, **settings)
+    found = list(losses(tmp_path).values())
+    assert len(found) == 4
+    assert max(found) - min(found) < 1e-6
 
 
 def test_without_an_interval_it_is_measured_with_every_checkpoint(tmp_path):

@@ -14,7 +14,7 @@ from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.train.distributed import total
 from fluxvla_core.train.forward import to_device
-from fluxvla_core.train.state import rng_state, set_rng_state
+from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state
 
 if TYPE_CHECKING:
     from fluxvla_core.train.strategy import Strategy
@@ -25,7 +25,8 @@ class Validation:
 
     Its samples are those of epoch 0 in their order: the same ones, with the same noise, every
     time. They are normalised by the statistics of the training data. The ranks share them; as in
-    training, the last batch is filled up with the first samples.
+    training, the last batch is filled up with the first samples. What the model itself draws is
+    the same every time too: it follows from the run's seed and the rank.
     """
 
     def __init__(self, run: Strategy) -> None:
@@ -60,6 +61,7 @@ class Validation:
             RunFailed: it is not finite.
         """
         drawn = rng_state()
+        seed_all(rank_seed(run.options.seed, run.world.rank))
         run.vla.eval()
         with run.ema.in_place() if run.ema is not None else nullcontext(), torch.no_grad():
             losses = [

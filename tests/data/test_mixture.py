@@ -18,6 +18,7 @@ from fluxvla_core.data.mixture import DistributedRepeatingDataset, first_dataset
 from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
+from fluxvla_core.train.state import seeds_of
 
 NOISE = {"type": "SampleFlowNoise"}
 NORMALISE = {"type": "NormalizeStatesAndActions"}
@@ -115,6 +116,21 @@ def test_a_sample_is_a_function_of_seed_epoch_and_index(shared, others):
     together = one.get_samples(keys(1)[::-1])
     for i, sample in zip(range(39, -1, -1), together, strict=True):
         np.testing.assert_array_equal(sample["noise"], one.get_sample(i, 1)["noise"])
+
+
+def test_a_runs_seed_reaches_those_that_have_none(shared, others):
+    def make(seed=None):
+        tables = (table(shared), {**table(others[0]), "seed": 5})
+        return mixture(*tables, weights=[1, 3], samples_per_epoch=40, seed=seed)
+
+    told, own = make(), make(1)
+    before = drawn(told, [0])
+    told.use_seed(7)
+    own.use_seed(7)
+    assert seeds_of(told) == [7, 7, 5]
+    assert seeds_of(own) == [1, 7, 5]
+    assert drawn(told, [0]) == drawn(make(7), [0]) != before
+    assert drawn(own, [0]) == drawn(make(1), [0])
 
 
 def test_no_two_samples_draw_the_same_noise(shared, others):

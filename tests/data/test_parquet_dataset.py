@@ -322,6 +322,15 @@ def test_everything_random_follows_from_seed_epoch_and_index(shared):
         assert not np.array_equal(other["states"], dataset.get_sample(3, 1)["states"])
 
 
+def test_without_a_seed_it_takes_the_runs(shared):
+    told, own = load(shared, TRANSFORMS), load(shared, TRANSFORMS, seed=42)
+    assert same(told[3], own[3])
+    told.use_seed(7)
+    own.use_seed(7)
+    assert same(told[3], load(shared, TRANSFORMS, seed=7)[3])
+    assert same(own[3], load(shared, TRANSFORMS)[3])
+
+
 def test_reading_many_at_once_gives_the_same(shared):
     dataset = load(shared, TRANSFORMS)
     keys = [SampleKey(1, i) for i in (20, 3, 27, 3, 0)]

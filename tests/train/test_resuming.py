@@ -133,6 +133,34 @@ def test_another_runs_checkpoint_is_refused(tmp_path, settings, message):
     assert message in resume_error(tmp_path, **settings)
 
 
+class Drawing(TinyDataset):
+    """Draws by a seed of its own, or by the run's."""
+
+    def __init__(self, seed=None):
+        super().__init__()
+        self.given = self.seed = seed
+
+    def use_seed(self, seed):
+        self.seed = seed if self.given is None else self.given
+
+
+def draw(work_dir, own, resume=None, **settings):
+    runner = make(work_dir, resume, **settings)
+    runner.run_setup(37)
+    dataset = Drawing(own)
+    runner.run(dataset)
+    return dataset.seed
+
+
+def test_a_dataset_draws_by_the_runs_seed_and_resumes_by_the_same(tmp_path):
+    assert draw(tmp_path, None, max_steps=2, seed=7) == 7
+    assert draw(tmp_path, None, "auto", max_steps=4, seed=7) == 7
+    assert draw(tmp_path, 7, "auto", max_steps=6, seed=7) == 7
+    with pytest.raises(CheckpointError) as caught:
+        draw(tmp_path, 3, "auto", max_steps=8, seed=7)
+    assert "the seed of the dataset is 3, the checkpoint's run had 7" in str(caught.value)
+
+
 def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):
     said = Said()
     run(tmp_path, max_steps=2)

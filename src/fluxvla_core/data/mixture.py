@@ -12,7 +12,7 @@ from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.data.agreement import check_alike
 from fluxvla_core.data.parquet_dataset import ParquetDataset, pooled_statistics
-from fluxvla_core.data.rng import mixture_rng
+from fluxvla_core.data.rng import DEFAULT_SEED, mixture_rng
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
@@ -40,7 +40,8 @@ class DistributedRepeatingDataset:
         weights: relative frequencies, one for each dataset in their order; by default their
             lengths, so that each sample is seen once an epoch.
         samples_per_epoch: by default as many as all datasets have.
-        seed: of which samples an epoch takes, where it does not take all.
+        seed: of which samples an epoch takes, where it does not take all; None takes the
+            training's (``runner.seed``), as do the datasets that set none.
         context: handed on to datasets that want it.
 
     Raises:
@@ -55,11 +56,12 @@ class DistributedRepeatingDataset:
         datasets: Any,
         weights: Sequence[float] | None = None,
         samples_per_epoch: int | None = None,
-        seed: int = 42,
+        seed: int | None = None,
         context: RunContext | None = None,
     ) -> None:
         self.datasets = _build(datasets, context)
-        self.seed = seed
+        self.seed = DEFAULT_SEED if seed is None else seed
+        self._own_seed = seed is not None
         self.lengths = np.array([len(d) for d in self.datasets], np.int64)
         total = int(self.lengths.sum()) if samples_per_epoch is None else samples_per_epoch
         self.shares = shares(total, self.lengths if weights is None else weights, len(self.lengths))
@@ -112,6 +114,14 @@ class DistributedRepeatingDataset:
     def tasks(self) -> tuple[str, ...]:
         """The instructions of all datasets."""
         return tuple(dict.fromkeys(t for d in self.datasets for t in getattr(d, "tasks", ())))
+
+    def use_seed(self, seed: int) -> None:
+        """Draw by the run's seed from now on, here and in every dataset, but for given ones."""
+        if not self._own_seed:
+            self.seed, self._drawn = seed, {}
+        for dataset in self.datasets:
+            if hasattr(dataset, "use_seed"):
+                dataset.use_seed(seed)
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Let every dataset decode what it keeps in memory."""

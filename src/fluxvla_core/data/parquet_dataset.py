@@ -15,7 +15,7 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data.agreement import check_alike, find_embodiment
 from fluxvla_core.data.frames import Frames
 from fluxvla_core.data.recording import load_recorded
-from fluxvla_core.data.rng import sample_rng
+from fluxvla_core.data.rng import DEFAULT_SEED, sample_rng
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.data.statistics import as_lists, column_statistics
 from fluxvla_core.data.windows import action_statistics, differences, window
@@ -57,7 +57,7 @@ class ParquetDataset:
         statistic_name: the key of :attr:`statistics`.
         embodiment_id: added to every sample as ``embodiment_ids``, int64, if given.
         cache_frames: decode everything once and keep it in memory as uint8.
-        seed: of everything random in a sample.
+        seed: of everything random in a sample; None takes the training's (``runner.seed``).
         episodes: the ones to use, for one dataset a list, for several one list each.
         processors: a checkpoint's ``processors`` folder.
         embodiment: the robot (a table as ``EmbodimentSpec.to_dict`` gives it, or the path of one
@@ -86,7 +86,7 @@ class ParquetDataset:
         statistic_name: str = "private",
         embodiment_id: int | None = None,
         cache_frames: bool = False,
-        seed: int = 42,
+        seed: int | None = None,
         episodes: Sequence[Any] | None = None,
         processors: str | None = None,
         embodiment: Mapping[str, Any] | str | None = None,
@@ -113,7 +113,8 @@ class ParquetDataset:
         self.per_step_statistics = per_step_statistics
         self.statistic_name = statistic_name
         self.embodiment_id = embodiment_id
-        self.seed = seed
+        self.seed = DEFAULT_SEED if seed is None else seed
+        self._own_seed = seed is not None
         self.relative = _relative(relative_actions, self)
         self._frames = Frames(self.recordings, cache_frames)
         self._ends = np.cumsum([len(r.rows) for r in self.recordings])
@@ -161,6 +162,11 @@ class ParquetDataset:
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
         """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""
         self.statistics = {self.statistic_name: dict(entry)}
+
+    def use_seed(self, seed: int) -> None:
+        """Draw by the run's seed from now on, unless the dataset was given one of its own."""
+        if not self._own_seed:
+            self.seed = seed
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""

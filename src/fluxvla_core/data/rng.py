@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+DEFAULT_SEED = 42
+"""Of datasets that have none and were told none by a run."""
 _SAMPLE, _ORDER, _MIXTURE = 1, 2, 3
 
 

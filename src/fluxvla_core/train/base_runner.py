@@ -72,7 +72,8 @@ class BaseTrainRunner(TrainRun):
         val_iter_interval: with a ``val_dataloader``: its loss every so many steps and at the end;
             None with every checkpoint. The best one by it is kept and called ``best``.
         early_stop_patience: end after so many validations in a row without a better one.
-        seed: initial weights, order of samples, and everything drawn.
+        seed: initial weights, order of samples, and everything drawn, also by datasets that set
+            no ``seed`` of their own.
         resume_from: ``auto`` or a checkpoint's path; the command line's ``--resume`` goes first.
         log_iter_interval: fetch losses, and look for NaN, every so many steps; every step is
             logged all the same.

@@ -17,6 +17,7 @@ from fluxvla_core.train.memory import GB, peak_bytes
 from fluxvla_core.train.optim import trainable
 from fluxvla_core.train.resuming import restore_rng
 from fluxvla_core.train.saver import Saver
+from fluxvla_core.train.state import take_seed
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
 from fluxvla_core.train.validation import Validation
@@ -30,6 +31,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     if not world.first:
         run.hooks = HookCaller(context)
     run.dataset = dataset
+    take_seed(dataset, options.seed)
     run.plan = run._plan(len(dataset), run._shards(dataset))
     run._saver = Saver(world, options.async_save, run.optimizer)
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from fluxvla_core.train.distributed import World, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
-from fluxvla_core.train.state import rank_seed, seed_all, set_rng_state
+from fluxvla_core.train.state import rank_seed, seed_all, seeds_of, set_rng_state
 from fluxvla_core.train.weights import LeftOut, check_model_tensors
 
 if TYPE_CHECKING:
@@ -86,8 +86,14 @@ def _refuse_existing(work_dir: Path) -> None:
         )
 
 
-def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str | None:
+def check_same_run(
+    saved: Mapping[str, Any], plan: StepPlan, seeds: Sequence[int | None], where: str
+) -> str | None:
     """Refuse to go on with other data or another seed; a changed batch or world only is said.
+
+    Args:
+        saved: ``trainer.json``.
+        seeds: what the dataset, and those it is made of, draw by.
 
     Returns:
         One line to warn with when steps will use other numbers of samples than before, or None.
@@ -95,14 +101,17 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
     Raises:
         CheckpointError: another seed or number of samples, under which the order would change.
     """
-    for key, ours, what in (
-        ("seed", plan.seed, "seed"),
-        ("n_train_examples", plan.length, "number of samples in the dataset"),
-        ("shuffle_episodes", plan.shards and plan.shards.together, "value of shuffle_episodes"),
+    together = plan.shards and plan.shards.together
+    theirs = saved.get("data_seeds", seeds)
+    for ours, before, what in (
+        (plan.seed, saved.get("seed"), "seed"),
+        (plan.length, saved.get("n_train_examples"), "number of samples in the dataset"),
+        (together, saved.get("shuffle_episodes"), "value of shuffle_episodes"),
+        (_listed(seeds), _listed(theirs), "seed of the dataset"),
     ):
-        if saved.get(key) != ours:
+        if before != ours:
             raise CheckpointError(
-                f"the {what} is {ours}, the checkpoint's run had {saved.get(key)}",
+                f"the {what} is {ours}, the checkpoint's run had {before}",
                 where=where,
                 cause="the rest of its epoch would be another one's",
                 next="set it back, or start a new run in another --work-dir",
@@ -118,6 +127,10 @@ def check_same_run(saved: Mapping[str, Any], plan: StepPlan, where: str) -> str 
             f"{saved['world_size']}: the order of samples stays, results agree only to rounding"
         )
     return None
+
+
+def _listed(seeds: Sequence[int | None]) -> str:
+    return ", ".join(map(str, seeds))
 
 
 def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
@@ -152,7 +165,7 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     where = str(checkpoint.path)
     saved = checkpoint.json(TRAINER)
     check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
-    warning = check_same_run(saved, run.plan, where)
+    warning = check_same_run(saved, run.plan, seeds_of(run.dataset), where)
     if warning and run.world.first:
         run.context.reporter.warn(warning)
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)

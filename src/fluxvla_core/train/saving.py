@@ -22,7 +22,7 @@ from fluxvla_core.train import lora
 from fluxvla_core.train.distributed import World, on_first, texts
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.saver import Saver
-from fluxvla_core.train.state import rng_state
+from fluxvla_core.train.state import rng_state, seeds_of
 from fluxvla_core.train.weights import LeftOut
 
 if TYPE_CHECKING:
@@ -172,6 +172,7 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
         "scheduler": run.lr_scheduler.state_dict(),
         "metric": run.metric.state_dict(),
         "seed": run.plan.seed,
+        "data_seeds": seeds_of(run.dataset),
         "n_train_examples": run.plan.length,
         "step_samples": run.plan.step_samples,
         "world_size": run.plan.world,

@@ -1,9 +1,9 @@
-"""The state of every random generator of a process, as tensors."""
+"""What a run draws by: its seed, and the state of every random generator of a process."""
 
 from __future__ import annotations
 
 import random
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,21 @@ def seed_all(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
+
+
+def take_seed(dataset: Any, seed: int) -> None:
+    """Let ``dataset`` draw by ``seed``, unless it has one of its own or knows of none."""
+    take = getattr(dataset, "use_seed", None)
+    if take is not None:
+        take(seed)
+
+
+def seeds_of(dataset: Any) -> list[int | None]:
+    """What ``dataset`` draws by, followed by the datasets that it is made of; None if untold."""
+    seed = getattr(dataset, "seed", None)
+    parts = getattr(dataset, "datasets", None)
+    below = [s for part in parts for s in seeds_of(part)] if isinstance(parts, list) else []
+    return [seed if isinstance(seed, int) else None, *below]
 
 
 def rank_seed(seed: int, rank: int, step: int = 0) -> int:

@@ -14,7 +14,7 @@ from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.train.distributed import total
 from fluxvla_core.train.forward import to_device
-from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state
+from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
 
 if TYPE_CHECKING:
     from fluxvla_core.train.strategy import Strategy
@@ -35,6 +35,7 @@ class Validation:
         table = run.context.config["val_dataloader"]["dataset"]
         self._dataset = build_dataset_from_cfg(table, run.context)
         share_statistics(run.dataset, self._dataset)
+        take_seed(self._dataset, run.options.seed)
         world = run.world
         sampler = EpochSampler(
             len(self._dataset),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from typing import ClassVar
 
 import pytest
 
@@ -159,6 +160,57 @@ def test_a_dataset_draws_by_the_runs_seed_and_resumes_by_the_same(tmp_path):
     with pytest.raises(CheckpointError) as caught:
         draw(tmp_path, 3, "auto", max_steps=8, seed=7)
     assert "the seed of the dataset is 3, the checkpoint's run had 7" in str(caught.value)
+
+
+def test_averages_are_not_dropped_without_a_word(tmp_path):
+    run(tmp_path, max_steps=2, ema_decay=0.9)
+    with pytest.raises(CheckpointError) as caught:
+        run(tmp_path, resume="auto")
+    assert str(caught.value) == (
+        f"{tmp_path}/checkpoints/step-000000002: ema_decay is not set, and the checkpoint's run "
+        "kept averaged weights, which act\n"
+        "  next: set it back: the checkpoint's config.resolved.json has its value; or begin "
+        "another run from these weights: init_from = '<this checkpoint>' and another --work-dir"
+    )
+
+
+class Rescaled(TinyDataset):
+    statistics: ClassVar = {"private": {"action": {"mean": [0.0] * 3, "std": [1.0, 1.0, 2.0]}}}
+
+
+def test_data_that_are_normalised_otherwise_are_refused(tmp_path):
+    run(tmp_path, max_steps=2)
+    runner = make(tmp_path, resume="auto")
+    runner.run_setup(37)
+    with pytest.raises(CheckpointError) as caught:
+        runner.run(Rescaled())
+    assert (
+        "the dataset's statistics are not those of the checkpoint's run: private.action.std\n"
+        in str(caught.value)
+    )
+
+
+def test_changed_settings_are_listed_once_and_what_changes_nothing_is_not(tmp_path):
+    run(tmp_path, max_steps=2, weight_decay=0.1)
+    said = Said()
+    run(
+        tmp_path,
+        resume="auto",
+        reporter=said,
+        learning_rate=2e-2,
+        optimizer={"type": "AdamW", "betas": [0.9, 0.95]},
+        model={"dropout": 0.3},
+        max_keep_ckpts=5,
+        log_iter_interval=3,
+    )
+    assert said.lines[1:] == [
+        "warning: other settings than those of the checkpoint's run:\n"
+        "    runner.learning_rate: 0.01 -> 0.02\n"
+        "    runner.weight_decay: 0.1 -> not set\n"
+        '    runner.optimizer.type: not set -> "AdamW"\n'
+        "    runner.optimizer.betas: not set -> [0.9, 0.95]\n"
+        "    model.dropout: not set -> 0.3"
+    ]
 
 
 def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):

@@ -19,6 +19,7 @@ from fluxvla_core.checkpoints.checkpoint import (
 from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, set_aside_later
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.train.batches import StepPlan
+from fluxvla_core.train.changes import changed_settings, changed_statistics, plain
 from fluxvla_core.train.distributed import World, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
 from fluxvla_core.train.progress import Progress
@@ -149,6 +150,58 @@ def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, whe
         )
 
 
+def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
+    """Refuse to go on without the averages that the checkpoint has, or with ones it has not.
+
+    Raises:
+        CheckpointError: says which.
+    """
+    if (decay is not None) == checkpoint.has(EMA):
+        return
+    if decay is not None:
+        what = "ema_decay is set, and the checkpoint's run kept no averaged weights"
+        back = "resume without ema_decay"
+    else:
+        what = "ema_decay is not set, and the checkpoint's run kept averaged weights, which act"
+        back = "set it back: the checkpoint's config.resolved.json has its value"
+    raise CheckpointError(
+        what,
+        where=str(checkpoint.path),
+        next=f"{back}; or begin another run from these weights: init_from = '<this checkpoint>' "
+        "and another --work-dir",
+    )
+
+
+def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
+    """Refuse to go on with data that are normalised by other numbers.
+
+    Raises:
+        CheckpointError: names the statistics that differ.
+    """
+    ours = plain(dict(getattr(dataset, "statistics", None) or {}))
+    changed = changed_statistics(checkpoint.statistics(), ours)
+    if changed:
+        named = ", ".join(changed[:6]) + (", …" if len(changed) > 6 else "")
+        raise CheckpointError(
+            f"the dataset's statistics are not those of the checkpoint's run: {named}",
+            where=str(checkpoint.path),
+            cause="other data, episodes or settings of the dataset: states and actions would now "
+            "mean something else to the model",
+            next="set the dataset back; or begin another run from these weights: init_from = "
+            "'<this checkpoint>' and another --work-dir",
+        )
+
+
+def _warnings(run: Strategy, checkpoint: Checkpoint, saved: Mapping[str, Any]) -> list[str]:
+    """What to say of settings that may change, and have."""
+    said = check_same_run(saved, run.plan, seeds_of(run.dataset), str(checkpoint.path))
+    context = run.context
+    changed = changed_settings(checkpoint.config(), context.config, context.section)
+    listed = [f"    {key}: {before} -> {now}" for key, (before, now) in changed.items()]
+    head = "other settings than those of the checkpoint's run:"
+    return (["\n".join([head, *listed])] if listed else []) + ([said] if said else [])
+
+
 def _shown(settings: Mapping[str, Any] | None) -> str:
     if settings is None:
         return "not set"
@@ -160,13 +213,16 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     """Put everything but the random generators back to where ``checkpoint`` was saved.
 
     Raises:
-        CheckpointError: it is of another model, optimizer, dataset, seed, or kept no averages.
+        CheckpointError: it is of another model, optimizer, dataset, seed or adapter, or one of
+            the two keeps averages.
     """
     where = str(checkpoint.path)
     saved = checkpoint.json(TRAINER)
     check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
-    warning = check_same_run(saved, run.plan, seeds_of(run.dataset), where)
-    if warning and run.world.first:
+    check_same_averages(run.options.ema_decay, checkpoint)
+    warnings = _warnings(run, checkpoint, saved)
+    check_same_statistics(run.dataset, checkpoint)
+    for warning in warnings if run.world.first else ():
         run.context.reporter.warn(warning)
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
     check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
@@ -178,12 +234,6 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
         )
     run.lr_scheduler.load_state_dict(saved["scheduler"])
     if run.ema is not None:
-        if not checkpoint.has(EMA):
-            raise CheckpointError(
-                "ema_decay is set, and the checkpoint's run kept no averaged weights",
-                where=where,
-                next="resume without ema_decay, or start a new run in another --work-dir",
-            )
         run.ema.load(checkpoint.tensors(EMA), where)
     run.metric.load_state_dict(saved["metric"])
     run.progress = Progress.from_dict(saved)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.resolved import environment
 from fluxvla_core.train import lora
+from fluxvla_core.train.changes import plain
 from fluxvla_core.train.distributed import World, on_first, texts
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.saver import Saver
@@ -202,8 +202,7 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
     rate = getattr(dataset, "fps", None)
     config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
     documents: dict[str, dict[str, Any]] = {
-        # A config made in Python may hold objects; they are described rather than lost.
-        ckpt.CONFIG: json.loads(json.dumps(config, default=repr)),
+        ckpt.CONFIG: plain(config),
         ckpt.ENVIRONMENT: environment(),
         ckpt.POLICY: {
             "action_rate_hz": None if rate is None else float(rate),

@@ -68,6 +68,22 @@ def test_an_exception_is_retried_once_and_then_reported_with_its_traceback(tmp_p
     assert found[2].result == "fine done"
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_process_that_raised_gets_no_more_jobs(tmp_path, processes):
+    """What broke in it would break every later job."""
+    jobs = ["breaksonce", "fine-1", "breaksonce-2", "fine-2", "fine-3"]
+    found = outcomes(workers.Recorder(str(tmp_path)), jobs, processes)
+    assert [o.error for o in found] == [None] * 5
+    assert [o.attempts for o in found] == [2, 1, 2, 1, 1]
+
+
+def test_any_number_of_jobs_may_raise(tmp_path):
+    """A process that raised was not one that could not be started."""
+    jobs = [f"raise-{n}" for n in range(4)]
+    found = outcomes(workers.Recorder(str(tmp_path)), jobs, 1)
+    assert [o.attempts for o in found] == [2] * 4
+
+
 def test_a_failure_of_the_run_is_an_error_of_its_job_alone(tmp_path):
     found = outcomes(workers.Recorder(str(tmp_path)), ["runfailed", "fine"])
     assert found[0].error == "the renderer is gone\n  next: look for it"

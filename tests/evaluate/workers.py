@@ -27,6 +27,7 @@ class Recorder:
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
+        self.broken = False
 
     def __call__(self):
         return self.work
@@ -37,6 +38,8 @@ class Recorder:
     def work(self, job: str) -> str:
         attempt = self.attempts(job)
         (self.folder / f"{job}.{attempt}").touch()
+        if self.broken:
+            raise RuntimeError("the renderer's context is lost")
         kind = job.partition("-")[0]
         if kind == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
@@ -46,6 +49,9 @@ class Recorder:
             raise ZeroDivisionError("the simulator blew up")
         if kind == "raiseonce" and attempt == 0:
             raise RuntimeError("first time")
+        if kind == "breaksonce" and attempt == 0:
+            self.broken = True
+            raise RuntimeError("the renderer lost its context")
         if kind == "runfailed":
             raise RunFailed("the renderer is gone", next="look for it")
         if kind == "refuse":

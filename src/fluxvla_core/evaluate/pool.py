@@ -1,9 +1,10 @@
 """Jobs for worker processes that may crash.
 
 A worker is built once per process by a factory and then called with one job after another. A
-process that dies or hangs is replaced. The job that it had, or one that raised, is tried once more;
-if that fails too it is an error of that job, and the others go on. What cannot get better by
-trying again (a ``FluxError`` that means bad input) ends the run at once.
+process that dies, hangs or raises is replaced: what made one job fail may be broken for good in it,
+as a lost renderer is. The job that it had is tried once more in another process; if that fails too
+it is an error of that job, and the others go on. What cannot get better by trying again (a
+``FluxError`` that means bad input) ends the run at once.
 """
 
 from __future__ import annotations
@@ -225,11 +226,11 @@ class WorkerPool:
                 self.ready_s = time.monotonic() - self._began
             self._next(worker)
             return None
+        if kind == "raised":
+            return self._lost(worker, str(value))
         index, worker.job, worker.deadline = worker.job, None, None
         assert index is not None
         self._next(worker)
-        if kind == "raised":
-            return self._again(index, str(value))
         return Outcome(index, value, None, self._attempts[index])
 
     def _next(self, worker: _Worker) -> None:
@@ -251,8 +252,10 @@ class WorkerPool:
                     cause="out of memory, or a library that crashes while it is loaded",
                     next="try again with workers=1",
                 )
-        self._workers.append(_Worker(self._factory, self._link))
-        return None if index is None else self._again(index, why)
+        outcome = None if index is None else self._again(index, why)
+        if self._waiting:
+            self._workers.append(_Worker(self._factory, self._link))
+        return outcome
 
     def _again(self, index: int, why: str) -> Outcome | None:
         if self._attempts[index] > self._retries:

@@ -33,6 +33,8 @@ class Batched:
             self.go.wait(30)
         for question in questions:
             match question.observation["task_description"]:
+                case "crowd" if len(questions) > 1:
+                    raise MemoryError("too many at once")
                 case "raise":
                     raise ZeroDivisionError("weights exploded")
                 case "refuse":
@@ -114,6 +116,37 @@ def test_a_failing_policy_fails_those_who_asked_and_no_one_else(server):
     assert client(server).predict_action(see()).shape == (2, 4)
 
 
+@pytest.mark.parametrize(
+    ("words", "kind", "text"),
+    [
+        ("raise", "raised", "weights exploded"),
+        ("fail", "raised", "out of memory"),
+        ("refuse", "refused", "nobody can do that"),
+        ("crowd", "chunk", "0.5"),
+    ],
+)
+def test_one_that_cannot_be_answered_is_no_error_of_its_company(server, policy, words, kind, text):
+    connections = [server.link() for _ in range(4)]
+    for connection in connections:  # once they are answered the server knows them all
+        connection.send(("policy", Question(see(), 0, 0)))
+        connection.recv()
+    policy.sizes.clear()
+    server.batches = server.rows = 0
+    policy.started, policy.go = threading.Event(), threading.Event()
+    for number, asked in enumerate(("go", "go", words, "go")):
+        connections[number].send(("policy", Question(see(0.5, asked), number, 0)))
+        assert policy.started.wait(30), "the first is asked alone, while the others wait"
+    policy.go.set()
+    answers = [connection.recv() for connection in connections]
+    assert policy.sizes == [1, 3, 1, 1, 1]
+    for number in (0, 1, 3):
+        assert answers[number][0] == "chunk"
+        assert answers[number][1].tolist() == [[number, 0, 0.5, 0]] * 2
+    assert answers[2][0] == kind
+    assert text in str(answers[2][1])
+    assert (server.batches, server.rows) == (5, 4)
+
+
 def test_a_worker_that_is_gone_takes_nobody_with_it(server):
     one = client(server)
     one._connection.send(("policy", Question(see(), 0, 0)))
@@ -128,6 +161,8 @@ def test_a_server_that_is_gone_is_told(policy):
     server.close()
     with pytest.raises(RunFailed, match="the process with the policy is gone"):
         one.predict_action(see())
+    with pytest.raises(RunFailed, match="the thread with the policy has ended"):
+        server.link()
 
 
 def test_a_policy_that_cannot_be_loaded_is_refused_where_the_server_is_made():

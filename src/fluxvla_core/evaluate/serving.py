@@ -13,7 +13,7 @@ import queue
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -30,6 +30,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 Load = Callable[[], LocalPolicy]
+_Answer = tuple[str, Any]
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,13 @@ class PolicyServer:
             raise problem
 
     def link(self) -> Connection:
-        """A worker's end of a connection of its own; to be closed here once it has it."""
+        """A worker's end of a connection of its own; to be closed here once it has it.
+
+        Raises:
+            RunFailed: nobody is there any more to answer on it.
+        """
+        if not self._thread.is_alive():
+            raise RunFailed("the thread with the policy has ended")
         ours, theirs = get_context("spawn").Pipe()
         self._new.put(ours)
         self._wake.send_bytes(b"n")
@@ -166,22 +173,35 @@ class PolicyServer:
         mine = alike[: policy.batch_size]
         for asked in mine:
             waiting.remove(asked)
-        answers: list[tuple[str, Any]]
-        try:
-            chunks = policy.predict_batch([asked.question for asked in mine])
-            answers = [("chunk", chunk) for chunk in chunks]
-        except FluxError as error:
-            kind = "refused" if error.exit_code == EXIT_BAD_INPUT else "raised"
-            answers = [(kind, error if kind == "refused" else str(error))] * len(mine)
-        except Exception:  # noqa: BLE001 - an episode's crash is counted, not raised
-            answers = [("raised", traceback.format_exc())] * len(mine)
-        self.batches += 1
+        answers = self._answers(policy, [asked.question for asked in mine])
         self.rows += len(mine)
         for asked, answer in zip(mine, answers, strict=True):
             try:
                 asked.connection.send(answer)
             except OSError:  # the worker is gone; reading its connection will tell so
                 continue
+
+    def _answers(self, policy: LocalPolicy, questions: Sequence[Question]) -> list[_Answer]:
+        """What to send to each of those who asked.
+
+        Where a batch fails each question is asked alone: one that cannot be answered is no reason
+        for the others' episodes to end.
+        """
+        self.batches += 1
+        try:
+            return [("chunk", chunk) for chunk in policy.predict_batch(questions)]
+        except Exception as error:  # noqa: BLE001 - an episode's crash is counted, not raised
+            if len(questions) == 1:
+                return [_failure(error)]
+        return [self._answers(policy, [question])[0] for question in questions]
+
+
+def _failure(error: Exception) -> _Answer:
+    if not isinstance(error, FluxError):
+        return "raised", "".join(traceback.format_exception(error))
+    if error.exit_code == EXIT_BAD_INPUT:
+        return "refused", error
+    return "raised", str(error)
 
 
 class ServedPolicy:

@@ -243,6 +243,36 @@ def test_bf16_computes_and_still_gives_float64(tmp_path):
         load(save(tmp_path), mixed_precision_dtype="fp16")
 
 
+@pytest.mark.parametrize(
+    ("environment", "count", "device"),
+    [
+        ({}, 8, "cuda"),
+        ({"LOCAL_RANK": "0"}, 8, "cuda:0"),
+        ({"LOCAL_RANK": "5"}, 8, "cuda:5"),
+        ({"LOCAL_RANK": "5"}, 2, "cuda:1"),
+        ({"LOCAL_RANK": "3"}, 1, "cuda:0"),
+        ({"LOCAL_RANK": "3"}, 0, "cuda"),
+        ({"SLURM_LOCALID": "2"}, 4, "cuda:2"),
+        ({"LOCAL_RANK": "1", "SLURM_LOCALID": "0"}, 4, "cuda:1"),
+    ],
+)
+def test_processes_of_one_machine_have_a_gpu_each(environment, count, device):
+    from fluxvla_core.infer.local_policy import own_device
+
+    assert own_device(environment, count) == device
+
+
+def test_a_plain_cuda_is_the_gpu_of_this_process(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch.nn.Module, "to", lambda self, device: asked.append(device) or self)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    path = save(tmp_path)
+    assert load(path, device="cuda").device == "cuda:1"
+    assert load(path, device="cuda:0").device == "cuda:0"
+    assert asked == ["cuda:1", "cuda:0"]
+
+
 def test_a_work_dir_means_its_newest_whole_checkpoint(tmp_path):
     from fluxvla_core.infer.local_policy import find_checkpoint
 

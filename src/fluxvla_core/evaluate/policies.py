@@ -96,7 +96,7 @@ def load(source: Source) -> LocalPolicy:
         dataset, denormalize = _with_statistics(source)
     policy = load_policy(source.ckpt_path, source.device, dataset, denormalize, source.precision)
     if source.what == UNTRAINED:
-        policy.model = untrained_model(source.ckpt_path, source.device)
+        policy.model = untrained_model(source.ckpt_path, policy.device)
     policy.batch_size = source.batch_size
     return policy
 

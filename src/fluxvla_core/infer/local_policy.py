@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -249,7 +250,7 @@ def load_policy(
 
     Args:
         ckpt_path: a checkpoint's folder, or a work dir, whose newest one is taken.
-        device: of torch.
+        device: of torch; a plain ``cuda`` is ``own_device``'s.
         dataset: table or object that prepares observations instead of the training dataset's
             transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
             ``norm_stats`` and ``processors``, is the checkpoint's.
@@ -286,6 +287,10 @@ def load_policy(
         )
     prepare = _prepare(dataset, trained_on, checkpoint)
     denormalize = _denormalize(denormalize_action, prepare, checkpoint)
+    if device == "cuda":
+        import torch
+
+        device = own_device(os.environ, torch.cuda.device_count())
     model = _model(config, checkpoint, device)
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     return LocalPolicy(
@@ -300,6 +305,17 @@ def load_policy(
         precision=mixed_precision_dtype,
         source=where,
     )
+
+
+def own_device(environment: Mapping[str, str], count: int) -> str:
+    """The GPU of this process: of several on one machine each has its own, as far as they reach.
+
+    Args:
+        environment: of the process; torchrun sets ``LOCAL_RANK``, ``srun`` ``SLURM_LOCALID``.
+        count: how many GPUs it sees.
+    """
+    local = environment.get("LOCAL_RANK", environment.get("SLURM_LOCALID"))
+    return "cuda" if local is None or count < 1 else f"cuda:{int(local) % count}"
 
 
 def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:

@@ -15,7 +15,7 @@ from fluxvla_core.evaluate import results
 from fluxvla_core.evaluate.pool import WorkerPool
 from fluxvla_core.evaluate.showing import choose_episodes, record_videos, video_name
 from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import summarise
+from fluxvla_core.evaluate.summary import problems, summarise
 
 
 def record(task, seed, success, group="policy", **more):
@@ -128,6 +128,7 @@ def test_people_are_told_rates_speed_and_videos(tmp_path):
     records = [record("a", 0, True), record("b", 0, False)]
     found = {
         "groups": summarise(records),
+        "problems": [],
         "timing": results.timing(records, 2, 4.0, 2),
         "videos": [{"path": "videos/x.mp4"}],
     }
@@ -139,6 +140,43 @@ def test_people_are_told_rates_speed_and_videos(tmp_path):
         "20 steps in 4 s: 5 steps/s in 2 processes",
         "video x.mp4",
     ]
+
+
+def test_what_went_wrong_is_counted_the_most_frequent_first(listener, tmp_path):
+    traceback = "Traceback (most recent call last):\n  File x\nKeyError: 'qpos'\n"
+    lost = RunFailed("the state is gone", cause="it diverged", next="look")
+    records = [
+        record("a", 0, True, problem=None),
+        record("a", 1, False, problem="not finite"),
+        record("b", 1, False, problem="not finite"),
+        *[record("a", n, None, status="error", error=traceback) for n in (2, 3, 4)],
+        record("b", 5, None, status="error", error=str(lost), group="swapped"),
+    ]
+    found = problems(records)
+    assert found == [
+        {"group": "policy", "status": "error", "what": "KeyError: 'qpos'", "episodes": 3},
+        {"group": "policy", "status": "done", "what": "not finite", "episodes": 2},
+        {"group": "swapped", "status": "error", "what": "the state is gone", "episodes": 1},
+    ]
+    others = [{**found[1], "what": f"reason {n}"} for n in range(4)]
+    told = {"groups": {}, "problems": found + others, "timing": {"episodes": 0}, "videos": []}
+    results.tell(listener, told, tmp_path)
+    assert listener.warnings == [
+        "policy: 3 episodes gave no result: KeyError: 'qpos'",
+        "policy: 2 episodes failed: not finite",
+        "swapped: 1 episode gave no result: the state is gone",
+        "policy: 2 episodes failed: reason 0",
+        "policy: 2 episodes failed: reason 1",
+        "and 2 more problems: see results.json",
+    ]
+
+
+def test_an_evaluation_with_errors_is_not_whole(tmp_path):
+    results.check_all_done([record("a", 0, False)], tmp_path)
+    with pytest.raises(RunFailed, match=r"1 of 2 episodes gave no result.*last one: it blew up"):
+        results.check_all_done(
+            [record("a", 0, True), {"status": "error", "error": "it blew up"}], tmp_path
+        )
 
 
 def test_no_checkpoint_is_said_with_what_to_do(tmp_path):

@@ -175,6 +175,7 @@ def test_a_stop_ends_the_evaluation_unless_nobody_can_be_hurt(evaluate, section,
     found = evaluate(tasks=["1"], go_on=True)
     assert found["groups"]["policy"]["tasks"]["1"]["episodes"] == 4
     assert found["groups"]["policy"]["tasks"]["1"]["errors"] == 0
+    assert [(row["status"], row["episodes"]) for row in found["problems"]] == [("done", 1)]
 
 
 def test_a_robot_that_fails_is_an_error_and_no_failure_of_the_policy(
@@ -188,7 +189,10 @@ def test_a_robot_that_fails_is_an_error_and_no_failure_of_the_policy(
         real(self, action)
 
     monkeypatch.setattr(Simulated, "send_action", breaks)
-    found = evaluate(tasks=["1"], go_on=True)
+    with pytest.raises(RunFailed, match=r"1 of 4 episodes gave no result.*cable is out"):
+        evaluate(tasks=["1"], go_on=True)
+    found = json.loads((tmp_path / "eval_robot" / "results.json").read_text())
+    assert [(row["status"], row["episodes"]) for row in found["problems"]] == [("error", 1)]
     counted = found["groups"]["policy"]["tasks"]["1"]
     assert (counted["episodes"], counted["successes"], counted["errors"]) == (3, 1, 1)
     assert any("1, episode 12: " in line and "cable" in line for line in listener.warnings)

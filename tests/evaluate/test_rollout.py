@@ -96,12 +96,43 @@ def test_joint_targets_are_joined_and_kept_within_the_limits(walk):
         ([0.1], r"chunk has shape \(1,\); \(T, 1\) is needed"),
         (np.zeros((0, 1)), r"chunk has shape \(0, 1\)"),
         ([[1.0, 2.0]], r"chunk has shape \(1, 2\)"),
-        ([[np.nan]], "chunk is not finite"),
+        ([[1.0], [1.0, 2.0]], "chunk is no array of numbers: "),
     ],
 )
-def test_impossible_chunks_are_refused(walk, chunk, text):
-    with pytest.raises(RunFailed, match=text):
+def test_chunks_of_another_shape_are_refused(walk, chunk, text):
+    with pytest.raises(SpecMismatch, match=text):
         episode(walk.Walk(), Says(chunk))
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_chunk_that_is_not_finite_is_a_failure_that_says_why(walk, value, limited):
+    found = episode(walk.Walk(limited=limited), Says([[0.1], [value]]))
+    assert (found["success"], found["steps"], found["calls"]) == (False, 0, 1)
+    assert found["problem"] == f"the policy's chunk is not finite: action 1, x is {value}"
+    assert episode(walk.Walk(), Says([[0.1]]))["problem"] is None
+
+
+def test_a_success_does_not_outlive_a_chunk_that_is_not_finite(walk):
+    world = walk.Walk()
+    real = world.step
+    # A success that does not end the episode, as some environments have it.
+    world.step = lambda action: replace(real(action), success=True, ended=False)
+    found = episode(world, walk.Dazed())
+    assert (found["success"], found["steps"], found["calls"]) == (False, 3, 2)
+
+
+def test_a_state_that_is_not_finite_is_not_the_policys_fault(walk):
+    class Lost(walk.Walk):
+        state = property(lambda self: np.array([np.nan]))
+
+    # What a policy makes of such a state would look like its own failure.
+    echo = walk.Walker()
+    echo.predict_action = lambda observation: observation["qpos"][:, None] + 0.1
+    for world, steps in ((Lost(limited=True), 0), (walk.Walk(diverging=6), 3)):
+        with pytest.raises(RunFailed, match=f"state is not finite after {steps} steps") as caught:
+            episode(world, echo)
+        assert "likely cause: the simulation diverged" in str(caught.value)
 
 
 def test_equal_seeds_give_equal_courses(walk):

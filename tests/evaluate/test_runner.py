@@ -34,6 +34,10 @@ def courses(work_dir):
     return found
 
 
+def results(work_dir):
+    return json.loads((work_dir / "eval" / "results.json").read_text())
+
+
 def test_outcomes_are_the_same_for_any_number_of_workers(tmp_path, walking):
     for workers in (1, 2, 4):
         result = evaluate(tmp_path / str(workers), workers=workers, instruction_swap=True)
@@ -78,7 +82,11 @@ def test_a_crashed_environment_is_tried_again_and_then_is_no_failure_of_the_poli
     marks = tmp_path / "marks"
     marks.mkdir()
     environment = {**WALK, "marks": str(marks), "crashing": 1, "shaky": 2}
-    result = evaluate(tmp_path, environment, tasks=["right"], reporter=listener)
+    with pytest.raises(RunFailed, match="1 of 4 episodes gave no result, so the rates") as caught:
+        evaluate(tmp_path, environment, tasks=["right"], reporter=listener)
+    assert "the last one: its process died (exit code 9)" in str(caught.value)
+    assert "run the same command again: only these are tried again" in str(caught.value)
+    result = results(tmp_path)
     counted = result["groups"]["policy"]["tasks"]["right"]
     assert (counted["errors"], counted["episodes"], counted["successes"]) == (1, 3, 3)
     assert Counter(p.name.split(".")[0] for p in marks.iterdir()) == {
@@ -88,9 +96,84 @@ def test_a_crashed_environment_is_tried_again_and_then_is_no_failure_of_the_poli
         "right-3": 1,
     }
     assert listener.warnings == [
-        "episode policy/right/0 gave no result after 2 attempts: its process died (exit code 9)"
+        "episode policy/right/0 gave no result after 2 attempts: its process died (exit code 9)",
+        "policy: 1 episode gave no result: its process died (exit code 9)",
     ]
     assert "right: 3/3 = 100%" in " ".join(listener.lines)
+
+
+NAN = "the policy's chunk is not finite: action 0, x is nan"
+
+
+@pytest.mark.parametrize(
+    ("seeds", "successes", "failed"), [(None, 0, 10), ([1, 4, 7], 7, 3), ([0, 1], 8, 2)]
+)
+def test_chunks_that_are_not_finite_are_failures_of_the_policy(
+    tmp_path, walking, listener, seeds, successes, failed
+):
+    policy = {"type": "Dazed", "seeds": seeds}
+    options = {"policy": policy, "tasks": ["right"], "episodes": 10, "reporter": listener}
+    for workers in (1, 2):
+        found = evaluate(tmp_path / str(workers), workers=workers, **options)
+    assert courses(tmp_path / "1") == courses(tmp_path / "2")
+    counted = found["groups"]["policy"]["all"]
+    assert (counted["episodes"], counted["errors"]) == (10, 0)
+    assert (counted["successes"], counted["rate"]) == (successes, successes / 10)
+    assert found["problems"] == [
+        {"group": "policy", "status": "done", "what": NAN, "episodes": failed}
+    ]
+    assert {c["problem"] for c in courses(tmp_path / "1").values() if not c["success"]} == {NAN}
+    assert listener.warnings == [f"policy: {failed} episodes failed: {NAN}"] * 2
+
+
+def test_what_a_policy_raises_is_told_and_the_evaluation_is_not_whole(tmp_path, walking, listener):
+    """It may as well be the set-up that is wrong: nothing to be counted quietly as 0 %."""
+    policy = {"type": "Dazed", "seeds": [2], "raises": True}
+    with pytest.raises(RunFailed, match=r"1 of 4 episodes gave no result.*: KeyError: 'compass'"):
+        evaluate(tmp_path, policy=policy, tasks=["right"], reporter=listener)
+    assert listener.warnings[-1] == "policy: 1 episode gave no result: KeyError: 'compass'"
+    found = results(tmp_path)
+    assert found["groups"]["policy"]["all"]["episodes"] == 3
+    assert found["problems"] == [
+        {"group": "policy", "status": "error", "what": "KeyError: 'compass'", "episodes": 1}
+    ]
+
+
+def test_a_policy_of_another_shape_is_refused_at_once(tmp_path, walking):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    with pytest.raises(SpecMismatch, match=r"the policy's chunk has shape \(3, 2\)"):
+        evaluate(tmp_path, {**WALK, "marks": str(marks)}, policy="TwoLegs", workers=1)
+    assert len(list(marks.iterdir())) == 1
+
+
+@pytest.mark.parametrize("serve_policy", [False, True])
+def test_a_simulation_that_diverges_is_an_error_of_its_episode(
+    tmp_path, checkpoint, listener, serve_policy
+):
+    options = {"policy": "checkpoint", "ckpt_path": str(checkpoint), "serve_policy": serve_policy}
+    options |= {"tasks": ["right"], "workers": 1, "max_steps": 8}
+    with pytest.raises(RunFailed, match="1 of 4 episodes gave no result"):
+        evaluate(tmp_path, {**WALK, "diverging": 1}, reporter=listener, **options)
+    assert listener.warnings[-1] == (
+        "policy: 1 episode gave no result: the environment's state is not finite after 4 steps"
+    )
+    assert results(tmp_path)["groups"]["policy"]["all"]["episodes"] == 3
+
+
+def test_errors_of_other_parts_are_no_failure_of_one_that_had_nothing_to_do(
+    tmp_path, walking, monkeypatch
+):
+    """It would end the part that is about to try them again: torchrun ends all with one."""
+    environment = {**WALK, "diverging": 1}
+    options = {"tasks": ["right"], "episodes": 2, "workers": 1}
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "0")
+    assert evaluate(tmp_path, environment, **options)["episodes_left"] == 1
+    monkeypatch.setenv("RANK", "1")
+    with pytest.raises(RunFailed, match="1 of 2 episodes gave no result"):
+        evaluate(tmp_path, environment, **options)
+    assert evaluate(tmp_path, environment, **options)["groups"]["policy"]["all"]["errors"] == 1
 
 
 def test_finished_episodes_are_never_run_again(tmp_path, walking, listener):
@@ -125,6 +208,20 @@ def test_parts_of_a_job_are_run_apart_and_merged(tmp_path, walking, monkeypatch,
     # Another number of parts finds everything done.
     monkeypatch.setenv("WORLD_SIZE", "4")
     assert evaluate(tmp_path / "parts")["groups"] == result["groups"]
+
+
+def test_a_gpu_of_ones_own_makes_no_part_another_evaluation(tmp_path, checkpoint, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "8")
+    devices = set()
+    for rank in ("0", "5"):
+        monkeypatch.setenv("RANK", rank)
+        monkeypatch.setenv("LOCAL_RANK", rank)
+        runner = EvalRunner(
+            context=RunContext(work_dir=checkpoint), environment=WALK, device="cuda"
+        )
+        runner.run_setup()
+        devices.add(runner.what()["settings"]["device"])
+    assert devices == {"cuda"}
 
 
 def test_nproc_is_workers_but_for_torchruns_own_count(tmp_path, walking, monkeypatch):

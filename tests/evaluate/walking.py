@@ -24,18 +24,21 @@ class Walk:
         limited: actions are places, not steps.
         marks: a folder in which each reset leaves a mark, and where what shall crash does: seeds
             below ``crashing`` crash at every attempt, those below ``shaky`` at the first alone.
+        diverging: below this seed the place is no number after three steps.
     """
 
     expert = "Walker"
 
-    def __init__(self, limited=False, marks=None, crashing=0, shaky=0, slow=0.0, max_steps=40):
+    def __init__(
+        self, limited=False, marks=None, crashing=0, shaky=0, diverging=0, slow=0.0, max_steps=40
+    ):
         tasks = (TaskSpec("right", "go right", max_steps), TaskSpec("left", "go left", max_steps))
         mode = "absolute" if limited else "delta"
         self.spec = EnvironmentSpec(
             "a line", embodiment((EYE,), mode), tasks, limited=limited, details={"ground": "shaky"}
         )
         self.limited, self.slow = limited, slow
-        self.marks, self.crashing, self.shaky = marks, crashing, shaky
+        self.marks, self.crashing, self.shaky, self.diverging = marks, crashing, shaky, diverging
         self.closed = 0
 
     def reset(self, seed, task):
@@ -45,6 +48,7 @@ class Walk:
             if seed < self.crashing or (seed < self.shaky and before == 0):
                 os._exit(9)
         self.rng, self.place = np.random.default_rng(seed), 0.0
+        self.left = 3 if seed < self.diverging else None
         self.scene = self.told = task
         self.did = {"right": False, "left": False}
 
@@ -66,13 +70,16 @@ class Walk:
             time.sleep(self.slow)
         shake = 0.02 * self.rng.normal()
         self.place = float(action[0] if self.limited else self.place + action[0]) + shake
+        if self.left is not None:
+            self.left -= 1
+            self.place = self.place if self.left else float("nan")
         self.did["right"] |= self.place >= 1
         self.did["left"] |= self.place <= -1
         ended = self.did[self.scene] or self.did[self.told]
         return Step(self.place, self.did[self.scene], ended, dict(self.did))
 
     def observe(self, cameras):
-        shade = int(np.clip(100 + 50 * self.place, 0, 255))
+        shade = int(np.clip(100 + 50 * np.nan_to_num(self.place), 0, 255))
         return {
             "qpos": self.state.astype(np.float32),
             "images": {c.name: np.full((c.height, c.width, 3), shade, np.uint8) for c in cameras},
@@ -107,6 +114,40 @@ class Walker:
         if self.noise:
             self.executed = chunk[:1] + self.noise * self.rng.normal(size=(1, 1))
         return chunk
+
+
+@POLICIES.register_module()
+class Dazed(Walker):
+    """A walker that no longer knows where to go at its second chunk: NaN for every seed, or some.
+
+    Args:
+        seeds: for which.
+        raises: it raises instead.
+    """
+
+    def __init__(self, seeds=None, raises=False):
+        super().__init__()
+        self.dazed, self.raises = seeds, raises
+
+    def reset(self, seed):
+        super().reset(seed)
+        self.calls = 0
+
+    def predict_action(self, observation):
+        self.calls += 1
+        if self.calls < 2 or (self.dazed is not None and self.seeds[-1] not in self.dazed):
+            return super().predict_action(observation)
+        if self.raises:
+            raise KeyError("compass")
+        return np.full((3, 1), np.nan)
+
+
+@POLICIES.register_module()
+class TwoLegs(Walker):
+    """Is for an environment with two joints."""
+
+    def predict_action(self, observation):
+        return np.zeros((3, 2))
 
 
 def little_model():

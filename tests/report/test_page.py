@@ -150,6 +150,26 @@ def test_live_results_are_shown_apart_from_stepped_ones(complete: Path, tmp_path
     assert page.shows("stopped by safety: starvation 2")
 
 
+def test_what_went_wrong_in_episodes_stands_beside_their_rates(
+    complete: Path, tmp_path: Path
+) -> None:
+    work_dir = tmp_path / "run"
+    shutil.copytree(complete, work_dir)
+    path = work_dir / "eval" / "results.json"
+    rows = [
+        {"group": "policy", "status": "done", "what": "chunk is not finite", "episodes": 3},
+        {"group": "swapped", "status": "error", "what": "KeyError: 'qpos'", "episodes": 1},
+        *[{"group": "x", "status": "done", "what": f"reason {n}", "episodes": 2} for n in range(5)],
+    ]
+    path.write_text(json.dumps({**json.loads(path.read_text()), "problems": rows}))
+    page = Page(build_report(work_dir).read_text(encoding="utf-8"))
+    assert page.shows("trained policy: 3 episodes failed: chunk is not finite")
+    assert page.shows("told the other task: 1 episode gave no result: KeyError: 'qpos'")
+    assert page.shows("reason 2")
+    assert not page.shows("reason 3")
+    assert page.shows("2 more problems are in")
+
+
 def test_damaged_files_are_listed(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "environment.json").write_text("{")

@@ -16,7 +16,7 @@ from fluxvla_libero.inference_runner import LiberoInferenceRunner
 from fluxvla_libero.suites import init_states, suite_tasks
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, SpecMismatch, UsageError
+from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch, UsageError
 from fluxvla_core.evaluate.demonstrating import demonstrate
 from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
 from fluxvla_core.spec.embodiment import Camera
@@ -261,6 +261,17 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     shown = pictures[0].read()
     assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
     assert shown.count(b"\xff\xd8\xff") >= 1, "JPEG"
+
+
+def test_inference_with_a_chunk_that_is_not_finite_fails_and_says_why(
+    tmp_path, libero, listener, monkeypatch
+):
+    lost = np.full((1, 7), np.nan)
+    monkeypatch.setattr(LiberoExpert, "predict_action", lambda self, observation: lost)
+    with pytest.raises(RunFailed, match="the policy's chunk is not finite: action 0, ") as caught:
+        infer(tmp_path, listener, "2")
+    summary = json.loads((tmp_path / "inference" / "001-2" / "episode.json").read_text())
+    assert (summary["outcome"], summary["problem"]) == ("failed", caught.value.what)
 
 
 def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, listener, save):

@@ -22,7 +22,7 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.evaluate.collecting import Recorded, collect_episodes
 from fluxvla_core.evaluate.policies import fit, resolve_name
-from fluxvla_core.evaluate.rollout import Commands, checked
+from fluxvla_core.evaluate.rollout import Commands, not_finite, shaped
 from fluxvla_core.evaluate.worker import choose_tasks
 from fluxvla_core.spec.embodiment import Camera
 
@@ -153,7 +153,8 @@ def demonstrate(
         The episode, and whether the task was done, judged over all of it.
 
     Raises:
-        RunFailed: the actor's chunk is of another shape, or not finite.
+        SpecMismatch: the actor's chunk is of another shape.
+        RunFailed: it is not finite.
     """
     spec = environment.spec
     environment.reset(seed, task.name)
@@ -169,14 +170,14 @@ def demonstrate(
     while not ended and steps < task.max_steps:
         teaches = steps < recorded
         observation = environment.observe(cameras if teaches else ())
-        chunk = checked(actor.predict_action(observation), spec.embodiment.dim)
+        chunk = _checked(actor.predict_action(observation), spec)
         if teaches:
             for name, pictures in images.items():
                 pictures.append(observation["images"][name])
             states.append(np.array(environment.state))
             actions.append(chunk[0].copy())
         own = getattr(actor, "executed", None)
-        targets = commands.of(chunk[:1]) if own is None else checked(own, spec.embodiment.dim)
+        targets = commands.of(chunk[:1]) if own is None else _checked(own, spec)
         for target in targets:
             found = environment.step(commands.take(target))
             steps += 1
@@ -208,6 +209,15 @@ def task_of(episode: int, episodes: int, tasks: Sequence[TaskSpec], together: bo
     if together:
         return tasks[episode * len(tasks) // episodes]
     return tasks[episode % len(tasks)]
+
+
+def _checked(chunk: Any, spec: EnvironmentSpec) -> npt.NDArray[np.float64]:
+    """Nothing can be learned from a chunk that is not finite."""
+    array = shaped(chunk, spec.embodiment.dim)
+    problem = not_finite(array, spec.embodiment.joint_names)
+    if problem is not None:
+        raise RunFailed(problem)
+    return array
 
 
 def _actor(collection: Collection, environment: Environment) -> Actor:

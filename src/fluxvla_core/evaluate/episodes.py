@@ -16,6 +16,7 @@ from typing import Any
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.evaluate.ledger import DONE, ERROR, EpisodeKey, Ledger
 from fluxvla_core.evaluate.pool import Outcome, WorkerPool
+from fluxvla_core.evaluate.summary import reason
 
 EpisodeFactory = Callable[[], Callable[[EpisodeKey], dict[str, Any]]]
 
@@ -91,10 +92,9 @@ def _record(key: EpisodeKey, outcome: Outcome) -> dict[str, Any]:
 
 
 def _error_line(record: dict[str, Any]) -> str:
-    reason = str(record["error"]).strip().splitlines()[-1]
     return (
         f"episode {record['group']}/{record['task']}/{record['seed']} gave no result "
-        f"after {record['attempts']} attempts: {reason}"
+        f"after {record['attempts']} attempts: {reason(record['error'])}"
     )
 
 

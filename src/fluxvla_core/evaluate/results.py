@@ -12,9 +12,11 @@ from typing import Any
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluate.ledger import DONE
-from fluxvla_core.evaluate.summary import describe
+from fluxvla_core.evaluate.summary import describe, describe_problem, reason
 
 FORMAT = "fluxvla-eval-1"
+NAMED = 5
+"""How many different problems are told; all are in the results."""
 
 
 def write_results(path: Path, results: Mapping[str, Any]) -> None:
@@ -103,13 +105,33 @@ def check_any_done(records: Sequence[Mapping[str, Any]], ledger: Path) -> None:
         )
 
 
+def check_all_done(records: Sequence[Mapping[str, Any]], ledger: Path) -> None:
+    """Let nobody take rates for those of all episodes when some gave no result.
+
+    Raises:
+        RunFailed: with how many there are, and the last one's reason.
+    """
+    errors = [record for record in records if record["status"] != DONE]
+    if errors:
+        raise RunFailed(
+            f"{len(errors)} of {len(records)} episodes gave no result, so the rates are of the "
+            f"others alone; the last one: {reason(errors[-1]['error'])}",
+            where=str(ledger),
+            next="mend what it says and run the same command again: only these are tried again",
+        )
+
+
 def tell(reporter: Reporter, results: Mapping[str, Any], folder: Path) -> None:
-    """Say the rates of each group and task, the speed, and where the videos are."""
+    """Say the rates of each group and task, what went wrong, the speed, where the videos are."""
     for group, found in results["groups"].items():
         for task, counted in found["tasks"].items():
             reporter.info(describe(f"{group} {task}", counted))
         if len(found["tasks"]) > 1:
             reporter.info(describe(f"{group} all tasks", found["all"]))
+    for row in results["problems"][:NAMED]:
+        reporter.warn(describe_problem(row))
+    if len(results["problems"]) > NAMED:
+        reporter.warn(f"and {len(results['problems']) - NAMED} more problems: see results.json")
     speed = results["timing"]
     if speed["episodes"]:
         reporter.info(

@@ -23,7 +23,7 @@ from fluxvla_core.evaluate.episodes import open_ledger
 from fluxvla_core.evaluate.ledger import DONE, ERROR, EpisodeKey, Ledger
 from fluxvla_core.evaluate.showing import choose_episodes
 from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import summarise
+from fluxvla_core.evaluate.summary import problems, summarise
 from fluxvla_core.infer.base_runner import FOLDER as EPISODES
 
 FOLDER = "eval_robot"
@@ -112,7 +112,8 @@ class RobotEvalRunner:
         """Run the episodes that are not there yet, write ``results.json``, return what is in it.
 
         Raises:
-            RunFailed: nobody can tell whether a task was done; no episode gave a result.
+            RunFailed: nobody can tell whether a task was done; an episode gave no result (the
+                results of the others are written).
             SafetyStop, OperatorError: what ended an episode, unless ``go_on``.
         """
         reporter, keys, about = self.context.reporter, self._keys(), self._about()
@@ -137,6 +138,7 @@ class RobotEvalRunner:
             "policy": "checkpoint" if self._checkpoint else type(self._policy).__name__,
             "mode": "robot",
             "groups": summarise(records),
+            "problems": problems(records),
             "checkpoint": self._checkpoint,
             "settings": {**about["settings"], **_kept_time(records)},
             "videos": self._videos(records),
@@ -146,6 +148,7 @@ class RobotEvalRunner:
         results.write_results(path, found)
         reporter.artifact("evaluation", path)
         results.tell(reporter, found, self.folder)
+        results.check_all_done(records, ledger.path)
         return found
 
     def _keys(self) -> list[EpisodeKey]:

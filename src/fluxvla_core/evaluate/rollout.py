@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.control.keyframes import interpolate
-from fluxvla_core.errors import RunFailed
+from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.trips import action_columns
 from fluxvla_core.spec.embodiment import Camera
@@ -93,6 +93,9 @@ def run_episode(
 ) -> dict[str, Any]:
     """Run one episode; its course follows from the arguments alone.
 
+    A chunk that is not finite ends it: the policy has failed, as on a robot, where safety stops
+    it. A state that is not finite is the environment's affair, and says nothing about the policy.
+
     Args:
         seed: of environment and, with ``course.policy_seed``, policy.
         told: the task whose instruction the policy is told instead; the environment is
@@ -100,13 +103,15 @@ def run_episode(
         watch: called with the number of steps before the first and after each, for a video.
 
     Returns:
-        JSON values: ``success``, ``behaviours`` (where the environment tells), ``steps``, ``calls``
-        (of the policy), ``clamped`` (actions beyond the limits), ``return`` (sum of rewards),
-        ``state_hash``, ``instruction``, and ``timing`` in seconds: ``seconds``,
-        ``policy_seconds``, ``step_seconds``, ``observe_seconds``.
+        JSON values: ``success``, ``problem`` (what the policy did wrong, else None),
+        ``behaviours`` (where the environment tells), ``steps``, ``calls`` (of the policy),
+        ``clamped`` (actions beyond the limits), ``return`` (sum of rewards), ``state_hash``,
+        ``instruction``, and ``timing`` in seconds: ``seconds``, ``policy_seconds``,
+        ``step_seconds``, ``observe_seconds``.
 
     Raises:
-        RunFailed: the policy's chunk is of another shape, or not finite.
+        SpecMismatch: the policy's chunk is of another shape.
+        RunFailed: the environment's state is not finite.
     """
     began = time.perf_counter()
     spent = dict.fromkeys(("policy", "step", "observe"), 0.0)
@@ -119,24 +124,32 @@ def run_episode(
     spec, limit = environment.spec, course.max_steps or task.max_steps
     commands = Commands(spec, getattr(actor, "action_rate_hz", None))
     start = environment.state
+    _check_state(start, 0)
     commands.start(start)
     own_hash = getattr(environment, "state_hash", None)
     digest = hashlib.sha256(start.tobytes())
     steps = calls = 0
     total, success, ended = 0.0, False, False
     behaviours: dict[str, bool] | None = None
+    problem: str | None = None
     if watch is not None:
         watch(environment, 0)
     while not ended and steps < limit:
         at = time.perf_counter()
         observation = environment.observe(course.cameras)
+        # Before the policy is asked: what it makes of such a state is not its fault.
+        _check_state(observation["qpos"], steps)
         seen = time.perf_counter()
-        chunk = checked(actor.predict_action(observation), spec.embodiment.dim)
+        chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
         answered = time.perf_counter()
         del observation  # so that the next pictures can have its memory: fresh pages cost more
         spent["observe"] += seen - at
         spent["policy"] += answered - seen
         calls += 1
+        problem = not_finite(chunk, spec.embodiment.joint_names)
+        if problem is not None:
+            success = False
+            break
         for target in commands.of(chunk[: course.replan_every]):
             at = time.perf_counter()
             found = environment.step(commands.take(target))
@@ -153,6 +166,7 @@ def run_episode(
                 break
     return {
         "success": success,
+        "problem": problem,
         **({} if behaviours is None else {"behaviours": behaviours}),
         "steps": steps,
         "calls": calls,
@@ -167,18 +181,37 @@ def run_episode(
     }
 
 
-def checked(chunk: Any, dim: int) -> Array:
-    """A chunk ``(T, dim)`` of finite numbers, T at least 1.
+def shaped(chunk: Any, dim: int) -> Array:
+    """A chunk as ``(T, dim)`` float64, T at least 1.
 
     Raises:
-        RunFailed: it is none.
+        SpecMismatch: it is none; the policy is not for this environment, in any episode.
     """
-    array = np.asarray(chunk, dtype=np.float64)
+    try:
+        array = np.asarray(chunk, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SpecMismatch(f"the policy's chunk is no array of numbers: {error}") from error
     if array.ndim != 2 or array.shape[1] != dim or not len(array):
-        raise RunFailed(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
-    if not np.isfinite(array).all():
-        raise RunFailed("the policy's chunk is not finite")
+        raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
     return array
+
+
+def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:
+    """What of a chunk ``(T, dim)`` is not finite; None if all of it is."""
+    bad = np.argwhere(~np.isfinite(chunk))
+    if not bad.size:
+        return None
+    row, column = bad[0]
+    value = chunk[row, column]
+    return f"the policy's chunk is not finite: action {row}, {joints[column]} is {value}"
+
+
+def _check_state(state: Any, steps: int) -> None:
+    if not np.isfinite(state).all():
+        raise RunFailed(
+            f"the environment's state is not finite after {steps} steps",
+            cause="the simulation diverged",
+        )
 
 
 def find_task(tasks: Sequence[TaskSpec], name: str) -> TaskSpec:

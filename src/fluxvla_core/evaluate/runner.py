@@ -38,7 +38,7 @@ from fluxvla_core.evaluate.serving import PolicyServer
 from fluxvla_core.evaluate.shards import Shard, shard_of
 from fluxvla_core.evaluate.showing import choose_episodes, record_videos, recorded_videos
 from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import summarise
+from fluxvla_core.evaluate.summary import problems, summarise
 from fluxvla_core.evaluate.worker import (
     POLICY,
     SWAPPED,
@@ -247,7 +247,8 @@ class EvalRunner:
 
         Raises:
             SpecMismatch: the policy is for another robot.
-            RunFailed: no episode gave a result, or results cannot be written.
+            RunFailed: an episode gave no result after all attempts (the results of the others are
+                written), or results cannot be written.
         """
         reporter, keys = self.context.reporter, self.keys()
         what = self.what()
@@ -275,6 +276,7 @@ class EvalRunner:
             "environment": what["environment"]["type"],
             "mode": "stepped" if self._live is None else "live",
             "groups": summarise(records),
+            "problems": problems(records),
             "instruction_test": instruction_test(records),
             "behaviours": count_behaviours(records),
             "checkpoint": self._checkpoint,
@@ -288,6 +290,8 @@ class EvalRunner:
         results.write_results(path, found)
         reporter.artifact("evaluation", path)
         results.tell(reporter, found, self.folder)
+        if new:  # what others have to try again is theirs: failing here would end them, too
+            results.check_all_done(records, ledger.path)
         return found
 
     def keys(self) -> list[EpisodeKey]:

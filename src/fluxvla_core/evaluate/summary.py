@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -45,6 +46,40 @@ def summarise(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         }
         for group, tasks in table.items()
     }
+
+
+def problems(records: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What went wrong in episodes, the most frequent first, as JSON values.
+
+    Returns:
+        ``group``, ``what``, ``episodes`` (in how many of them), and ``status``: ``error`` for
+        episodes that gave no result, ``done`` for failures of the policy that say why.
+    """
+    found = Counter(
+        (record["group"], record["status"], reason(why))
+        for record in records
+        if not record.get("success")
+        and (why := record.get("problem" if record["status"] == DONE else "error"))
+    )
+    return [
+        {"group": group, "status": status, "what": what, "episodes": count}
+        for (group, status, what), count in found.most_common()
+    ]
+
+
+def describe_problem(row: Mapping[str, Any]) -> str:
+    """One line for people about a row of :func:`problems`."""
+    count = row["episodes"]
+    many = "1 episode" if count == 1 else f"{count} episodes"
+    failed = "failed" if row["status"] == DONE else "gave no result"
+    return f"{row['group']}: {many} {failed}: {row['what']}"
+
+
+def reason(text: str) -> str:
+    """What a message or a traceback says in one line: the last that is no advice."""
+    lines = text.strip().splitlines()
+    said = [line for line in lines if not line.startswith(("  likely cause: ", "  next: "))]
+    return (said or lines)[-1].strip()
 
 
 def describe(name: str, counted: Mapping[str, Any]) -> str:

@@ -74,12 +74,14 @@ class Behaviour:
 class Evaluation:
     """One evaluation: its groups, and videos in the order in which to show them.
 
-    ``details`` are plain values that the results state beside the rates; ``live`` says that the
-    world ran on the wall clock and did not wait for the policy.
+    ``problems`` say in how many episodes what went wrong, the most frequent first. ``details`` are
+    plain values that the results state beside the rates; ``live`` says that the world ran on the
+    wall clock and did not wait for the policy.
     """
 
     name: str
     groups: Sequence[Group]
+    problems: Sequence[str] = ()
     behaviours: Sequence[Behaviour] = ()
     videos: Sequence[Video] = ()
     details: Mapping[str, Any] = field(default_factory=dict)

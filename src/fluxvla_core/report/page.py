@@ -25,6 +25,7 @@ from fluxvla_core.report.timeline import milliseconds
 # Videos are put into the page up to this many bytes in all; the rest is linked to.
 EMBEDDED_BYTES = 32_000_000
 MOST_VIDEOS = 12
+MOST_PROBLEMS = 5
 # Episodes that are shown as a whole, the newest ones; all are in the list.
 SHOWN_EPISODES = 4
 
@@ -240,6 +241,8 @@ def _evaluation(evaluation: Evaluation, shelf: Shelf) -> dict[str, Any]:
             )
     return {
         "facts": evaluation,
+        "problems": evaluation.problems[:MOST_PROBLEMS],
+        "more_problems": max(0, len(evaluation.problems) - MOST_PROBLEMS),
         "chart": interval_chart(rows, title="Success rates with 95 % intervals"),
         "rows": text_rows(evaluation.details.items()),
         "videos": [shelf.put(v) for v in evaluation.videos[:MOST_VIDEOS]],

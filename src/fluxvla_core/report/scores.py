@@ -38,6 +38,7 @@ def _evaluation(folder: Path, results: Mapping[str, Any]) -> Evaluation:
     return Evaluation(
         name=folder.name,
         groups=[group for group in groups if group is not None],
+        problems=_problems(names, results.get("problems")),
         behaviours=_behaviours(names, results.get("behaviours")),
         videos=_videos(folder, names, results.get("videos")),
         details=_details(results),
@@ -65,6 +66,18 @@ def _score(name: str, counted: Any) -> Score | None:
         high=number(counted.get("high")),
         errors=int(number(counted.get("errors", 0))),
     )
+
+
+def _problems(names: Mapping[str, str], listed: Any) -> list[str]:
+    """Lines for people; episodes without a result are among nobody's successes or failures."""
+    lines = []
+    for row in listed if isinstance(listed, list) else []:
+        if isinstance(row, Mapping):
+            count, group = int(number(row.get("episodes", 0))), str(row.get("group"))
+            became = "failed" if row.get("status") == "done" else "gave no result"
+            many = "1 episode" if count == 1 else f"{count} episodes"
+            lines.append(f"{names.get(group, group)}: {many} {became}: {row.get('what')}")
+    return lines
 
 
 def _behaviours(names: Mapping[str, str], table: Any) -> list[Behaviour]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, UsageError
+from fluxvla_core.errors import ConfigError, RunFailed, UsageError
 from fluxvla_core.evaluate.drawing import check_render
 from fluxvla_core.evaluate.policies import (
     FROM_CHECKPOINT,
@@ -152,7 +152,8 @@ class LiberoInferenceRunner:
         Raises:
             UsageError: the task is unknown, or cannot be done in the scene; or ``run_setup`` was
                 not called.
-            RunFailed: the policy's actions are impossible, or recording failed.
+            SpecMismatch: the policy's actions are of another shape.
+            RunFailed: they are not finite, or recording failed.
         """
         if self._policy is None:
             raise UsageError("LiberoInferenceRunner: call run_setup() before run()")
@@ -212,6 +213,9 @@ class LiberoInferenceRunner:
                 told,
                 watch,
             )
+            if found["problem"] is not None:
+                summary["problem"] = found["problem"]
+                raise RunFailed(found["problem"], where=str(trace.folder))
             success = None if task is None else found["behaviours"][task.name]
             summary |= {
                 "outcome": "done" if success else "ended",

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -37,10 +38,16 @@ torch = pytest.mark.skipif(
 )
 
 
-def start(*words: str) -> subprocess.Popen[str]:
+TORCHRUN = [
+    *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+    *("-m", *COMMAND[2:-2]),
+]
+
+
+def start(*words: str, command: Sequence[str] = COMMAND) -> subprocess.Popen[str]:
     environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
     return subprocess.Popen(
-        [*COMMAND, *words],
+        [*command, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -112,8 +119,11 @@ def test_signals_reach_the_ranks(write: Write, number: int, code: int, text: str
 
 
 @torch
-def test_ranks_do_not_outlive_a_launcher_that_is_killed(write: Write) -> None:
-    process = start("--set", "runner.mode+=wait")
+@pytest.mark.parametrize("command", [COMMAND, TORCHRUN], ids=["nproc", "torchrun"])
+def test_ranks_do_not_outlive_a_launcher_that_is_killed(
+    write: Write, command: Sequence[str]
+) -> None:
+    process = start("--set", "runner.mode+=wait", command=command)
     pids = waiting(process)
     process.kill()
     process.communicate()
@@ -121,6 +131,22 @@ def test_ranks_do_not_outlive_a_launcher_that_is_killed(write: Write) -> None:
     while any(alive(pid) for pid in pids):
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+@torch
+def test_the_same_command_started_twice_names_the_first_and_leaves_its_records(
+    write: Write,
+) -> None:
+    first = start("--set", "runner.mode+=wait")
+    rank = waiting(first)[0]
+    config = Path("work_dirs/c/config.resolved.json").read_text()
+    code, _, err = finished(start("--set", "runner.mode+=other"))
+    first.kill()
+    first.communicate()
+    assert code == 2
+    here = Path("work_dirs/c").resolve()
+    assert err.startswith(f"{here} is in use by another training: process {rank} on ")
+    assert Path("work_dirs/c/config.resolved.json").read_text() == config
 
 
 def alive(pid: int) -> bool:

@@ -8,12 +8,14 @@ from typing import ClassVar
 
 import pytest
 
+from fluxvla_core.checkpoints import owner
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import CheckpointError, RunFailed, UsageError
 from fluxvla_core.testing.training import (
     TinyDataset,
     checkpoint_differences,
     differences,
+    run_ranks,
     unflushed,
 )
 from tests.train.runs import Said, make, run
@@ -222,6 +224,33 @@ def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):
         "stays, the result will differ"
     )
     assert runner.progress.cursor.samples == 2 * 4 + 8
+
+
+def other_run(work_dir, left):
+    """In another process: what becomes of what ``left`` is while this one trains, and after."""
+    owner.PATIENCE_S = 0.0
+    try:
+        make(work_dir, "auto").run_setup(37)
+    except UsageError as error:
+        (work_dir / "refused.txt").write_text(error.what)
+        assert left.is_dir()
+    else:
+        assert not left.is_dir()
+
+
+def test_the_same_command_started_twice_leaves_the_firsts_checkpoints_alone(tmp_path):
+    left = tmp_path / "checkpoints/step-000000099.partial"
+    runner = make(tmp_path)
+    runner.run_setup(37)
+    left.mkdir()
+    assert run_ranks(1, other_run, tmp_path, left) == [0]
+    assert (
+        f"in use by another training: process {os.getpid()}"
+        in (tmp_path / "refused.txt").read_text()
+    )
+    runner.run(TinyDataset())
+    assert run_ranks(1, other_run, tmp_path, left) == [0]
+    assert not left.is_dir()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -136,15 +136,16 @@ def _ending(code: int) -> str:
 
 
 def die_with_parent() -> None:
-    """Make this rank end when its launcher does, however that ends.
+    """Make this rank end when its launcher, or torchrun's agent, does, however that ends.
 
-    After ``kill -9`` of the launcher, ranks that trained on would write into the work dir that
-    the next ``--resume auto`` reads.
+    After ``kill -9`` of it, ranks that trained on would keep the work dir from the next
+    ``--resume auto``.
     """
     if not sys.platform.startswith("linux"):
         return
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    if str(os.getppid()) != os.environ.get(ranks.LAUNCHER):  # it was gone before the call
+    # It may have been gone before the call; torchrun's agent does not say which process it is.
+    if str(os.getppid()) != os.environ.get(ranks.LAUNCHER, str(os.getppid())):
         raise RunFailed("the launcher of this rank has ended")

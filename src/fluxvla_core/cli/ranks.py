@@ -74,6 +74,11 @@ def launched() -> bool:
     return ERROR_DIR in os.environ
 
 
+def has_agent() -> bool:
+    """Whether torch's agent started this process: ``fluxvla run --nproc``, or torchrun."""
+    return launched() or "TORCHELASTIC_RUN_ID" in os.environ
+
+
 @dataclass(frozen=True)
 class Failure:
     """How one rank ended.

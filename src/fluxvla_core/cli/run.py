@@ -7,7 +7,7 @@ import errno
 import json
 import signal
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 from fluxvla_core.cli import following, ranks
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, natural, positive
 from fluxvla_core.cli.plan import Plan, make_plan, prepare_work_dir, refuse_overwriting
+from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.plugins.files import load_plugin_files
 from fluxvla_core.signals import handling
@@ -63,7 +64,7 @@ class Run:
         )
 
     def run(self, args: argparse.Namespace) -> int:
-        if ranks.launched():
+        if ranks.has_agent():
             from fluxvla_core.cli.launch import die_with_parent
 
             die_with_parent()
@@ -147,14 +148,15 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
     if ranks.rank() != 0:
         _run_section(plan, build_runner_from_cfg, replace(context, reporter=SilentReporter()))
         return
-    _leave_records(plan)
     reporter = make_reporter(args.log_format)
     try:
-        reporter.event("start", section=plan.section, work_dir=plan.work_dir)
-        for text in ranks.restarted():
-            reporter.warn(text)
-        context = replace(context, reporter=reporter)
-        result = _run_section(plan, build_runner_from_cfg, context)
+        with _owned(plan, reporter):
+            _leave_records(plan)
+            reporter.event("start", section=plan.section, work_dir=plan.work_dir)
+            for text in ranks.restarted():
+                reporter.warn(text)
+            context = replace(context, reporter=reporter)
+            result = _run_section(plan, build_runner_from_cfg, context)
         if isinstance(result, Mapping):
             for name, value in result.items():
                 if isinstance(value, (bool, int, float, str)):
@@ -168,6 +170,16 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
         raise
     finally:
         reporter.close()
+
+
+def _owned(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
+    """A training has its work dir for itself, from before it leaves the first file there."""
+    if not plan.trains:
+        return nullcontext()
+    from fluxvla_core.checkpoints.owner import claim
+
+    plan.work_dir.mkdir(parents=True, exist_ok=True)
+    return claim(plan.work_dir, reporter.warn)
 
 
 def _run_section(plan: Plan, build: Any, context: Any) -> Any:

@@ -16,6 +16,7 @@ from fluxvla_core.checkpoints.checkpoint import (
     folders,
     newest_whole,
 )
+from fluxvla_core.checkpoints.owner import Claim, claim
 from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, set_aside_later
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.train.batches import StepPlan
@@ -33,10 +34,28 @@ if TYPE_CHECKING:
 AUTO = "auto"
 
 
+def take_over(world: World, context: RunContext) -> Claim | None:
+    """Make the work dir's ``checkpoints`` folder, and keep other trainings out; the first rank has
+    the claim.
+
+    Raises:
+        UsageError: it cannot be written, or another training is using it.
+    """
+    claims: list[Claim] = []
+
+    def take() -> str:
+        prepare(context.work_dir)
+        claims.append(claim(context.work_dir, context.reporter.warn))
+        return ""
+
+    on_first(world, take)
+    return claims[0] if claims else None
+
+
 def choose(world: World, context: RunContext, resume: str | None) -> Checkpoint | None:
     """The verified checkpoint to go on from, None to start afresh; the same on every rank.
 
-    Also makes the work dir's ``checkpoints`` folder and clears what killed saves left there.
+    Also clears what killed saves left in the work dir, which :func:`take_over` made this run's.
 
     Args:
         resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
@@ -44,14 +63,13 @@ def choose(world: World, context: RunContext, resume: str | None) -> Checkpoint 
 
     Raises:
         CheckpointError: the one at the path is missing or damaged.
-        UsageError: the work dir cannot be written, or has checkpoints of another run.
+        UsageError: the work dir has checkpoints of another run.
     """
     found = on_first(world, lambda: _choose(context, resume))
     return Checkpoint.open(found) if found else None
 
 
 def _choose(context: RunContext, resume: str | None) -> str:
-    prepare(context.work_dir)
     clear_leftovers(context.work_dir)
     reporter = context.reporter
     if resume is None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.owner import Claim
     from fluxvla_core.data.order import EpisodeShards
     from fluxvla_core.hooks import HookCaller
     from fluxvla_core.train.batches import StepPlan
@@ -55,6 +56,7 @@ class TrainRun:
     flops: Meter | None = None
     sample_losses: Tensor | None = None
     _world: World | None = None
+    _claim: Claim | None = None
     _checkpoint: Checkpoint | None = None
     _arguments: ForwardArguments | None = None
     _loop: StepLoop | None = None
@@ -108,6 +110,8 @@ class TrainRun:
             if self.world.first:
                 self.metric.finalize()
             self.hooks.call("run_finished", outcome=outcome)
+            if self._claim is not None:
+                self._claim.release()
             distributed.stop(self.world, failed=outcome == "failed")
         if number:
             raise stopped(number, f"step {self.progress.step} in {self.context.work_dir}")
@@ -167,13 +171,14 @@ class TrainRun:
         return self._total(self.plan)
 
     def _prepare(self) -> None:
-        """Join the other ranks, see that checkpoints can be written, choose one to go on from."""
+        """Join the other ranks, take over the work dir, choose a checkpoint to go on from."""
         from fluxvla_core.train import distributed
-        from fluxvla_core.train.resuming import choose
+        from fluxvla_core.train.resuming import choose, take_over
 
         if self._world is not None:
             return
         self._world = distributed.start(self.options.device, self.needs_process_group)
+        self._claim = take_over(self._world, self.context)
         wanted = self.context.resume or self.options.resume_from
         self._checkpoint = choose(self._world, self.context, wanted)
 

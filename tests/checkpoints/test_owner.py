@@ -1,0 +1,119 @@
+"""One training at a time has a work dir, and nobody has one that has ended."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from fluxvla_core.checkpoints import owner
+from fluxvla_core.checkpoints.owner import LOCK, claim
+from fluxvla_core.errors import UsageError
+
+OWNER = """
+import os, sys, time
+from pathlib import Path
+from fluxvla_core.checkpoints.owner import claim
+held = claim(Path(sys.argv[1]), print)
+worker = os.fork() if "worker" in sys.argv else 1
+if worker:
+    print(worker, flush=True)
+time.sleep(120)
+"""
+
+
+def start(work_dir, *words):
+    """Another process that owns ``work_dir``, and what it said."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", OWNER, str(work_dir), *words], stdout=subprocess.PIPE, text=True
+    )
+    return process, process.stdout.readline().strip()
+
+
+def end(process):
+    process.kill()
+    process.stdout.close()
+    process.wait()
+
+
+def test_a_second_one_is_told_who_has_it_until_that_one_is_gone(tmp_path, monkeypatch):
+    process, _ = start(tmp_path)
+    monkeypatch.setattr(owner, "PATIENCE_S", 0.0)
+    try:
+        with pytest.raises(UsageError) as caught:
+            claim(tmp_path, pytest.fail)
+        said = json.loads((tmp_path / LOCK).read_text())
+        assert said["pid"] == process.pid
+        assert str(caught.value) == (
+            f"{tmp_path} is in use by another training: process {process.pid} on {said['host']}, "
+            f"since {said['since']}\n"
+            "  likely cause: the same command was started twice, or processes of a run that was "
+            "killed live on\n"
+            f"  next: wait for it, end it (kill {process.pid}), or name another --work-dir; if its "
+            f"machine is gone for good: rm {tmp_path}/{LOCK}"
+        )
+    finally:
+        end(process)
+    with claim(tmp_path, pytest.fail):
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+
+
+def test_a_loader_worker_that_lives_on_does_not_keep_it(tmp_path):
+    """A lock of flock would be inherited by the fork."""
+    process, worker = start(tmp_path, "worker")
+    end(process)
+    try:
+        os.kill(int(worker), 0)
+        with claim(tmp_path, pytest.fail) as mine:
+            assert mine.held
+    finally:
+        os.kill(int(worker), signal.SIGKILL)
+
+
+def in_use(work_dir):
+    """Whether another process finds it taken."""
+    code = (
+        "import sys; from pathlib import Path; from fluxvla_core.checkpoints import owner\n"
+        "owner.PATIENCE_S = 0.0; owner.claim(Path(sys.argv[1]), print)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(work_dir)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0 or "is in use by another training" in done.stderr
+    return done.returncode != 0
+
+
+def test_a_claim_within_a_claim_ends_without_it(tmp_path):
+    with claim(tmp_path, pytest.fail) as outer:
+        inner = claim(tmp_path, pytest.fail)
+        assert not inner.held
+        inner.release()
+        assert outer.held
+        assert in_use(tmp_path)
+    assert not in_use(tmp_path)
+
+
+def test_a_claim_that_nobody_holds_any_more_is_none(tmp_path):
+    claim(tmp_path, pytest.fail)
+    assert claim(tmp_path, pytest.fail).held
+
+
+def test_a_file_system_without_locks_is_said(tmp_path, monkeypatch):
+    def refuse(file, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "lockf", refuse)
+    said = []
+    outer = claim(tmp_path, said.append)
+    inner = claim(tmp_path, said.append)
+    assert (outer.held, inner.held) == (False, False)
+    assert said == [
+        f"{tmp_path}/{LOCK} cannot be locked (No locks available): nothing keeps a second training "
+        "out of this work dir"
+    ]

@@ -143,6 +143,40 @@ def test_a_command_that_raised_counts_as_sent():
     assert rig.limiter.last[0] == rig.robot[-1]
 
 
+def test_what_is_interrupted_before_anything_is_sent_moves_nothing(monkeypatch):
+    rig = Rig()
+    step, count = rig.limiter.step, iter(range(5))
+
+    def interrupted(*arguments):
+        if next(count) == 3:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    monkeypatch.setattr(rig.limiter, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rig.path.play([[1.0]] * 10)
+
+    assert rig.robot == []
+    assert rig.limiter.last[0] == 0.0
+    assert rig.limiter.at_rest
+
+
+def test_a_robot_that_is_slowed_down_in_the_middle_keeps_its_limits_and_stays_with_its_commands():
+    rig, shares = Rig(), iter([1.0] * 20 + [0.3] * 30 + [1.0] * 30)
+    rig.path = CommandPath(
+        rig.execute, rig.path.rate, rig.limiter, rig.latch, (), speed=lambda: next(shares)
+    )
+    rig.path.play([[1.4]] * 80)
+
+    pace = np.abs(np.diff(rig.robot)) * 50
+    fastest = ONE.joints[0].velocity
+    assert pace[:18].max() > 0.9 * fastest
+    assert pace[40:48].max() == pytest.approx(0.3 * fastest, rel=1e-3)
+    assert pushes(rig.robot) <= ONE.joints[0].acceleration
+    rig.path.brake(20)
+    assert pushes(rig.robot) <= ONE.joints[0].acceleration
+
+
 def test_a_loop_without_beats_is_reported_afterwards():
     def unpaced(actions, rate):
         rig.robot.extend(float(a[0]) for a in actions)

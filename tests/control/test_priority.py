@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -61,6 +62,36 @@ def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has
     assert mine == (os.SCHED_FIFO if real_time else os.SCHED_OTHER)
     assert seen == [os.SCHED_OTHER]
     assert child == [str(os.SCHED_OTHER)]
+
+
+@on_linux
+def test_shortly_before_its_deadline_no_other_thread_takes_the_interpreter():
+    counted, over = [0], threading.Event()
+
+    def count() -> None:
+        while not over.is_set():
+            counted[0] += 1
+            time.sleep(0)
+
+    thread = threading.Thread(target=count)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(60.0)
+    thread.start()
+    try:
+        seen = []
+        for kept_s in (0.0, 0.2):
+            before, deadline = counted[0], time.monotonic() + 0.2
+            priority.wait_until(deadline, kept_s)
+            seen.append((counted[0] - before, time.monotonic() >= deadline))
+    finally:
+        over.set()
+        sys.setswitchinterval(interval)
+        thread.join()
+
+    (given, on_time), (kept, on_time_too) = seen
+    assert given > 0
+    assert kept == 0
+    assert (on_time, on_time_too) == (True, True)
 
 
 @on_linux

@@ -67,12 +67,24 @@ def test_elsewhere_a_signal_raises_on_the_spot():
         send(signal.SIGINT)
 
 
-def test_a_second_signal_does_not_wait():
+def test_a_second_signal_does_not_wait_where_no_beat_comes(monkeypatch):
     with Interrupts() as interrupts:
         interrupts.deferred = True
         send(signal.SIGTERM)
+        monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 0.0)
         with pytest.raises(Interrupted, match="SIGINT"):
             send(signal.SIGINT)
+
+
+def test_signals_that_come_together_cut_no_command_in_half(monkeypatch):
+    monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 3600.0)
+    with Interrupts() as interrupts:
+        interrupts.deferred = True
+        send(signal.SIGHUP)
+        send(signal.SIGTERM)
+
+        with pytest.raises(Interrupted, match="SIGHUP"):
+            interrupts.check()
 
 
 def test_while_stopping_signals_are_only_counted():

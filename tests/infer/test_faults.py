@@ -253,6 +253,49 @@ def test_a_robot_that_never_gives_a_reading(bench):
 
 
 @pytest.mark.realtime
+def test_a_reading_that_is_old_moves_nothing(bench, make_arm):
+    """A driver that froze long ago, behind an operator that gives its last reading again."""
+    bench.arm = make_arm(realtime=True)
+    bench.arm.faults["frozen_after"] = -1
+    bench.arm.stamped = bench.arm.now() - 100
+
+    error = fails(
+        bench, NotReady, "no complete reading within 1 s: stream state is stale", ready_timeout=1.0
+    )
+    assert "froze" in error.cause
+    assert bench.arm.sent == []
+
+
+def test_motion_does_not_begin_with_an_answer_that_took_long(bench, make_arm):
+    """The second may, too: libraries compile more than once, and servers pause."""
+    bench.arm = make_arm(realtime=True)
+
+    def slow(chunk):
+        time.sleep(0.5)
+        return chunk
+
+    bench.policy.faults = {1: slow, 2: slow}
+    bench.run(max_publish_step=20, safety={"starvation_s": 0.3})
+
+    assert len(bench.policy.asked) >= 3
+    first = next(row for row in bench.trace() if row["event"] == "chunk")
+    assert first["ms"]["policy"] < 300
+
+
+def test_a_policy_that_is_slow_for_good_moves_nothing(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+    think = bench.policy.predict_action
+
+    def slow(observation):
+        time.sleep(0.2)
+        return think(observation)
+
+    bench.policy.predict_action = slow
+    limits = {"starvation_s": 0.1, "first_chunk_s": 1.0}
+    fails(bench, SafetyStop, "gave no chunk within 1 s that took at most 0.1 s", safety=limits)
+    assert bench.arm.sent == []
+
+
 def test_a_robot_whose_get_frame_hangs(bench, make_arm):
     bench.arm = make_arm(realtime=True)
     bench.arm.faults["get_frame"] = lambda: time.sleep(2)

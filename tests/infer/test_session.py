@@ -11,6 +11,7 @@ import pytest
 
 from fluxvla_core.errors import Faulted, NotReady, RunFailed, SafetyStop, UsageError
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
+from tests.infer.conftest import TASKS
 from tests.infer.test_sources import Person
 
 
@@ -297,3 +298,103 @@ def test_the_source_is_opened_before_the_robot_and_closed_after_it(bench, asked)
     bench.run(task=None)
 
     assert bench.arm.calls == ["source opened", "connect", "stop", "close", "source closed"]
+
+
+@pytest.fixture
+def real(make_arm):
+    """Lags behind its commands as arms do: it droops, and its jaw presses on what it holds."""
+
+    class Real(make_arm):
+        def get_state(self):
+            return self.state.copy()
+
+        def send_action(self, action):
+            super().send_action(action)
+            if not self.faults.get("stuck"):
+                self.state = np.array([action[0] - 0.04, action[1], max(action[2], 0.4)])
+
+    return Real(realtime=True)
+
+
+@pytest.fixture
+def gripping(make_waver):
+    """Closes the jaw."""
+
+    class Gripping(make_waver):
+        def predict_action(self, observation):
+            chunk = super().predict_action(observation)
+            if chunk.dtype == np.float64:
+                chunk[:, 2] = 0.0
+            return chunk
+
+    return Gripping(goal=0.3)
+
+
+class Acts(Slow):
+    """Does something to the arm just before saying each line, for which there is a deed."""
+
+    def __init__(self, deeds, *lines, polls=10):
+        super().__init__(*lines, polls=polls)
+        self.deeds = deeds
+
+    def ask(self):
+        super().ask()
+        deed = self.deeds.pop(self.lines[0] if self.lines else None, None)
+        if deed is not None:
+            deed()
+
+
+def test_the_next_task_begins_at_the_command_that_holds_the_arm(bench, real, gripping, asked):
+    """Not where it droops to; and a gripper does not let go."""
+    bench.arm, bench.policy = real, gripping
+    asked(Slow("1", "2", polls=3))
+
+    bench.run(task=None, max_publish_step=40)
+
+    ended = len([row for row in bench.trace("001-1") if row["event"] == "command"])
+    assert bench.arm.sent[ended - 1][2] == 0.0
+    assert len(bench.arm.sent) > 80
+    bench.assert_within_limits()
+
+
+def test_after_a_stop_it_begins_where_the_arm_is_and_goes_on_gripping(bench, real, gripping, asked):
+    bench.arm, bench.policy = real, gripping
+    before = []
+
+    def move():
+        before.append(len(real.sent))
+        real.state[0] = 0.9
+
+    asked(Acts({"rearm": move}, "1", "rearm", "2"))
+    bench.policy.faults[3] = nan
+
+    bench.run(task=None, max_publish_step=60)
+
+    first = bench.arm.sent[before[0]]
+    assert first[0] == pytest.approx(0.9, abs=0.01)
+    assert first[2] == pytest.approx(bench.arm.sent[before[0] - 1][2], abs=0.04)
+
+
+def switched_off(arm):
+    arm.faults["stuck"] = True
+    arm.state[0] = -0.9
+
+
+def test_an_arm_that_does_not_stay_where_it_is_held_is_stopped(bench, real, gripping, asked):
+    bench.arm, bench.policy = real, gripping
+    person = asked(Acts({"2": lambda: switched_off(real)}, "1", "2", polls=1000))
+
+    with pytest.raises(SafetyStop, match=r"shoulder is .* away from its command"):
+        bench.run(task=None, max_publish_step=10)
+    assert any("away from its command" in told for told in person.told)
+    sent = len([row for row in bench.trace("001-1") if row["event"] == "command"])
+    assert len(bench.arm.sent) < sent + 200
+
+
+def test_who_says_so_allows_motion_again_after_that(bench, real, gripping, asked):
+    bench.arm, bench.policy = real, gripping
+    deeds = {"2": lambda: switched_off(real), "rearm": real.faults.clear}
+    asked(Acts(deeds, "1", "2", "rearm", "3", polls=60))
+
+    result = bench.run(task=None, max_publish_step=10, task_descriptions={**TASKS, "3": "stir"})
+    assert (result["episodes"], result["task"]) == (2, "3")

@@ -184,7 +184,8 @@ class TestCommanding:
     def test_another_commander_is_refused_at_the_start(self, operators, robot, drivers):
         drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
 
-        assert "/teleop_" in rejection_of(operators).what
+        # DDS may tell of a publisher before it tells whose it is.
+        wait_for(lambda: "/teleop_" in rejection_of(operators).what)
 
     def test_another_commander_stops_the_commands_and_its_leaving_frees_them(self, arm, drivers):
         arm.send_action([0.1, 0.2, 0.5])

@@ -42,13 +42,13 @@ def test_a_latch_holds_with_its_first_reason_until_re_armed():
 
 def test_an_arm_that_stays_behind_trips_after_a_while():
     watch = TrackingWatch(ARM, SETTINGS)
-    command = np.array([1.0, 0.5, 0.0])
     state = np.array([0.6, 0.5, 1.0])
-    watch.check(command, state, 10.0)
-    watch.check(command, state, 10.24)
+    watch.sent(np.array([1.0, 0.5, 0.0]), 9.9)
+    watch.check(state, 10.0)
+    watch.check(state, 10.24)
 
     with pytest.raises(SafetyStop) as caught:
-        watch.check(command, state, 10.25)
+        watch.check(state, 10.25)
     assert caught.value.rule == "tracking"
     assert "turn is 0.4 away from its command for 0.25 s; 0.3 are allowed" in str(caught.value)
 
@@ -56,29 +56,49 @@ def test_an_arm_that_stays_behind_trips_after_a_while():
 def test_an_old_state_does_not_say_that_the_arm_stays_behind():
     watch = TrackingWatch(ARM, SETTINGS)
     state = np.array([0.6, 0.5, 1.0])
-    for turn in np.linspace(0.9, 2.5, 50):
-        watch.check(np.array([turn, 0.5, 0.0]), state, 10.0)
+    watch.sent(np.array([0.9, 0.5, 0.0]), 9.9)
+    for beat in range(50):
+        watch.sent(np.array([1.0 + beat / 20, 0.5, 0.0]), 10.0 + beat / 50)
+        watch.check(state, 10.0)
 
-    with pytest.raises(SafetyStop, match=r"turn is 1\.9 away from its command for 0\.30 s"):
-        watch.check(np.array([2.5, 0.5, 0.0]), state, 10.3)
+    with pytest.raises(SafetyStop, match=r"turn is 1\.15 away from its command for 0\.30 s"):
+        watch.check(state, 10.3)
+
+
+def test_a_state_is_held_against_the_command_that_the_arm_had_then():
+    watch = TrackingWatch(ARM, SETTINGS)
+    speed, lag, latency = 1.6, 0.06, 0.15
+    for beat in range(100):
+        now = beat / 50
+        watch.sent(np.array([speed * now, 0.5, 0.0]), now)
+        seen = now - latency
+        watch.check(np.array([max(0.0, speed * (seen - lag)), 0.5, 0.0]), seen)
+
+
+def test_a_state_from_before_all_commands_says_nothing():
+    watch = TrackingWatch(ARM, SETTINGS)
+    watch.check(np.array([0.6, 0.5, 1.0]), 1.0)
+    watch.sent(np.array([1.0, 0.5, 0.0]), 2.0)
+    watch.check(np.array([0.0, 0.5, 1.0]), 1.5)
 
 
 def test_catching_up_in_between_begins_the_time_anew():
     watch = TrackingWatch(ARM, SETTINGS)
-    command = np.array([1.0, 0.5, 0.0])
+    watch.sent(np.array([1.0, 0.5, 0.0]), 0.0)
     behind, there = np.array([0.6, 0.5, 0.0]), np.array([0.9, 0.5, 0.0])
     for now, state in [(0.0, behind), (0.2, there), (0.4, behind), (0.6, behind)]:
-        watch.check(command, state, now)
+        watch.check(state, now)
     watch.reset()
-    watch.check(command, behind, 0.7)
+    watch.check(behind, 0.7)
 
 
 def test_prismatic_joints_are_measured_in_metres_and_grippers_not_at_all():
     watch = TrackingWatch(ARM, SETTINGS)
-    command, state = np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.46, 1.0])
-    watch.check(command, state, 0.0)
+    watch.sent(np.array([0.0, 0.5, 0.0]), 0.0)
+    state = np.array([0.0, 0.46, 1.0])
+    watch.check(state, 0.0)
     with pytest.raises(SafetyStop, match=r"slide is 0\.04 away"):
-        watch.check(command, state, 1.0)
+        watch.check(state, 1.0)
 
 
 def test_joints_are_found_by_name_in_a_state_of_its_own():

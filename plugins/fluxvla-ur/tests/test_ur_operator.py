@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fluxvla_ur.embodiment import JOINTS, ur_spec
 from fluxvla_ur.operator import CONTROLLERS, TRAJECTORY, UROperator
-from fluxvla_ur.speed import scaled_step
 
+from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.ros2.streams import FLOAT64, FLOAT64_ARRAY, IMAGE, JOINT_STATE
 from fluxvla_core.testing import OperatorConformance
@@ -61,6 +61,23 @@ def robot(controller=FORWARD, scaling=None, running=None):
         {"topic": "/gripper/command", "message": FLOAT64},
     ]
     return streams, sinks
+
+
+class Turns:
+    """Turns the base as far as it may."""
+
+    action_rate_hz, horizon = 10.0, 5
+
+    def __init__(self, embodiment):
+        self.embodiment = embodiment
+
+    def reset(self, seed):
+        return
+
+    def predict_action(self, observation):
+        chunk = np.repeat(observation["qpos"][None].astype(np.float64), self.horizon, axis=0)
+        chunk[:, 0] += 0.15 * np.arange(1, self.horizon + 1)
+        return chunk
 
 
 def wait_for(condition, seconds=8.0):
@@ -142,20 +159,6 @@ class TestConfig:
             UROperator(**arguments)
 
 
-class TestScaledStep:
-    speeds = np.array([1.0, 2.0])
-
-    def test_a_step_that_is_slow_enough_is_taken_whole(self):
-        wanted = np.array([0.05, -0.1])
-
-        np.testing.assert_array_equal(scaled_step(np.zeros(2), wanted, self.speeds, 0.05), wanted)
-
-    def test_a_fast_step_is_cut_on_the_straight_line(self):
-        moved = scaled_step(np.zeros(2), np.array([0.2, 0.1]), self.speeds, 0.05)
-
-        np.testing.assert_allclose(moved, [0.05, 0.025])
-
-
 class TestRobot:
     def test_joints_by_name_and_a_gripper_of_its_own(self, connect, drivers):
         drivers(*robot())
@@ -217,30 +220,53 @@ class TestRobot:
 
 
 class TestWhatTheRobotSays:
-    def test_a_slowed_robot_is_given_slower_commands(self, connect, drivers):
+    def test_a_slider_that_is_moved_while_the_arm_moves(self, connect, drivers, tmp_path):
+        """Commands keep all limits and the share of the speed; the arm is not taken for blocked."""
+        driver = drivers(*robot(scaling=20.0))
+        operator = connect(publish_rate=50.0)
+        wait_for(lambda: operator.newest("speed scaling"))
+        published, publish = [], operator.publish_action
+
+        def publishing(action):
+            share = {80: 100.0, 120: 30.0}.get(len(published))
+            if share is not None:
+                driver.tell(change={SCALING: {"data": share}})
+            published.append((operator.speed_scaling, action))
+            publish(action)
+
+        operator.publish_action = publishing
+        runner = BaseInferenceRunner(
+            context=RunContext(section="inference", work_dir=tmp_path, task="1"),
+            operator=operator,
+            policy=Turns(operator.embodiment),
+            task_descriptions={"1": "turn"},
+            prepare_pose=[0.4, *POSE[1:], 0.5],
+            record_fps=None,
+            max_publish_step=160,
+        )
+        runner.run_setup()
+        assert runner.run()["outcome"] == "max_steps"
+
+        shares, actions = (np.array(values) for values in zip(*published, strict=True))
+        joint = operator.embodiment.joints[0]
+        speed = np.diff(actions[:, 0], prepend=POSE[0]) * 50.0
+        push = np.diff(speed, prepend=0.0) * 50.0
+        assert sorted(set(shares)) == pytest.approx([0.2, 0.3, 1.0])
+        assert np.abs(push).max() <= joint.acceleration
+        assert np.abs(speed).max() <= joint.velocity
+        assert 0.19 * joint.velocity < np.abs(speed[shares == 0.2]).max() < 0.21 * joint.velocity
+        assert np.abs(speed).max() > 0.4 * joint.velocity
+
+    def test_a_slider_that_is_no_number_stops_the_arm(self, connect, drivers):
         driver = drivers(*robot(scaling=20.0))
         operator = connect()
         wait_for(lambda: operator.newest("speed scaling"))
-        assert operator.speed_scaling == pytest.approx(0.2)
-        wanted = np.array([*POSE, 0.5])
-        wanted[0] += 1.0
-        for number in (1, 2, 3):
-            operator.send_action(wanted)
-            wait_for(lambda n=number: len(driver.on(COMMANDS)) == n)
+        driver.tell(fault=f"{SCALING}=nan")
+        wait_for(lambda: np.isnan(operator.newest("speed scaling").message.data))
 
-        sent = [POSE[0], *(heard["data"][0] for heard in driver.on(COMMANDS))]
-        limit = operator.embodiment.joints[0].velocity * 0.2 / operator.embodiment.rate_hz
-        np.testing.assert_allclose(np.diff(sent), limit)
-
-    def test_the_scaled_controller_needs_no_help(self, connect, drivers):
-        driver = drivers(*robot(SCALED, scaling=20.0))
-        operator = connect(controller=SCALED)
-        wait_for(lambda: operator.newest("speed scaling"))
-        operator.send_action([1.1, *POSE[1:], 0.5])
-        wait_for(lambda: driver.on(CONTROLLERS[SCALED][0]))
-
-        (point,) = driver.on(CONTROLLERS[SCALED][0])[0]["points"]
-        assert point["positions"][0] == 1.1
+        with pytest.raises(Faulted, match=rf"the speed scaling \({SCALING}\) is nan"):
+            operator.send_action([*POSE, 0.5])
+        assert driver.on(COMMANDS) == []
 
     def test_a_paused_robot_refuses(self, connect, drivers):
         drivers(*robot(scaling=0.0))

@@ -174,20 +174,25 @@ class TestDriving:
         assert robot.ask()["running"]
         operator.send_action(POSE)
 
-    def test_the_speed_slider_slows_commands_down(self, robot, connect):
-        operator = connect(robot, publish_rate=50.0)
+    def test_what_the_speed_slider_says(self, robot, connect):
+        operator = connect(robot)
         robot.tell(target_speed_fraction=0.2)
-        wait_for(lambda: operator.speed_scaling == pytest.approx(0.2))
-        wanted = POSE.copy()
-        wanted[0] += 1.0
-        for _ in range(3):
-            operator.send_action(wanted)
-            time.sleep(0.05)
-        wait_for(lambda: len(robot.ask()["servo"]) == 3)
 
-        sent = [0.0, *(q[0] for _, q, *_ in robot.ask()["servo"])]
-        limit = operator.embodiment.joints[0].velocity * 0.2 / 50.0
-        np.testing.assert_allclose(np.diff(sent), limit)
+        wait_for(lambda: operator.speed_scaling == pytest.approx(0.2))
+
+    def test_after_a_stop_the_arm_is_held_where_it_came_to_rest(self, robot, connect):
+        operator = connect(robot)
+        assert operator.last_action is None
+        told = POSE.copy()
+        told[0] += 0.1
+        operator.send_action(told)
+        np.testing.assert_array_equal(operator.last_action, told)
+
+        operator.stop()
+        wait_for(lambda: robot.ask()["stops"])
+        held, state = operator.last_action, operator.get_state()
+        np.testing.assert_allclose(held[:6], state[:6], atol=1e-6)
+        assert held[6] == told[6]
 
 
 class TestFaults:

@@ -46,6 +46,25 @@ class StampsState(Protocol):
         """When the newest state arrived, in seconds on the operator's clock."""
 
 
+class TellsLastAction(Protocol):
+    """An operator that knows what holds its arm, also after a stop: episodes begin from there.
+
+    An arm lags behind what holds it, and a gripper presses: neither is to be let go.
+    """
+
+    @property
+    def last_action(self) -> npt.NDArray[np.float64] | None:
+        """``(dim,)`` the command that the arm has, None if it has none."""
+
+
+class ScalesSpeed(Protocol):
+    """An operator whose robot a person may slow down: commands keep to that share of its speed."""
+
+    @property
+    def speed_scaling(self) -> float:
+        """0 (paused: ``send_action`` refuses) to 1."""
+
+
 class KeepsPictures(Protocol):
     """An operator that keeps pictures for a while: recordings then have all that arrive."""
 

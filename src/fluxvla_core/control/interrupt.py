@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import signal
+import time
 from contextlib import ExitStack
 from types import FrameType, TracebackType
 
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.signals import handling
+
+IMPATIENT_S = 0.5
 
 
 class Interrupted(BaseException):
@@ -36,9 +39,10 @@ class Interrupts:
     by default it would end the process with the arm in motion. ``nohup`` keeps it from coming.
 
     While ``deferred`` is set, the first signal waits for ``check``, which the loop calls at every
-    beat, so that no command is cut in half. Otherwise, and for a second signal that finds the first
-    still waiting, ``Interrupted`` is raised on the spot. Once the stop has begun (``stopping``),
-    further signals are only counted: nothing may keep the robot from being stopped.
+    beat, so that no command is cut in half. Otherwise, and for another signal where no beat came
+    for ``IMPATIENT_S`` after the first, ``Interrupted`` is raised on the spot. Once the stop has
+    begun (``stopping``), further signals are only counted: nothing may keep the robot from being
+    stopped.
     """
 
     def __init__(self) -> None:
@@ -46,6 +50,7 @@ class Interrupts:
         self.stopping = False
         self.signals: list[int] = []
         self._pending: int | None = None
+        self._since = 0.0
         self._taken = ExitStack()
 
     def __enter__(self) -> Interrupts:
@@ -87,7 +92,11 @@ class Interrupts:
         self.signals.append(number)
         if self.stopping:
             return
+        now = time.monotonic()
         if self.deferred and self._pending is None:
-            self._pending = number
+            self._pending, self._since = number, now
+            return
+        # Two at once are one wish: a terminal that closes sends several.
+        if self.deferred and now - self._since < IMPATIENT_S:
             return
         raise Interrupted(number)

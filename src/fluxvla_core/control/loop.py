@@ -179,15 +179,19 @@ class Loop:
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
         """The first answer: nothing moves, and the policy may have to warm up.
 
-        It is asked twice on a robot: by the time of a long first answer, what it saw is old. The
-        episode begins with the second one.
+        On a robot it is asked again until it answers as fast as it must later, and once at least:
+        by the time of a long answer, what it saw is old. The episode begins with the last one.
         """
+        until = time.monotonic() + self.settings.first_chunk_s
         asked = self._ask()
-        answer = self._idle(asked)
-        if not self.lockstep:
+        answer = self._idle(asked, until)
+        slow = not self.lockstep
+        while slow:
             self.begin_anew()
+            began = time.monotonic()
             asked = self._ask()
-            answer = self._idle(asked)
+            answer = self._idle(asked, until)
+            slow = time.monotonic() - began > self.settings.starvation_s
         return answer, asked.last
 
     def _take(self, asked: Asked | None) -> Asked | None:
@@ -205,17 +209,20 @@ class Loop:
 
     def _answer(self, asked: Asked) -> tuple[Seen, Any]:
         # In lockstep time stands still until it is there.
-        return self._idle(asked) if self.lockstep else asked.future.result()
+        if not self.lockstep:
+            return asked.future.result()
+        return self._idle(asked, time.monotonic() + self.settings.first_chunk_s)
 
-    def _idle(self, asked: Asked) -> tuple[Seen, Any]:
+    def _idle(self, asked: Asked, until: float) -> tuple[Seen, Any]:
         """The answer, waited for in real time; meanwhile the arm is held, if it was commanded."""
-        until = time.monotonic() + self.settings.first_chunk_s
         while not asked.future.done():
             if time.monotonic() > until:
                 raise Starved(
-                    f"the policy gave no chunk within {self.settings.first_chunk_s:g} s",
+                    f"the policy gave no chunk within {self.settings.first_chunk_s:g} s that took "
+                    f"at most {self.settings.starvation_s:g} s",
                     cause="it hangs, or it is far slower than this robot needs",
-                    next="safety.first_chunk_s sets how long it may take to warm up",
+                    next="safety.first_chunk_s sets how long it may take to warm up, "
+                    "safety.starvation_s how long it may take then",
                 )
             if self.holds:
                 self.path.hold()

@@ -46,6 +46,8 @@ class CommandPath:
         latch: while it is tripped only ``brake`` sends.
         filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
         on_sent: called after each beat with what was sent, None for a beat without a command.
+        speed: tells, before each command, the share of the velocity limits that it may use, in
+            (0, 1]: a robot that a person slowed down. None where there is no such thing.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class CommandPath:
         latch: Latch,
         filters: Sequence[Filter] = (),
         on_sent: Callable[[Sent | None], None] | None = None,
+        speed: Callable[[], float] | None = None,
     ) -> None:
         self.rate = rate
         self.limiter = limiter
@@ -63,9 +66,12 @@ class CommandPath:
         self._execute = execute
         self._filters = tuple(filters)
         self._on_sent = on_sent or (lambda sent: None)
+        self._speed = speed
         self._rows: deque[Sent] = deque()
-        self._between = False
-        self._unpaced = False
+        # When the arm had the command that ``on_sent`` is told of, at the latest; of those that a
+        # loop with a beat of its own plays, when the first was.
+        self.sent_at = 0.0
+        self._handed = self._between = self._unpaced = False
         rate.on_beat = self._beat
 
     def play(self, targets: npt.ArrayLike, filtered: bool = True) -> None:
@@ -77,21 +83,31 @@ class CommandPath:
         self.latch.check()
         wanted = np.asarray(targets, dtype=np.float64)
         shaped = np.array([self._filtered(row) for row in wanted]) if filtered else wanted
+        if self._speed is None:
+            self._play(wanted, shaped, 1.0)
+            return
+        for row in range(len(wanted)):
+            self._play(wanted[row : row + 1], shaped[row : row + 1], self._speed())
+
+    def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
         before = self.limiter.snapshot()
-        commands, clamps = self.limiter.run(shaped)
-        played = len(commands)
+        self._handed = False
+        played = 0
         try:
+            commands, clamps = self.limiter.run(shaped, speed)
             played = self._send(wanted, commands, clamps)
         except BaseException:
-            if not self._unpaced:
+            if self._unpaced:
+                played = len(shaped)
+            elif self._handed:
                 # The command that was being sent counts as sent; those after it were not.
-                played = len(commands) - len(self._rows) + (0 if self._between else 1)
+                played = len(shaped) - len(self._rows) + (0 if self._between else 1)
             raise
         finally:
             self._rows.clear()
-            if played < len(commands):
+            if played < len(shaped):
                 self.limiter.restore(before)
-                self.limiter.run(shaped[:played])
+                self.limiter.run(shaped[:played], speed)
 
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
@@ -120,9 +136,10 @@ class CommandPath:
         rows = zip(wanted, commands, clamps, strict=True)
         self._rows = deque(Sent(t, c, tuple(found), held) for t, c, found in rows)
         self._between = self._unpaced = False
+        self._handed = True
         handed = commands.copy()
         handed.flags.writeable = False
-        beats = self.rate.beats
+        beats, self.sent_at = self.rate.beats, self.rate.clock.now()
         self._execute(handed, self.rate)
         if self.rate.beats == beats:
             # A loop with a beat of its own: what it was given, it has played.
@@ -132,7 +149,7 @@ class CommandPath:
         return len(commands) - len(self._rows)
 
     def _beat(self) -> None:
-        self._between = True
+        self._between, self.sent_at = True, self.rate.clock.now()
         self._on_sent(self._rows.popleft() if self._rows else None)
         self._between = False
 

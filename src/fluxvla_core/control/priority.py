@@ -3,7 +3,8 @@
 Three things keep a Python thread from its deadline, and each has a means of its own:
 
 * other threads of the interpreter, which keep it for 5 ms unless they are asked to give it up
-  earlier (``sys.setswitchinterval``);
+  earlier (``sys.setswitchinterval``), and have it just when a deadline comes unless it was taken
+  from them before (``wait_until``);
 * a full garbage collection, which stops all threads for as long as it takes to look at every
   object of every imported library (``gc.freeze`` takes those out);
 * other processes, which may also stop a thread that has the interpreter just then. Where the system
@@ -15,15 +16,56 @@ Three things keep a Python thread from its deadline, and each has a means of its
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 
 SWITCH_S = 0.0005
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
+_TIMER_ABSTIME = 1  # of <time.h>
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def wait_until(deadline: float, kept_s: float) -> None:
+    """Sleep until ``deadline`` (monotonic, in seconds), the last ``kept_s`` with the interpreter.
+
+    A thread that wakes has to get the interpreter first. This one has it by then; meanwhile others
+    only compute outside of it, as torch's do. Off Linux it is given up as in any sleep.
+    """
+    left = deadline - kept_s - time.monotonic()
+    if left > 0.0:
+        time.sleep(left)
+    sleep = _keeping_sleep()
+    if sleep is not None and time.monotonic() < deadline:
+        seconds = int(deadline)
+        until = _Timespec(seconds, int((deadline - seconds) * 1e9))
+        sleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
+    # What is left where a signal ended it.
+    left = deadline - time.monotonic()
+    if left > 0.0:
+        time.sleep(left)
+
+
+@cache
+def _keeping_sleep() -> Callable[..., int] | None:
+    """``clock_nanosleep`` of a Linux C library."""
+    if sys.platform != "linux":
+        return None
+    try:
+        # PyDLL, unlike CDLL and time.sleep, does not give the interpreter up around a call.
+        found: Callable[..., int] = ctypes.PyDLL(None).clock_nanosleep
+    except (OSError, AttributeError):
+        return None
+    return found
 
 
 @contextmanager
@@ -34,6 +76,7 @@ def first() -> Iterator[bool]:
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(min(interval, SWITCH_S))
+    _keeping_sleep()  # found now, not while an arm moves
     gc.collect()
     gc.freeze()
     before = _raise(PRIORITY)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 from fluxvla_core.contracts.protocols import Clock
+from fluxvla_core.control import priority
 from fluxvla_core.control.clock import MonotonicClock, in_lockstep
 
 
@@ -16,7 +17,8 @@ class Rate:
     the arm for a jump. Two beats are at least half a period apart, however late the first one was.
 
     What a command is made of takes a while, and not always the same. So ``sleep`` may return
-    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself.
+    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself;
+    for the last half of it, in real time, no other thread of the interpreter comes between.
 
     In a lockstep simulation both return at once.
 
@@ -102,7 +104,10 @@ class Rate:
         self._waits = True
         self.late_s = 0.0
         if self._due is not None:
-            self.clock.sleep_until(self._due)
+            if type(self.clock) is MonotonicClock:
+                priority.wait_until(self._due, self.lead_s / 2)
+            else:
+                self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)
         return self.late_s
 

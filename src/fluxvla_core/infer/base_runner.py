@@ -191,6 +191,7 @@ class BaseInferenceRunner:
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
         self._episodes = 0
+        self._commanded: Array | None = None
 
     def run_setup(self) -> None:
         """Load the policy and check that it, the robot, the poses and the task fit together.
@@ -339,8 +340,12 @@ class BaseInferenceRunner:
             hooks=hooks,
             context=self.context,
         )
-        episode = Episode(plan, task, self._episodes, folder)
-        summary = episode.run()
+        held = self._session.episode is not None
+        episode = Episode(plan, task, self._episodes, folder, self._commanded, held)
+        try:
+            summary = episode.run()
+        finally:
+            self._commanded = episode.commanded
         self._episodes += 1
         if not self.robot.lockstep:
             self._session.episode = episode

@@ -29,12 +29,14 @@ from fluxvla_core.record.replay_policy import ENDED, RecordingEnded
 from fluxvla_core.safety.gates import FreshnessGate, check_frame
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
-from fluxvla_core.safety.stops import BadChunk, BadFrame
+from fluxvla_core.safety.stops import BadChunk, BadFrame, BadTiming
 from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
 
 Array = npt.NDArray[np.float64]
 # How long before its deadline a command is made ready, in seconds and as a share of the period.
 _LEAD_S, _LEAD_SHARE = 0.002, 0.1
+_LOOK_S = 0.5  # that a reading may take
+_THERE = 1e-9  # from the start pose, in the joints' units
 # After these the arm no longer obeys, or nobody knows whether it does: it is not commanded on.
 _NOT_BRAKED = ("operator", "tracking", "execute")
 
@@ -47,18 +49,30 @@ class Episode:
         task: what to do.
         number: how many episodes the run had before.
         folder: where the record goes.
+        before: ``(D,)`` the last command of the run, None before any.
+        held: whether the arm was held by it since, without a stop.
 
     Raises:
         RunFailed: the folder cannot be written to.
         BadFrame: the state does not tell where a commanded joint is.
     """
 
-    def __init__(self, plan: Plan, task: Task, number: int, folder: Path) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        task: Task,
+        number: int,
+        folder: Path,
+        before: Array | None = None,
+        held: bool = False,
+    ) -> None:
         self._plan = plan
         self._task = task
         self._number = number
         self._seed = plan.seed + number
         self._folder = folder
+        self._before = before
+        self._held = held
         embodiment, settings = plan.robot.embodiment, plan.settings
         lead_s = min(_LEAD_S, _LEAD_SHARE / plan.rate_hz)
         self._rate = Rate(plan.rate_hz, plan.robot.clock, lead_s=lead_s)
@@ -69,11 +83,18 @@ class Episode:
             settings.acceleration_scale,
         )
         self._path = CommandPath(
-            self._execute, self._rate, self._limiter, plan.latch, plan.filters, self._on_sent
+            self._execute,
+            self._rate,
+            self._limiter,
+            plan.latch,
+            plan.filters,
+            self._on_sent,
+            plan.robot.speed,
         )
         self._gate = FreshnessGate(settings.max_age_s, settings.max_skew_s)
         self._tracking = TrackingWatch(embodiment, settings)
         self._columns = action_columns(embodiment)
+        self._grippers = np.array([joint.kind == "gripper" for joint in embodiment.joints])
         self._phase = "start"
         self._executing = False
         self._record = EpisodeRecord(plan, task, self._seed, folder, self._rate)
@@ -114,15 +135,30 @@ class Episode:
     def hold(self) -> None:
         """Send the last command once more, at the next beat: after an episode that ended well.
 
+        What goes wrong meanwhile trips the latch, and the robot is stopped.
+
         Raises:
-            SafetyStop: the latch was tripped.
-            OperatorError: the robot does not take it.
+            SafetyStop: the latch was tripped, or the arm does not stay.
+            OperatorError: the robot does not take it, or a stream fell silent.
         """
         beats = self._rate.beats
-        self._path.hold()
+        try:
+            self._path.hold()
+        except FluxError as error:
+            if self._plan.latch.tripped is None:
+                self._plan.latch.trip(self._rule(error), error)
+            failure = self._plan.robot.stop()
+            if failure:
+                self._plan.context.reporter.warn(failure)
+            raise
         if self._rate.beats == beats:
             # A runner's own sending that has no beat of the rate's.
             time.sleep(self._rate.period)
+
+    @property
+    def commanded(self) -> Array | None:
+        """``(D,)`` its last command, None if it had not begun."""
+        return self._limiter.last if self._limiter.started else None
 
     def _begin(self) -> None:
         """Read where the arm is, and bring it to the start pose."""
@@ -131,7 +167,7 @@ class Episode:
         window, frame = self._first_reading()
         state = self._checked(window, frame)
         self._record.seen(state, window["images"], frame, {})
-        self._limiter.start(state[self._columns])
+        self._limiter.start(self._where(state))
         plan.policy.reset(self._seed)
         if plan.start_pose is not None:
             self._phase = "ramp"
@@ -139,6 +175,9 @@ class Episode:
             seconds = len(targets) / plan.rate_hz
             plan.context.reporter.info(f"moving to the start pose, {seconds:.1f} s")
             self._path.play(targets, filtered=False)
+            # An arm that a person slowed down is not there yet.
+            while np.abs(self._limiter.last - plan.start_pose).max() > _THERE:
+                self._path.play([plan.start_pose], filtered=False)
         for each in plan.filters:
             reset = getattr(each, "reset", None)
             if reset is not None:
@@ -163,9 +202,26 @@ class Episode:
             worker=plan.worker,
             interrupts=plan.interrupts,
             latency_s=plan.latency_s,
-            holds=plan.start_pose is not None and not plan.robot.lockstep,
+            holds=(plan.start_pose is not None or self._held) and not plan.robot.lockstep,
             begin_anew=lambda: plan.policy.reset(self._seed),
         )
+
+    def _where(self, state: Array) -> Array:
+        """``(D,)`` the command to go on from: the one that holds the arm, else where it is.
+
+        A joint that is far from its command was moved, or the arm was stopped; a gripper always is,
+        because of what it holds.
+        """
+        measured = self._plan.robot.state()
+        if measured is not None:
+            state = measured.state
+        commanded = self._plan.robot.commanded(self._before)
+        if commanded is None:
+            return state[self._columns]
+        kept = self._grippers
+        if self._held:
+            kept = kept | self._tracking.follows(commanded, state)
+        return np.where(kept, commanded, state[self._columns])
 
     def _first_reading(self) -> tuple[dict[str, Any], Frame | None]:
         until = time.monotonic() + self._plan.ready_s
@@ -174,8 +230,10 @@ class Episode:
             try:
                 window, frame = self._look(until)
                 _check_complete(window, self._plan.cameras)
+                if frame is not None:
+                    self._gate.check(frame.stamps, self._plan.cameras, self._plan.robot.clock.now())
                 return window, frame
-            except NotReady as error:
+            except (NotReady, BadTiming) as error:
                 if time.monotonic() > until:
                     raise NotReady(
                         f"the robot gave no complete reading within {self._plan.ready_s:g} s: "
@@ -190,6 +248,8 @@ class Episode:
         plan = self._plan
         if plan.robot.lockstep:
             return plan.look()
+        # One that is begun shortly before the end is given its time, too.
+        until = max(until, time.monotonic() + _LOOK_S)
         future = plan.worker.submit(plan.look)
         while not future.done() and time.monotonic() < until:
             plan.interrupts.check()
@@ -227,7 +287,7 @@ class Episode:
             stamp = frame.stamps[STATE]
             seconds = {"receipt": age, **seconds}
         if plan.robot.follows:
-            self._tracking.check(last, state, stamp)
+            self._tracking.check(state, stamp)
         self._record.seen(state, window["images"], frame, seconds)
         observation = {**window, "task_description": self._task.instruction}
         return Seen(observation, now - age)
@@ -280,17 +340,16 @@ class Episode:
     def _on_sent(self, sent: Sent | None) -> None:
         """The beat after each command: recorded always, supervised while it may still stop."""
         plan, record = self._plan, self._record
-        if self._phase == "over":
-            return
-        supervised = self._phase in ("ramp", "ready", "run")
+        # Between two episodes, too: an arm that is held may be switched off, or moved.
+        supervised = self._phase in ("ramp", "ready", "run", "over")
         try:
-            state, problem = plan.robot.state(), None
+            measured, problem = plan.robot.state(), None
         except OperatorError as error:
             # What was sent is recorded all the same; and a stream that fell silent stops an arm,
             # it does not keep it from braking.
-            state, problem = None, error
-        if sent is not None:
-            record.command(sent, self._phase, state)
+            measured, problem = None, error
+        if sent is not None and self._phase != "over":
+            record.command(sent, self._phase, None if measured is None else measured.state)
             if plan.hooks:
                 action = sent.command.copy()
                 action.flags.writeable = False
@@ -300,8 +359,10 @@ class Episode:
         if problem is not None:
             raise problem
         plan.interrupts.check()
-        if state is not None and sent is not None and plan.robot.follows:
-            self._tracking.check(sent.command, state, plan.robot.state_stamp())
+        if sent is not None:
+            self._tracking.sent(sent.command, self._path.sent_at)
+        if measured is not None and plan.robot.follows:
+            self._tracking.check(measured.state, measured.at)
         if self._phase != "run" or sent is None:
             return
         record.steps += 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,15 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 # How long a safe stop may take before a person is told to use the emergency stop.
 STOP_S = 5.0
+_LEAST_SPEED = 0.01
+
+
+@dataclass(frozen=True)
+class Measured:
+    """``(state_dim,)`` where the robot was, and when that arrived, on its clock."""
+
+    state: npt.NDArray[np.float64]
+    at: float
 
 
 class Robot:
@@ -76,18 +86,40 @@ class Robot:
         self._call("send_action", action)
         self.sent_s = time.perf_counter() - began
 
-    def state(self) -> npt.NDArray[np.float64] | None:
-        """The ``(state_dim,)`` state alone, from an operator that has ``get_state``; else None.
+    def state(self) -> Measured | None:
+        """The state alone, from an operator that has ``get_state``; else None.
 
         It is read after each command, on a real robot while another thread may read frames.
         """
         read = getattr(self.operator, "get_state", None)
-        return None if read is None else np.asarray(read(), dtype=np.float64)
-
-    def state_stamp(self) -> float:
-        """When that state arrived, where the operator can tell (``state_stamp``); else now."""
+        if read is None:
+            return None
         tell = getattr(self.operator, "state_stamp", None)
-        return self.clock.now() if tell is None else float(tell())
+        # The stamp first: what arrives in between is newer than it says, which does no harm.
+        at = None if tell is None else float(tell())
+        state = np.asarray(read(), dtype=np.float64)
+        return Measured(state, self.clock.now() if at is None else at)
+
+    @property
+    def speed(self) -> Callable[[], float] | None:
+        """Tells the share of its speed that a person lets it have (``speed_scaling``), or None."""
+        operator = self.operator
+        if not hasattr(type(operator), "speed_scaling"):
+            return None
+        # An arm that is paused takes no command, and says so when it is given one.
+        return lambda: min(max(float(operator.speed_scaling), _LEAST_SPEED), 1.0)
+
+    def commanded(self, before: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64] | None:
+        """``(D,)`` what the arm was told last, None if nothing, or nothing that still counts.
+
+        Args:
+            before: the last command of this run, for operators that do not tell (``last_action``).
+        """
+        if hasattr(type(self.operator), "last_action"):
+            last = self.operator.last_action
+            return None if last is None else np.asarray(last, dtype=np.float64)
+        # Who begins episodes may put the arm elsewhere.
+        return None if hasattr(self.operator, "begin_episode") else before
 
     def success(self) -> bool | None:
         """Whether the task is done as of now, where the operator can tell (``task_success``)."""

@@ -1,9 +1,9 @@
 """The episodes of one run, one after the other, and what happens in between.
 
 Between two episodes the arm holds: its last command is sent again at every beat, so that drivers
-which stop an arm that they hear nothing for keep it where it is, and whatever goes wrong while
-nobody moves it is noticed. After a stop nothing is sent and no task is taken, until whoever gives
-the tasks says ``rearm``.
+which stop an arm that they hear nothing for keep it where it is, and what goes wrong while nobody
+moves it stops it as in an episode. After a stop nothing is sent and no task is taken, until whoever
+gives the tasks says ``rearm``.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class Session:
         worker: Worker,
     ) -> None:
         self.episode: Episode | None = None
+        self._failure: FluxError | None = None
         self._source = source
         self._known = known
         self._run_episode = run_episode
@@ -67,32 +68,38 @@ class Session:
             Exception: what else ended an episode or the hold between two.
         """
         result: dict[str, Any] = {"episodes": 0}
-        failure: FluxError | None = None
         for task in tasks(self._source, self._known, self._idle, self._heard):
             try:
                 summary = self._run_episode(task)
             except (SafetyStop, PolicyFailed, NotReady) as error:
-                self.episode = None
-                # A policy that still thinks cannot be asked again.
-                if not self._source.waits or self._worker.busy:
-                    raise
-                failure = error
-                self._interrupts.resume()
-                self._source.tell(f"{error}\nstopped; {REARM!r} allows motion again")
+                self._stopped(error)
                 continue
             self._interrupts.check()
             result = {"episodes": result["episodes"] + 1, **{key: summary[key] for key in _KEPT}}
-        if failure is not None and self._latch.tripped:
-            raise failure
+        if self._failure is not None and self._latch.tripped:
+            raise self._failure
         return result
+
+    def _stopped(self, error: FluxError) -> None:
+        """Go on, without motion, where somebody can say ``rearm``; else raise ``error``."""
+        self.episode = None
+        # A policy that still thinks cannot be asked again.
+        if not self._source.waits or self._worker.busy:
+            raise error
+        self._failure = error
+        self._interrupts.resume()
+        self._source.tell(f"{error}\nstopped; {REARM!r} allows motion again")
 
     def _idle(self) -> None:
         self._interrupts.deferred = True
         self._interrupts.check()
         if self.episode is None:
             time.sleep(_LOOK_S)
-        else:
+            return
+        try:
             self.episode.hold()
+        except (SafetyStop, NotReady) as error:
+            self._stopped(error)
 
     def _heard(self, line: str) -> bool:
         trip = self._latch.tripped

@@ -9,9 +9,9 @@ from fluxvla_core.errors import Rejected
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
-# A joint further than this from its last command (rad or m) is held where it is: it was blocked,
+# A joint further than this from its last command (rad, or m) is held where it is: it was blocked,
 # and pushing on would not be a stop.
-HOLD_REACH = 0.15
+HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015}
 
 
 def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
@@ -36,24 +36,24 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
     return values
 
 
-def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, age_s: float) -> Array:
+def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Array) -> Array:
     """The command that holds an arm: the last one, but for joints that were kept from following.
 
     Grippers keep their last command always: what they hold is why they are behind it. A joint may
-    have gone on since it was measured, at its limit at most; where it can be at its last command by
-    now it is not sent back to where it was.
+    have gone on since it was measured; where it can be at its last command by now it is not sent
+    back to where it was. One that did not move then is not taken to have moved since.
 
     Args:
         last: ``(dim,)`` last command.
         state: ``(state_dim,)`` as measured.
-        age_s: how long ago that was, in seconds.
+        moved: ``(state_dim,)`` how far each joint has gone since, if it went on as it did.
     """
-    where = dict(zip(embodiment.state_names, state, strict=True))
+    where = {name: index for index, name in enumerate(embodiment.state_names)}
     target = last.copy()
     for index, joint in enumerate(embodiment.joints):
-        measured = where.get(joint.name)
-        if joint.kind == "gripper" or measured is None:
+        column = where.get(joint.name)
+        if joint.kind == "gripper" or column is None:
             continue
-        if abs(measured - last[index]) > HOLD_REACH + joint.velocity * age_s:
-            target[index] = min(max(measured, joint.lower), joint.upper)
+        if abs(state[column] - last[index]) > HOLD_REACH[joint.kind] + moved[column]:
+            target[index] = min(max(state[column], joint.lower), joint.upper)
     return target

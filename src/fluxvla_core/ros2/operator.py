@@ -181,6 +181,7 @@ class RosOperator(ABC):
             BadMessage: the joint states are not what the embodiment describes.
             Faulted: the connection broke.
         """
+        self._fresh()
         return self._measured()[0]
 
     def state_stamp(self) -> float:
@@ -189,8 +190,8 @@ class RosOperator(ABC):
         Raises:
             NotReady: not connected.
         """
-        streams = self._connected().streams
-        newest = [streams[spec.name].newest() for spec in self._specs_of(STATE)]
+        self._connected()
+        newest = [self.newest(spec.name) for spec in self._specs_of(STATE)]
         return min(received.receipt for received in newest if received is not None)
 
     def pictures_after(
@@ -231,7 +232,7 @@ class RosOperator(ABC):
             connection.check()
             if self._fault is not None:
                 raise self._fault
-            admitted = self.admit(checked)
+            admitted = checked_action(self.embodiment, self.admit(checked))
             self.publish_action(admitted)
             self._last = admitted
 
@@ -246,7 +247,7 @@ class RosOperator(ABC):
                 return
             steps = [self.on_stop]
             if self._last is not None:
-                target = self._hold_target(self._last)
+                self._last = target = self._hold_target(self._last)
                 steps.insert(0, lambda: self.publish_action(target))
             for step in steps:
                 try:
@@ -406,16 +407,25 @@ class RosOperator(ABC):
 
     def _hold_target(self, last: Array) -> Array:
         try:
-            state, receipt = self._measured()
+            self._fresh()
+            state, receipt = self._measured(-1)
+            before, earlier = self._measured(-2)
         except FluxError:
             # Where the arm is, nobody knows; its last command is where it goes or stays.
             return last
-        return hold_target(self.embodiment, last, state, time.monotonic() - receipt)
+        passed, age = receipt - earlier, time.monotonic() - receipt
+        moved = np.abs(state - before) * (age / passed if passed > 0 else 0.0)
+        return hold_target(self.embodiment, last, state, moved)
 
-    def _measured(self) -> tuple[Array, float]:
-        """The newest ``(state_dim,)`` state, and the receipt of the oldest message in it."""
-        newest = self._fresh()
-        states = {spec.name: newest[spec.name] for spec in self._specs_of(STATE)}
+    def _measured(self, index: int = -1) -> tuple[Array, float]:
+        """A ``(state_dim,)`` state that is kept, and the receipt of the oldest message in it.
+
+        Args:
+            index: -1 for the newest, -2 for the one before it, or the newest if it is the only one.
+        """
+        streams = self._connected().streams
+        kept = {spec.name: streams[spec.name].ring.items() for spec in self._specs_of(STATE)}
+        states = {name: items[max(index, -len(items))] for name, items in kept.items()}
         state = self.read_state({name: found.message for name, found in states.items()})
         return state, min(found.receipt for found in states.values())
 

@@ -203,7 +203,7 @@ class Limiter:
         last, speed, target = snapshot
         self._last, self._speed, self._target = last.copy(), speed.copy(), target.copy()
 
-    def run(self, wanted: npt.ArrayLike) -> tuple[Array, list[list[Clamp]]]:
+    def run(self, wanted: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[list[Clamp]]]:
         """``step`` for each row of ``(N, D)``; all rows are checked before the first is used."""
         rows = np.asarray(wanted, dtype=np.float64)
         for row in rows:
@@ -211,7 +211,7 @@ class Limiter:
         commands = np.empty_like(rows)
         clamps = []
         for index, row in enumerate(rows):
-            commands[index], found = self.step(row)
+            commands[index], found = self.step(row, speed)
             clamps.append(found)
         return commands, clamps
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,6 +19,8 @@ Array = npt.NDArray[np.float64]
 PRISMATIC_SHARE = 0.1
 # How much further beyond its limits a gripper may be wanted: pressing is how policies hold things.
 GRIPPER_EXCESS = 4.0
+# Commands that are kept to hold a state against; an older one is too old to say anything.
+_REMEMBERED = 256
 
 
 @dataclass(frozen=True)
@@ -90,25 +93,38 @@ class TrackingWatch:
         self._allowed: Array = np.array([allowed[j.kind] for j in embodiment.joints])
         self._time = settings.tracking_time_s
         self._since: Array = np.full(len(self._names), np.inf)
+        self._sent: deque[tuple[float, Array]] = deque(maxlen=_REMEMBERED)
 
     def reset(self) -> None:
         """Begin anew: the arm is where its command is."""
         self._since[:] = np.inf
 
-    def check(self, command: Array, state: npt.ArrayLike, measured: float) -> None:
-        """Compare the last command with where the arm is.
+    def sent(self, command: Array, at: float) -> None:
+        """A ``(dim,)`` command was sent, at that time in seconds."""
+        self._sent.append((at, command))
 
-        An old state says nothing about the arm now: it is not behind for longer than it was
-        measured to be.
+    def follows(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which joints, ``(dim,)``, are as near to ``command`` as they must be."""
+        measured = np.asarray(state, dtype=np.float64)[self._columns]
+        near: npt.NDArray[np.bool_] = np.abs(measured - command) <= self._allowed
+        return near
+
+    def check(self, state: npt.ArrayLike, measured: float) -> None:
+        """Compare where the arm was with the command that it had then.
+
+        An old state says nothing about the arm now: it is held against what was sent before it was
+        measured, and it is not behind for longer than it was measured to be.
 
         Args:
-            command: ``(dim,)`` as sent.
             state: ``(state_dim,)`` as measured.
             measured: when that was, in seconds.
 
         Raises:
             NotFollowing: a joint has been too far behind for too long.
         """
+        command = next((c for at, c in reversed(tuple(self._sent)) if at <= measured), None)
+        if command is None:
+            return
         error = np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
         behind = error > self._allowed
         self._since = np.where(behind, np.minimum(self._since, measured), np.inf)

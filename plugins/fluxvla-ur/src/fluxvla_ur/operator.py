@@ -25,7 +25,7 @@ from fluxvla_core.ros2.streams import (
 from fluxvla_core.ros2.trouble import BadMessage, Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
-from fluxvla_ur.speed import check_not_paused, scaled_step
+from fluxvla_ur.speed import check_not_paused
 
 Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
@@ -194,7 +194,12 @@ class UROperator(RosOperator):
     def speed_scaling(self) -> float:
         """Share of the programmed speed that the robot runs at, 0 to 1; 1 where it does not say."""
         received = self.newest("speed scaling")
-        return 1.0 if received is None else float(np.clip(received.message.data / 100.0, 0.0, 1.0))
+        if received is None:
+            return 1.0
+        percent = float(received.message.data)
+        if not math.isfinite(percent):
+            raise BadMessage(f"the speed scaling ({self._scaling_topic}) is {percent}")
+        return min(max(percent / 100.0, 0.0), 1.0)
 
     def admit(self, action: Array) -> Array:
         running = self.newest("program running")
@@ -204,14 +209,8 @@ class UROperator(RosOperator):
                 cause="a protective or emergency stop, local mode, or External Control ended",
                 next="look at the teach pendant, clear the stop, and play the program again",
             )
-        scaling = self.speed_scaling
-        check_not_paused(scaling)
-        if scaling == 1.0 or not self._forward:
-            return action
-        before = self.last_action
-        if before is None:
-            before = self.get_state()
-        return scaled_step(before, action, self._speeds(), scaling / self.embodiment.rate_hz)
+        check_not_paused(self.speed_scaling)
+        return action
 
     def publish_action(self, action: Array) -> None:
         closed, opened = self._gripper_ends
@@ -241,6 +240,3 @@ class UROperator(RosOperator):
         if not math.isfinite(value):
             raise BadMessage(f"the gripper ({self._gripper_state}) reports {value}")
         return value
-
-    def _speeds(self) -> Array:
-        return np.array([joint.velocity for joint in self.embodiment.joints])

@@ -30,7 +30,7 @@ from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import ACCELERATION, JOINTS, RATE_HZ, ur_spec
 from fluxvla_ur.robotiq import PORT as GRIPPER_PORT
 from fluxvla_ur.robotiq import RobotiqGripper
-from fluxvla_ur.speed import check_not_paused, scaled_step
+from fluxvla_ur.speed import check_not_paused
 from fluxvla_ur.video import VideoCamera
 
 Array = npt.NDArray[np.float64]
@@ -244,17 +244,12 @@ class URRTDEOperator:
             if not self._listens():
                 raise self._not_obeying()
             period = 1.0 / self.embodiment.rate_hz
-            sent = checked
-            if reading.scaling < 1.0:
-                before = self.get_state() if self._last is None else self._last
-                speeds = np.array([joint.velocity for joint in self.embodiment.joints])
-                sent = scaled_step(before, checked, speeds, reading.scaling * period)
             lookahead, gain = self._servo
-            if not self._control.servoJ(sent[:_ARM].tolist(), 0.0, 0.0, period, lookahead, gain):
+            if not self._control.servoJ(checked[:_ARM].tolist(), 0.0, 0.0, period, lookahead, gain):
                 raise self._not_obeying()
-            self._spoke, self._moving, self._last = time.monotonic(), True, sent
+            self._spoke, self._moving, self._last = time.monotonic(), True, checked
             if self._gripper is not None:
-                self._gripper.move(float(sent[_ARM]))
+                self._gripper.move(float(checked[_ARM]))
 
     def stop(self) -> None:
         """Come to rest within the acceleration limit and hold.
@@ -290,6 +285,18 @@ class URRTDEOperator:
             self._release()
 
     # Parts.
+
+    @property
+    def last_action(self) -> Array | None:
+        """``(7,)`` what holds arm and gripper, None before any command.
+
+        ``servoStop`` leaves the arm where it comes to rest, not at its last command.
+        """
+        with self._lock:
+            last = self._last
+            if last is None or self._control is None:
+                return None
+            return last.copy() if self._moving else np.append(self._reading().joints, last[_ARM])
 
     @property
     def speed_scaling(self) -> float:

@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_ur.operator import UROperator
 
@@ -95,6 +97,17 @@ class InSimulation(RosOperator):
             return frame
         stamps = {name: at * self.real_time_factor for name, at in frame.stamps.items()}
         return replace(frame, stamps=stamps)
+
+    def state_stamp(self) -> float:
+        """As the robot's operator; on ``clock``."""
+        return super().state_stamp() * self.real_time_factor
+
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """As the robot's operator; times are on ``clock``."""
+        found, arrived = super().pictures_after(camera, after / self.real_time_factor)
+        return [(at * self.real_time_factor, picture) for at, picture in found], arrived
 
     def begin_episode(self, instruction: str, episode: int) -> None:
         """Robot at home, objects where ``seed + episode`` puts them; waits until that is seen.

@@ -17,7 +17,7 @@ Write = Callable[[str, str], Path]
 
 TOY = '''\
 """Toy classes, registered by ``--plugin toy.py``."""
-import json, os, time
+import json, os, signal, time
 from fluxvla_core import DATASETS, OPERATORS, RUNNERS
 from fluxvla_core.errors import DataError
 
@@ -66,6 +66,9 @@ class ToyTrainRunner:
             raise ValueError("boom")
         if rank == 1 and self.mode == "rank 1 dies":
             os.kill(os.getpid(), 9)
+        if self.mode == "wait, rank 1 deaf" and rank == 1:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         if self.mode.startswith(("rank 1", "wait")):
             (context.work_dir / f"pid-{rank}").write_text(str(os.getpid()))
             time.sleep(120)

@@ -118,11 +118,48 @@ def test_signals_reach_the_ranks(write: Write, number: int, code: int, text: str
     assert not any(alive(pid) for pid in pids)
 
 
+KILLED = """1 of 2 ranks were killed, or had not begun, when they were to stop and save
+  likely cause: saving took longer than --grace 1 (seconds)
+  next: {}: go on with the same command and --resume auto
+"""
+
+
+@torch
+@pytest.mark.parametrize(
+    ("number", "code", "prefix", "left"),
+    [
+        (signal.SIGINT, 130, "interrupted: ", "the newest whole checkpoint is {}"),
+        (signal.SIGTERM, 1, "", "there is no checkpoint yet"),
+    ],
+)
+def test_ranks_that_must_be_killed_leave_word_of_what_there_is(
+    write: Write, number: int, code: int, prefix: str, left: str
+) -> None:
+    saved = Path("work_dirs/c/checkpoints/step-000000003")
+    if "{}" in left:
+        saved.mkdir(parents=True)
+        (saved / "manifest.json").write_text("{}")
+    words = ("--set", "runner.mode+=wait, rank 1 deaf", "--grace", "1", "--resume", "auto")
+    process = start(*words)
+    pids = waiting(process)
+    process.send_signal(number)
+    assert finished(process)[::2] == (code, prefix + KILLED.format(left.format(saved)))
+    assert not any(alive(pid) for pid in pids)
+
+
+def test_grace_is_for_processes_that_are_started(run: Fluxvla) -> None:
+    for words in (("--section", "eval", "--nproc", "2"), ("--section", "runner")):
+        ended = run("--config", "c.py", *words, "--grace", "5")
+        assert ended.code == 2
+        assert "--grace is for the processes that --nproc or --max-restarts starts" in ended.err
+
+
 @torch
 @pytest.mark.parametrize("command", [COMMAND, TORCHRUN], ids=["nproc", "torchrun"])
 def test_ranks_do_not_outlive_a_launcher_that_is_killed(
     write: Write, command: Sequence[str]
 ) -> None:
+    Path("work_dirs/c").mkdir(parents=True)  # under torchrun the first rank makes it
     process = start("--set", "runner.mode+=wait", command=command)
     pids = waiting(process)
     process.kill()
@@ -250,14 +287,14 @@ def test_a_rank_whose_launcher_is_gone_ends(monkeypatch: pytest.MonkeyPatch) -> 
     assert done.stdout == "the launcher of this rank has ended\n"
 
 
-def test_a_rank_that_was_killed_after_the_grace_is_no_cause(
+def test_a_rank_that_did_not_stop_after_anothers_failure_is_no_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Process:
         exitcode = -9
 
     first = Failure(1, 100.0, "ValueError: boom", 1)
-    monkeypatch.setattr(launch.time, "monotonic", lambda: 100.0 + launch._GRACE_S)
+    monkeypatch.setattr(launch.time, "monotonic", lambda: 100.0 + launch._STOP_S)
     found = launch._all({0: Process(), 1: Process()}, {1: first})
     assert root_cause(found) is first
     monkeypatch.setattr(launch.time, "monotonic", lambda: 101.0)

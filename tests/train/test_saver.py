@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 
 import pytest
 import torch
@@ -134,6 +135,31 @@ def test_memory_is_kept_from_save_to_save(tmp_path, monkeypatch):
     monkeypatch.setattr(saver.torch, "empty", counted)
     run(tmp_path)
     assert set(made) == {"checkpoint-2"}
+
+
+def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, monkeypatch):
+    """Gathering is pretended: one process has everything anyhow. Real ones save in
+    test_exact_resume.py."""
+    alive: list[weakref.ref[torch.Tensor]] = []
+    most = []
+
+    def pretended(tensor):
+        gathered = tensor.detach().clone()
+        alive[:] = [ref for ref in alive if ref() is not None] + [weakref.ref(gathered)]
+        most.append(len(alive))
+        return gathered
+
+    plain = run(tmp_path / "plain")
+    monkeypatch.setattr(saver, "is_split", lambda tensor: True)
+    monkeypatch.setattr(saver, "whole", pretended)
+    split = run(tmp_path / "split")
+
+    assert len(most) > 10
+    assert max(most) <= 2
+    for a, b in zip(plain, split, strict=True):
+        assert [n.rpartition("/")[2] for n in checkpoint_differences(a, b)] == [
+            "config.resolved.json"
+        ]
 
 
 def test_copies_wait_for_nothing_without_a_job():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,51 @@ def test_looking_changes_nothing(tmp_path):
     assert set(checkpoint_differences(*ends)) == {
         f"{ends[0].name}/{name}" for name in ("config.resolved.json", "trainer.json")
     }
+
+
+class Stopping(TinyDataset):
+    """SIGTERM arrives while the batch of ``step`` is loaded."""
+
+    def __init__(self, step):
+        super().__init__()
+        self.left = 4 * step
+
+    def get_sample(self, index, epoch):
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().get_sample(index, epoch)
+
+
+@pytest.mark.parametrize("step", [1, 4, 8])
+def test_a_stop_does_not_wait_for_it_and_the_run_that_goes_on_makes_up_for_it(tmp_path, step):
+    settings = {
+        "val_iter_interval": 1 if step == 1 else 4,
+        "learning_rate": 0.3,
+        "metric": {"type": "VLAMetric", "window_size": 3},
+    }
+    run(tmp_path / "whole", **settings)
+    cut = make(tmp_path / "cut", **settings)
+    cut.run_setup(37)
+    with pytest.raises(RunFailed, match=f"step {step} in"):
+        cut.run(Stopping(step))
+    assert step not in losses(tmp_path / "cut")
+    assert (
+        latest(tmp_path / "cut").json("trainer.json")["validation"]["owed"]["global_step"] == step
+    )
+    run(tmp_path / "cut", "auto", **settings)
+    assert list(losses(tmp_path / "cut")) == list(losses(tmp_path / "whole"))
+    ends = [folders(tmp_path / d)[-1] for d in ("whole", "cut")]
+    found = set(differences(tmp_path / "whole", tmp_path / "cut"))
+    assert "metrics.jsonl" not in found
+    # A run that is stopped at its very end has saved it before.
+    late = [f"{ends[0].name}/trainer.json"] if step == 8 else []
+    assert checkpoint_differences(*ends) == late
+    links = [os.readlink(tmp_path / d / "checkpoints/best") for d in ("whole", "cut")]
+    assert links[0] == links[1]
+    before = (tmp_path / "cut/metrics.jsonl").read_text().count("\n")
+    run(tmp_path / "cut", "auto", **settings)
+    assert (tmp_path / "cut/metrics.jsonl").read_text().count("\n") == before == 8
 
 
 @VLAS.register_module()

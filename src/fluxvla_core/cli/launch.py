@@ -17,21 +17,27 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.errors import EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
 
-_GRACE_S = 60  # for a checkpoint, between asking ranks to stop and killing them
+GRACE_S = 600
+"""Seconds for a checkpoint, between asking ranks to stop and killing them."""
+_STOP_S = 30
+"""What torch's agent gives the others when a rank has failed: they have nothing left to save."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-def launch(nproc: int, words: Sequence[str], restarts: int = 0) -> int:
+def launch(
+    nproc: int, words: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = GRACE_S
+) -> int:
     """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
 
     Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped. Up to
     ``restarts`` times all are started again, from the newest checkpoint; after that the words and
-    the exit code of the one that failed first are this command's.
+    the exit code of the one that failed first are this command's. Asked to stop, they have
+    ``grace`` seconds to save in ``work_dir``; then they are killed.
 
     Raises:
         UsageError: torch is not installed, or this process is itself a rank.
         RunFailed: a rank was killed, or this command was.
-        KeyboardInterrupt: Ctrl-C; the ranks were given time to save.
+        KeyboardInterrupt: Ctrl-C.
     """
     if ranks.world_size() is not None:
         raise UsageError(
@@ -39,7 +45,7 @@ def launch(nproc: int, words: Sequence[str], restarts: int = 0) -> int:
             next="leave --nproc out under torchrun",
         )
     try:
-        from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
+        from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs, SignalException
         from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
         from torch.distributed.launcher.api import LaunchConfig, elastic_launch
     except ModuleNotFoundError as error:
@@ -65,11 +71,16 @@ def launch(nproc: int, words: Sequence[str], restarts: int = 0) -> int:
                 rdzv_endpoint="127.0.0.1:0",
                 local_addr="127.0.0.1",
                 max_restarts=restarts,
-                shutdown_timeout=_GRACE_S,
+                shutdown_timeout=grace,
                 logs_specs=DefaultLogsSpecs(log_dir=folder),
             )
             agent = elastic_launch(config, sys.executable)
-            return _watch(agent, words, Path(folder), ChildFailedError)
+            try:
+                return _watch(agent, words, Path(folder), ChildFailedError)
+            except SignalException as error:
+                said = list(ranks.failures(Path(folder)).values())
+                unsaved = _unsaved(nproc - len(said), nproc, work_dir, grace)
+                return _stopped(signal.Signals(error.sigval), said, unsaved)
     finally:
         for name in (ranks.ERROR_DIR, ranks.LAUNCHER):
             os.environ.pop(name, None)
@@ -77,21 +88,39 @@ def launch(nproc: int, words: Sequence[str], restarts: int = 0) -> int:
 
 
 def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) -> int:
-    from torch.distributed.elastic.multiprocessing import SignalException
-
     try:
         agent("-m", "fluxvla_core", "run", *words)
-    except SignalException as error:
-        said = list(ranks.failures(folder).values())
-        if error.sigval == signal.SIGINT:
-            raise KeyboardInterrupt(_after("interrupted", said)) from None
-        if said:
-            return _tell(ranks.root_cause(said))
-        raise RunFailed(f"stopped by {signal.Signals(error.sigval).name}") from None
     except failed as error:
-        said = _all(error.failures, ranks.failures(folder))
-        return _tell(ranks.root_cause(said))
+        return _tell(ranks.root_cause(_all(error.failures, ranks.failures(folder))))
     return 0
+
+
+def _stopped(number: signal.Signals, said: list[ranks.Failure], unsaved: RunFailed | None) -> int:
+    """How this command ends after a signal, by what the ranks said of it."""
+    failed = [f for f in said if not f.asked and f.code != EXIT_INTERRUPTED]
+    if failed:
+        return _tell(ranks.root_cause(failed))
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt(_after("interrupted", said) if unsaved is None else str(unsaved))
+    if unsaved is not None:
+        raise unsaved
+    return _tell(ranks.root_cause(said))
+
+
+def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed | None:
+    """What is left when ``silent`` ranks did not say how they ended: they had to be killed."""
+    from fluxvla_core.checkpoints.checkpoint import folders
+
+    if not silent:
+        return None
+    # A checkpoint has its name only when it is whole; summing it up again would take long.
+    found = folders(work_dir)
+    left = f"the newest whole checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
+    return RunFailed(
+        f"{silent} of {nproc} ranks were killed, or had not begun, when they were to stop and save",
+        cause=f"saving took longer than --grace {grace} (seconds)",
+        next=f"{left}: go on with the same command and --resume auto",
+    )
 
 
 def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ranks.Failure]:
@@ -104,7 +133,7 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
             found.append(said[rank])
             continue
         # SIGTERM came from us, and so did SIGKILL to one that did not answer it in time.
-        late = process.exitcode == -signal.SIGKILL and now - first >= _GRACE_S
+        late = process.exitcode == -signal.SIGKILL and now - first >= _STOP_S
         ours = late or process.exitcode == -signal.SIGTERM
         text = f"ended without a word: {_ending(process.exitcode)}"
         if process.exitcode == -signal.SIGKILL:

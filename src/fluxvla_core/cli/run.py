@@ -47,6 +47,13 @@ class Run:
             metavar="N",
             help="when a process of a training ends, start all again from the newest checkpoint",
         )
+        parser.once(
+            "--grace",
+            type=positive,
+            metavar="SECONDS",
+            help="for processes to save when they are stopped, before they are killed "
+            "(default 600)",
+        )
         parser.add_argument(
             "--eval-after-train",
             action="store_true",
@@ -80,11 +87,12 @@ class Run:
             prepare_work_dir(plan.work_dir)
             if plan.trains and ranks.resume(args.resume, plan.work_dir) is None:
                 refuse_overwriting(plan.work_dir)
-        if plan.trains and (args.nproc > 1 or args.max_restarts):
-            from fluxvla_core.cli.launch import launch
+        if plan.trains and _launches(args):
+            from fluxvla_core.cli.launch import GRACE_S, launch
 
+            grace = args.grace or GRACE_S
             with _terminable():
-                code = launch(args.nproc, _words(args), args.max_restarts)
+                code = launch(args.nproc, _words(args), plan.work_dir, args.max_restarts, grace)
         else:
             with _terminable(), _disk_full(plan.work_dir):
                 _execute(plan, args)
@@ -108,11 +116,21 @@ def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
                 f"--{flag.replace('_', '-')} is for training, and section {plan.section!r} does "
                 "not train"
             )
+    if args.grace is not None and not (plan.trains and _launches(args)):
+        raise UsageError(
+            "--grace is for the processes that --nproc or --max-restarts starts",
+            next="leave it out: this one saves when it is stopped, however long that takes",
+        )
     if args.resume not in (None, "auto") and not Path(args.resume).exists():
         raise UsageError(
             f"--resume {args.resume}: there is no such checkpoint",
             next="--resume auto takes the newest one of the work dir",
         )
+
+
+def _launches(args: argparse.Namespace) -> bool:
+    """Whether a training is done by other processes, which this one starts."""
+    return bool(args.nproc > 1 or args.max_restarts)
 
 
 def _words(args: argparse.Namespace) -> list[str]:

@@ -32,7 +32,12 @@ _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 def plain(config: Any) -> Any:
     """``config`` as JSON values; objects, which one made in Python may hold, are described."""
-    return json.loads(json.dumps(config, default=repr))
+    return json.loads(json.dumps(config, default=_described))
+
+
+def _described(value: Any) -> str:
+    """Where it lies in memory is another place in every process."""
+    return _ADDRESS.sub("", repr(value))
 
 
 def changed_settings(
@@ -63,7 +68,7 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
     if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
         value = {str(i): item for i, item in enumerate(value)}
     if not isinstance(value, Mapping):
-        yield name, _ADDRESS.sub("", json.dumps(value, ensure_ascii=False))
+        yield name, json.dumps(value, ensure_ascii=False)
         return
     for key, item in value.items():
         if key not in HARMLESS and not key.endswith("_path"):

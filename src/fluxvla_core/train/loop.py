@@ -43,7 +43,8 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     validation = None if run.val_options is None else Validation(run)
     if world.first:
         name_best(context.work_dir, run.progress.best_step)
-        run.metric.start(run.progress.step, context.config)
+        told = run.progress.step - (run.progress.owed is not None)
+        run.metric.start(told, context.config)
     sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
     loader = make_loader(
         dataset,
@@ -91,6 +92,7 @@ class StepLoop:
             The signal that asked for a stop, 0 if none did.
         """
         run, stopped = self._run, 0
+        self._catch_up()
         if not (finished() or self._enough()):
             self._look_ahead()
         self._window.restart_clock()
@@ -109,7 +111,11 @@ class StepLoop:
                 or step % run.options.log_iter_interval == 0
             ):
                 found = self._fetch()
-                better = validate and self._validate(found)
+                if stopped and validate:
+                    # Whoever asks for a stop may kill soon. The run that goes on makes up for it,
+                    # and tells of this step then.
+                    run.progress.owed = found.pop()
+                better = validate and not stopped and self._validate(found[-1])
                 self._report(found)
                 save = save or better or bool(stopped) or self._enough()
             if save:
@@ -117,6 +123,16 @@ class StepLoop:
             elif self._stop.due(step):
                 run.settle_saves(wait=False)
         return stopped
+
+    def _catch_up(self) -> None:
+        """Validate where a stop has left that out, as if there had been no stop."""
+        run, owed = self._run, self._run.progress.owed
+        if owed is None:
+            return
+        run.progress.owed = None
+        if self._validation is not None and self._validate(owed) and run.world.first:
+            name_best(run.context.work_dir, run.progress.step)
+        self._report([owed])
 
     def _look_ahead(self) -> None:
         """Show the first batch to whoever has to see one before the first step."""
@@ -139,11 +155,11 @@ class StepLoop:
         every = self._run.options.val_iter_interval
         return last or (save if every is None else self._run.progress.step % every == 0)
 
-    def _validate(self, found: list[dict[str, Any]]) -> bool:
-        """Add the validation loss to the newest of ``found``; whether it is the best so far."""
+    def _validate(self, record: dict[str, Any]) -> bool:
+        """Add the validation loss to a step's ``record``; whether it is the best so far."""
         run = self._run
         assert self._validation is not None
-        loss = found[-1]["val_loss"] = self._validation.loss(run)
+        loss = record["val_loss"] = self._validation.loss(run)
         better = run.progress.validated(loss)
         if self._enough() and run.world.first:
             run.context.reporter.info(
@@ -201,7 +217,7 @@ class StepLoop:
 
     def _report(self, found: list[dict[str, Any]]) -> None:
         run = self._run
-        if not run.world.first:
+        if not (run.world.first and found):
             return
         for values in found:
             run.metric.commit(**values)

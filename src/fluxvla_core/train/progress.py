@@ -19,6 +19,7 @@ class Progress:
         saved: the step of the last checkpoint, -1 when there is none.
         best, best_step: lowest validation loss, and its step.
         worse: validations since then.
+        owed: the record of the present step, which a stop left without its validation.
     """
 
     step: int = 0
@@ -28,6 +29,7 @@ class Progress:
     best: float | None = None
     best_step: int = -1
     worse: int = 0
+    owed: dict[str, Any] | None = None
 
     def validated(self, loss: float) -> bool:
         """Take the validation loss of the present step; whether it is the best so far."""
@@ -44,7 +46,12 @@ class Progress:
             "epoch": self.cursor.epoch,
             "cursor": {"epoch": self.cursor.epoch, "samples": self.cursor.samples},
             "train_loss": self.loss,
-            "validation": {"best": self.best, "best_step": self.best_step, "worse": self.worse},
+            "validation": {
+                "best": self.best,
+                "best_step": self.best_step,
+                "worse": self.worse,
+                **({"owed": self.owed} if self.owed is not None else {}),
+            },
         }
 
     @classmethod

@@ -1,8 +1,10 @@
 """Saving beside the training: the step loop waits for a copy in memory, not for the disk.
 
-One checkpoint at a time is on its way. What a step changes anyhow is copied at once; weights,
-averages and optimizer state are copied in the saving thread while the next forward and backward
-passes run, and the optimizer waits for that copy before it changes them.
+One checkpoint at a time is on its way. What a step changes anyhow is copied at once, and so is what
+has to be gathered from several processes, one tensor after the other, because no device need have
+room for all of it. Other weights, averages and optimizer state are copied in the saving thread
+while the next forward and backward passes run, and the optimizer waits for that copy before it
+changes them.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.parts import is_split
+from fluxvla_core.checkpoints.tensors import TensorFile, whole
 from fluxvla_core.train.distributed import World, agree
 
 
@@ -81,7 +84,7 @@ class Saver:
         if not self.beside:
             self._run(job, lambda: write(self.world, files, warn))
             return
-        gathered = [file.gathered() for file in files]
+        gathered = [self._gathered(file) for file in files]
         ready = _reached(self.world.device)
         job.thread = threading.Thread(
             target=self._run,
@@ -131,6 +134,16 @@ class Saver:
         except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
             job.error = error
 
+    def _gathered(self, file: TensorFile) -> TensorFile:
+        """``file`` with its split tensors in host memory; all ranks call it."""
+        found: list[Tensor] = []
+        for tensor in file.tensors:
+            full = whole(tensor) if file.mine or is_split(tensor) else tensor
+            if file.mine:
+                place = (file.name, len(found))
+                found.append(self._copy(place, full) if is_split(tensor) else full)
+        return replace(file, tensors=tuple(found))
+
     def _held(
         self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
     ) -> Iterator[TensorFile]:
@@ -156,6 +169,8 @@ class Saver:
         if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
             kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
             self._memory[place] = kept
+        if kept is tensor:
+            return kept
         with torch.no_grad():
             return kept.copy_(tensor)
 

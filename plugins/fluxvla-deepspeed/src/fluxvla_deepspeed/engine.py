@@ -84,10 +84,21 @@ def put_master_weights(
             safe_set_full_fp32_param(parameter, values[name].to(parameter.device, torch.float32))
 
 
+def on_host(tensor: Tensor, first: bool) -> Tensor:
+    """A copy of a whole tensor in host memory; an empty one but on the first rank."""
+    return tensor.detach().to("cpu", copy=True) if first else tensor.new_empty(0)
+
+
 def read_state(
-    engine: Any, inner: torch.optim.Optimizer, parameters: Mapping[str, nn.Parameter]
+    engine: Any,
+    inner: torch.optim.Optimizer,
+    parameters: Mapping[str, nn.Parameter],
+    first: bool,
 ) -> dict[str, Tensor]:
-    """The state of ``inner`` as whole tensors ``<parameter>/<key>``; all ranks call it."""
+    """The state of ``inner`` as whole tensors ``<parameter>/<key>``; all ranks call it.
+
+    They are in host memory, of the first rank; the others have empty ones.
+    """
     from deepspeed.utils import safe_get_full_optimizer_state
 
     flats = [flat for flat in _flats(engine) if flat in inner.state]
@@ -99,11 +110,9 @@ def read_state(
     for name, parameter in parameters.items():
         for key, value in state.items():
             if value.shape == flats[0].shape:
-                full = safe_get_full_optimizer_state(parameter, key)
-                found[f"{name}/{key}"] = full.detach().clone()
-            else:
-                # A count of steps: the same for all.
-                found[f"{name}/{key}"] = value.detach().clone()
+                value = safe_get_full_optimizer_state(parameter, key)
+            # Else a count of steps: the same for all.
+            found[f"{name}/{key}"] = on_host(value, first)
     return found
 
 

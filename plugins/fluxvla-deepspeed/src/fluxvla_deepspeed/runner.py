@@ -106,19 +106,18 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
 
     def _model_tensors(self) -> Mapping[str, Tensor]:
         """Whole weights and buffers; with stage 3 gathered, and kept by the first rank only."""
-        from fluxvla_deepspeed.engine import gathered
+        from fluxvla_deepspeed.engine import gathered, on_host
 
         if self.zero_stage < 3:
             return super()._model_tensors()
         with gathered(self.model.parameters(), self.zero_stage):
             state = super()._model_tensors()
-            first = self.world.first
-            return {n: t.detach().clone() if first else t.new_empty(0) for n, t in state.items()}
+            return {name: on_host(tensor, self.world.first) for name, tensor in state.items()}
 
     def _optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         from fluxvla_deepspeed.engine import read_state
 
-        tensors = read_state(self.vla, self.optimizer, self._trained())
+        tensors = read_state(self.vla, self.optimizer, self._trained(), self.world.first)
         groups = [
             {**{k: v for k, v in group.items() if k != "params"}, "params": names}
             for group, names in zip(self.optimizer.param_groups, self._groups, strict=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -60,6 +62,78 @@ def test_the_machine(error):
     told = explain(error)
     assert told.what == "this machine ran out of memory"
     assert "lower train_dataloader.per_device_num_workers" in told.next
+
+
+GONE = "DataLoader worker (pid {}) is killed by signal: {}. "
+SHM = (
+    GONE.format(7, "Bus error")
+    + "It is possible that dataloader's workers are out of shared memory. Please try to raise your "
+    "shared memory limit."
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "cause", "advice"),
+    [
+        (
+            GONE.format(123, "Killed"),
+            "a data worker (pid 123) was killed at step 7",
+            "ran out of memory: dmesg tells",
+            "lower train_dataloader.per_device_num_workers or per_device_batch_size",
+        ),
+        (
+            SHM,
+            "a data worker (pid 7) ran out of shared memory at step 7",
+            "/dev/shm is full, through which workers pass batches",
+            "docker run --shm-size=8g",
+        ),
+        (
+            "unable to write to file </torch_1_2_3>: No space left on device (28)",
+            "a data worker ran out of shared memory at step 7",
+            "/dev/shm is full",
+            "per_device_num_workers=0",
+        ),
+        (
+            GONE.format(5, "Segmentation fault"),
+            "a data worker (pid 5) ended: segmentation fault at step 7",
+            "a crash below Python",
+            "python -X faulthandler",
+        ),
+        (
+            "DataLoader worker (pid(s) 5, 6) exited unexpectedly",
+            "a data worker (pid 5, 6) ended without a word at step 7",
+            "a crash below Python",
+            "python -X faulthandler",
+        ),
+    ],
+)
+def test_a_data_worker(text, what, cause, advice):
+    told = explain(RuntimeError(text), 7)
+    assert told.what == what
+    assert cause in told.cause
+    assert advice in told.next
+    assert told.next.endswith("then go on with --resume auto: checkpoints are as they were")
+
+
+class Deadly(TinyDataset):
+    """The worker that loads sample 20 is killed, as the OOM killer does it."""
+
+    def get_sample(self, index, epoch):
+        if index == 20 and torch.utils.data.get_worker_info() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().get_sample(index, epoch)
+
+
+def test_a_data_worker_that_is_killed_ends_the_run_in_words(tmp_path):
+    config = tiny_config({"type": "OneProcessRunner", "max_epochs": 1}, workers=1)
+    context = RunContext(config=config, section="runner", work_dir=tmp_path)
+    runner = build_runner_from_cfg(config["runner"], context)
+    runner.run_setup(37)
+    with (
+        unflushed(),
+        pytest.raises(RunFailed, match=r"a data worker \(pid \d+\) was killed at step"),
+    ):
+        runner.run(Deadly())
 
 
 def test_torch_itself_runs_out_of_memory():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 from fluxvla_core.errors import RunFailed
@@ -9,19 +10,36 @@ from fluxvla_core.errors import RunFailed
 GB = 1e9
 _DEVICE = ("cuda error: out of memory", "cublas_status_alloc_failed", "cuda out of memory")
 _HOST = ("can't allocate memory", "not enough memory: you tried to allocate")
+# torch's words for a loader worker that is gone; signals as strsignal(3) has them.
+_WORKER = re.compile(
+    r"dataloader worker \(pid(?:\(s\))? ([\d, ]+)\) "
+    r"(?:is killed by signal: ([\w ]+)|exited unexpectedly)"
+)
+_SHARED = ("killed by signal: bus error", "out of shared memory", "unable to write to file </torch")
+_LESS_HOST = (
+    "lower train_dataloader.per_device_num_workers or per_device_batch_size, or set "
+    "cache_frames=False in the dataset"
+)
+_GO_ON = "then go on with --resume auto: checkpoints are as they were"
 
 
 def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
-    """What ``error`` means if memory ran out; None if it is about something else."""
+    """What ``error`` means if memory ran out, or a loader worker of it; else None."""
     text = str(error).strip()
     lower = text.lower()
+    when = "" if step is None else f" at step {step}"
+    # torch may say that one is gone from an error that says how.
+    origin = f"{lower}\n{error.__cause__ or ''}".lower()
+    shared = any(s in origin for s in _SHARED)
+    worker = max(_WORKER.finditer(origin), key=lambda m: bool(m[2]), default=None)
+    if shared or worker is not None:
+        return _worker_gone(worker, shared, when)
     # By name: the class is torch's, and moved between its versions.
     device = type(error).__name__ == "OutOfMemoryError" or any(s in lower for s in _DEVICE)
     host = isinstance(error, MemoryError) or any(s in lower for s in _HOST)
     if not (device or host):
         return None
     what = "the GPU ran" if device else "this machine ran"
-    when = "" if step is None else f" at step {step}"
     cause = text.splitlines()[0][:300] if text else None
     if device:
         advice = (
@@ -30,15 +48,39 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
             "enable_mixed_precision_training, or split the model with FSDPTrainRunner"
         )
     else:
-        advice = (
-            "lower train_dataloader.per_device_num_workers or per_device_batch_size, or set "
-            "cache_frames=False in the dataset"
-        )
+        advice = _LESS_HOST
     return RunFailed(
         f"{what} out of memory{when}",
         cause=cause,
-        next=f"{advice}; then go on with --resume auto: checkpoints are as they were",
+        next=f"{advice}; {_GO_ON}",
     )
+
+
+def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFailed:
+    """A process that loads data has ended: of shared memory, by the system, or of a crash."""
+    pid = "" if found is None else f" (pid {found[1]})"
+    ending = None if found is None else found[2]
+    if shared:
+        what = f"a data worker{pid} ran out of shared memory{when}"
+        cause = "/dev/shm is full, through which workers pass batches: a container has 64 MB of it"
+        advice = (
+            "make it larger (docker run --shm-size=8g; on Kubernetes an emptyDir with medium: "
+            "Memory there), or set train_dataloader.per_device_num_workers=0"
+        )
+    elif ending == "killed":
+        what = f"a data worker{pid} was killed{when}"
+        cause = "this machine, or its container, ran out of memory: dmesg tells"
+        advice = _LESS_HOST
+    else:
+        what = (
+            f"a data worker{pid} {f'ended: {ending}' if ending else 'ended without a word'}{when}"
+        )
+        cause = "a crash below Python, as in a video decoder, or it was killed from outside"
+        advice = (
+            "run with train_dataloader.per_device_num_workers=0 and python -X faulthandler to see "
+            "where it happens"
+        )
+    return RunFailed(what, cause=cause, next=f"{advice}; {_GO_ON}")
 
 
 def peak_bytes(cuda: bool) -> int:

@@ -85,7 +85,11 @@ def test_only_the_adapter_is_trained_and_saved(tmp_path, base):
     assert all(".lora_" in n or "modules_to_save" in n for n in trained)
     assert found.json("trainer.json")["left_out"]["sources"] == {"": str(base)}
     assert len(folders(tmp_path)) == 2
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoints", "metrics.jsonl"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "checkpoints",
+        "metrics.jsonl",
+        "run.lock",
+    ]
 
 
 def test_it_goes_on_bit_for_bit(tmp_path, base):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.errors import DataError
+from fluxvla_core.transforms.deferral import SCALE
 
 
 class DictCollator:
@@ -16,6 +17,8 @@ class DictCollator:
     Args:
         keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.
         meta_keys: kept as plain lists, one entry a sample.
+
+    What is left of normalising pictures (``image_scale``) is stacked without being listed.
 
     Keys that are configured but that no sample has are left out: one list serves datasets with
     and without ``embodiment_ids``.
@@ -36,7 +39,7 @@ class DictCollator:
             raise DataError("there are no samples to make a batch of")
         batch: dict[str, Any] = {}
         for key in samples[0]:
-            if key in self.keys:
+            if key in self.keys or key == SCALE:
                 batch[key] = _stack(key, [_get(sample, key) for sample in samples])
             elif key in self.meta_keys:
                 batch[key] = [_get(sample, key) for sample in samples]

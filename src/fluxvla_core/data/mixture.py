@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from fluxvla_core.data.rng import DEFAULT_SEED, mixture_rng
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.transforms.deferral import deferring
 
 Sample = dict[str, Any]
 Ints = npt.NDArray[np.int64]
@@ -122,6 +124,15 @@ class DistributedRepeatingDataset:
         for dataset in self.datasets:
             if hasattr(dataset, "use_seed"):
                 dataset.use_seed(seed)
+
+    def deferring(self) -> DistributedRepeatingDataset | None:
+        """The same samples with pictures left to be normalised, if every dataset can leave it."""
+        parts = [deferring(dataset) for dataset in self.datasets]
+        if any(part is None for part in parts):
+            return None
+        other = copy(self)
+        other.datasets = parts
+        return other
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Let every dataset decode what it keeps in memory."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -167,6 +168,18 @@ class ParquetDataset:
         """Draw by the run's seed from now on, unless the dataset was given one of its own."""
         if not self._own_seed:
             self.seed = seed
+
+    def deferring(self) -> ParquetDataset | None:
+        """The same samples with pictures left to be normalised, None if that cannot be left.
+
+        It shares frames and settings with this one, and is for reading only.
+        """
+        pipeline = self.pipeline.deferring()
+        if pipeline is None:
+            return None
+        other = copy(self)
+        other.pipeline, other.statistics = pipeline, self.statistics
+        return other
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""

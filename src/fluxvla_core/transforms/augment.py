@@ -51,6 +51,7 @@ class StateNoise:
 
     needs_rng = True
     training_only = True
+    keeps_images = True
 
     def __init__(self, std: float, state_key: str | None = None) -> None:
         if std < 0:
@@ -81,6 +82,7 @@ class SampleFlowNoise:
 
     needs_rng = True
     training_only = True
+    keeps_images = True
 
     def __init__(
         self,

@@ -6,13 +6,14 @@ of N cameras of equal size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.transforms.deferral import SCALE, Steps, as_array, scale_
 
 Sample = dict[str, Any]
 Image = npt.NDArray[Any]
@@ -123,29 +124,37 @@ class NormalizeImages:
         self.scale_to_unit_interval = scale_to_unit_interval
 
     def __call__(self, sample: Sample) -> Sample:
-        images = _float_planes(sample["images"])
-        cameras = len(images) // 3
+        return _normalize(sample, self._steps)
+
+    def defer(self, sample: Sample) -> Sample:
+        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the pictures still are."""
+        return _leave(sample, self._steps)
+
+    def _steps(self, cameras: int) -> Steps:
         if len(self.means) not in (1, cameras):
             raise ConfigError(
                 f"NormalizeImages: {len(self.means)} groups of means and stds, {cameras} cameras",
                 next="give one group for all cameras, or one for each",
             )
-        if self.scale_to_unit_interval:
-            images /= 255.0
         repeat = cameras // len(self.means)
-        images -= np.tile(self.means, (repeat, 1)).reshape(-1, 1, 1)
-        images /= np.tile(self.stds, (repeat, 1)).reshape(-1, 1, 1) + np.float32(1e-8)
-        return {**sample, "images": images}
+        means, stds = (np.tile(v, (repeat, 1)).reshape(-1) for v in (self.means, self.stds))
+        unit = np.full(3 * cameras, 255, np.float32) if self.scale_to_unit_interval else None
+        return unit, None, means, stds + np.float32(1e-8)
 
 
 class SimpleNormalizeImages:
     """``x / 255 * 2 - 1``; gives ``(3N, H, W)`` float32 in -1..1."""
 
     def __call__(self, sample: Sample) -> Sample:
-        images = _float_planes(sample["images"])
-        images *= np.float32(2 / 255)
-        images -= np.float32(1)
-        return {**sample, "images": images}
+        return _normalize(sample, self._steps)
+
+    def defer(self, sample: Sample) -> Sample:
+        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the pictures still are."""
+        return _leave(sample, self._steps)
+
+    def _steps(self, cameras: int) -> Steps:
+        factor, one = (np.full(3 * cameras, v, np.float32) for v in (2 / 255, 1))
+        return None, factor, one, None
 
 
 def split(images: Images) -> list[Image]:
@@ -204,6 +213,19 @@ def join_planes(images: Sequence[Image]) -> Image:
     for image, planes in zip(images, out.reshape(-1, *first.shape), strict=True):
         cv2.split(image.transpose(1, 2, 0), list(planes))
     return out
+
+
+def _normalize(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
+    images = _float_planes(sample["images"])
+    return {**sample, "images": scale_(images, steps(len(images) // 3))}
+
+
+def _leave(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
+    images = stack(sample["images"])
+    if images.dtype != np.uint8:
+        images = _float_planes(images)
+    planes = len(images)
+    return {**sample, "images": images, SCALE: as_array(steps(planes // 3), planes)}
 
 
 def _float_planes(images: Images) -> npt.NDArray[np.float32]:

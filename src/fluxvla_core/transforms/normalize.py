@@ -35,6 +35,8 @@ class NormalizeStatesAndActions:
             or a width that would cut dimensions off.
     """
 
+    keeps_images = True
+
     def __init__(
         self,
         state_key: str = "proprio",

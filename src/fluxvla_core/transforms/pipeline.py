@@ -11,6 +11,7 @@ import numpy as np
 
 from fluxvla_core.build import build_transform_from_cfg
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.transforms.deferral import declared
 
 Sample = dict[str, Any]
 INDEX = "processors.json"
@@ -53,9 +54,22 @@ class Pipeline:
 
     def inference(self) -> Pipeline:
         """The same transforms without those that only training wants."""
-        kept = Pipeline([t for t in self.transforms if not getattr(t, "training_only", False)])
-        kept._named = self._named
-        return kept
+        return self._of([t for t in self.transforms if not getattr(t, "training_only", False)])
+
+    def deferring(self) -> Pipeline | None:
+        """The same transforms, with the normalisation of pictures left to the device.
+
+        It must be the last one that touches pictures. A transform after it says that it does not
+        look at them by ``keeps_images = True``; with one that does not say so nothing can be left.
+        """
+        for place, transform in reversed(list(enumerate(self.transforms))):
+            if declared(transform, "keeps_images", "__call__"):
+                continue
+            if declared(transform, "defer", "__call__") is None:
+                return None
+            before, after = self.transforms[:place], self.transforms[place + 1 :]
+            return self._of([*before, transform.defer, *after])
+        return None
 
     def save_pretrained(self, folder: str | Path) -> None:
         """Save every tokenizer into ``folder``, under the path that its table named it by."""
@@ -74,6 +88,11 @@ class Pipeline:
             index[path] = name
         if index:
             (root / INDEX).write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
+
+    def _of(self, transforms: Sequence[Any]) -> Pipeline:
+        other = Pipeline(transforms)
+        other._named = self._named
+        return other
 
 
 def _saved(folder: Path) -> dict[str, str]:

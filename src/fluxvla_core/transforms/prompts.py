@@ -30,6 +30,8 @@ class ProcessPrompts:
             another instruction, so it is never cut.
     """
 
+    keeps_images = True
+
     def __init__(self, tokenizer: Mapping[str, Any] | Any, max_len: int = 180) -> None:
         if max_len < 1:
             raise ConfigError(f"ProcessPrompts: max_len must be at least 1, got {max_len}")

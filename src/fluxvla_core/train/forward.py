@@ -11,16 +11,22 @@ from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.train.units import blocks_of
+from fluxvla_core.transforms.deferral import normalized
 
 IDS = "sample_ids"
 
 
 def to_device(batch: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
-    """Tensors of a batch on ``device``; from pinned memory the copy overlaps with computing."""
-    return {
-        key: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
-        for key, value in batch.items()
-    }
+    """Tensors of a batch on ``device``; from pinned memory the copy overlaps with computing.
+
+    Pictures are normalised there if that has been left to the device.
+    """
+    return normalized(
+        {
+            key: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+            for key, value in batch.items()
+        }
+    )
 
 
 class ForwardArguments:

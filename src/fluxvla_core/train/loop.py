@@ -15,6 +15,7 @@ from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.forward import IDS, ForwardArguments, to_device
 from fluxvla_core.train.memory import GB, peak_bytes
 from fluxvla_core.train.optim import trainable
+from fluxvla_core.train.pictures import source
 from fluxvla_core.train.resuming import restore_rng
 from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.state import take_seed
@@ -47,7 +48,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
         run.metric.start(told, context.config)
     sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
     loader = make_loader(
-        dataset,
+        source(dataset, run.collator, world.device),
         run.collator,
         sampler,
         run.loader_options.per_device_num_workers,
@@ -139,11 +140,12 @@ class StepLoop:
         run = self._run
         first = next(self._batches)
         self._batches = chain([first], self._batches)
+        shown = to_device(first, run.world.device)
         if run.flops is not None and run._arguments is not None:
-            trouble = run.flops.look(run._arguments(first))
+            trouble = run.flops.look(run._arguments(shown))
             if trouble is not None and run.world.first:
                 run.context.reporter.warn(f"mfu is not reported: {trouble}")
-        run._warm_up(to_device(first, run.world.device))
+        run._warm_up(shown)
 
     def _enough(self) -> bool:
         patience = self._run.options.early_stop_patience

@@ -14,6 +14,7 @@ from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.train.distributed import total
 from fluxvla_core.train.forward import to_device
+from fluxvla_core.train.pictures import source
 from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Validation:
         )
         batches: Any = list(sampler.batches(0))
         self._loader = make_loader(
-            self._dataset,
+            source(self._dataset, run.collator, world.device),
             run.collator,
             batches,
             options.per_device_num_workers,

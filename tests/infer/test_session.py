@@ -398,3 +398,20 @@ def test_who_says_so_allows_motion_again_after_that(bench, real, gripping, asked
 
     result = bench.run(task=None, max_publish_step=10, task_descriptions={**TASKS, "3": "stir"})
     assert (result["episodes"], result["task"]) == (2, "3")
+
+
+def test_an_operator_that_knows_its_command_is_asked_for_it(bench, real, gripping, asked):
+    """It may hold something else than what was sent last: what its own stop sent."""
+    bench.arm, bench.policy = real, gripping
+    real.last_action = None
+    count = []
+
+    def elsewhere():
+        count.append(len(real.sent))
+        real.last_action = real.sent[-1] + [0.1, 0.0, 0.0]
+
+    asked(Acts({"2": elsewhere}, "1", "2", polls=0))
+    bench.run(task=None, max_publish_step=30)
+
+    first = real.sent[count[0]]
+    np.testing.assert_allclose(first, real.sent[count[0] - 1] + [0.1, 0.0, 0.0], atol=0.03)

@@ -7,6 +7,7 @@ when the config gives the ``embodiment`` that it lacks; the runner's ``_execute_
 
 from __future__ import annotations
 
+import inspect
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -24,6 +25,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 # How long a safe stop may take before a person is told to use the emergency stop.
 STOP_S = 5.0
 _LEAST_SPEED = 0.01
+_NOTHING = object()
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Robot:
     def speed(self) -> Callable[[], float] | None:
         """Tells the share of its speed that a person lets it have (``speed_scaling``), or None."""
         operator = self.operator
-        if not hasattr(type(operator), "speed_scaling"):
+        if not _has(operator, "speed_scaling"):
             return None
         # An arm that is paused takes no command, and says so when it is given one.
         return lambda: min(max(float(operator.speed_scaling), _LEAST_SPEED), 1.0)
@@ -115,7 +117,7 @@ class Robot:
         Args:
             before: the last command of this run, for operators that do not tell (``last_action``).
         """
-        if hasattr(type(self.operator), "last_action"):
+        if _has(self.operator, "last_action"):
             last = self.operator.last_action
             return None if last is None else np.asarray(last, dtype=np.float64)
         # Who begins episodes may put the arm elsewhere.
@@ -225,6 +227,11 @@ class Robot:
                 next="see docs/writing-a-plugin.md for what an operator has, or give the runner "
                 "an _execute_actions of its own",
             )
+
+
+def _has(operator: Any, name: str) -> bool:
+    """Whether there is such an attribute; a property is not asked, which may raise."""
+    return inspect.getattr_static(operator, name, _NOTHING) is not _NOTHING
 
 
 def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:

@@ -26,6 +26,9 @@ from contextlib import contextmanager
 from functools import cache
 
 SWITCH_S = 0.0005
+KEPT_S = 0.0004
+"""A little less than ``SWITCH_S``: who waits longer than that for the interpreter demands it, and
+the thread that kept it would have to give it up just when its deadline is there."""
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
 _TIMER_ABSTIME = 1  # of <time.h>

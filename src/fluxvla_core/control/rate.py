@@ -17,8 +17,8 @@ class Rate:
     the arm for a jump. Two beats are at least half a period apart, however late the first one was.
 
     What a command is made of takes a while, and not always the same. So ``sleep`` may return
-    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself;
-    for the last half of it, in real time, no other thread of the interpreter comes between.
+    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself; at
+    its very end, in real time, no other thread of the interpreter comes between.
 
     In a lockstep simulation both return at once.
 
@@ -105,7 +105,7 @@ class Rate:
         self.late_s = 0.0
         if self._due is not None:
             if type(self.clock) is MonotonicClock:
-                priority.wait_until(self._due, self.lead_s / 2)
+                priority.wait_until(self._due, min(self.lead_s / 2, priority.KEPT_S))
             else:
                 self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)

@@ -108,7 +108,7 @@ def test_checkpoints_go_to_one_process_and_back(runs, stage):
 
 
 @VLAS.register_module()
-class SteepVLA(TinyVLA):
+class SteepForAllVLA(TinyVLA):
     """From its third batch on the gradient is not finite, though the loss is."""
 
     def forward(self, **batch):
@@ -123,7 +123,7 @@ def steep(work_dir):
     for stage in STAGES:
         table = {"type": "DeepSpeedTrainRunner", "zero_stage": stage, "max_grad_norm": None}
         tree = config(**table, grad_accumulation_steps=1, save_iter_interval=1)
-        tree["model"] = {**tree["model"], "type": "SteepVLA"}
+        tree["model"] = {**tree["model"], "type": "SteepForAllVLA"}
         try:
             train({"config": tree, "work_dir": str(work_dir / f"{stage}")})
         except RunFailed as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import wait
@@ -12,6 +13,8 @@ from typing import Any
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, FluxError
+
+_END_S = 1.0  # between the end of a connection and that of the process that had it
 
 
 class Loader:
@@ -26,10 +29,24 @@ class Loader:
         self.sampler = sampler
 
     def __iter__(self) -> Iterator[Any]:
-        for batch in self.inner:
-            if isinstance(batch, _Failed):
-                raise batch.error
-            yield batch
+        batches = iter(self.inner)
+        try:
+            for batch in batches:
+                if isinstance(batch, _Failed):
+                    raise batch.error
+                yield batch
+        except (OSError, EOFError) as error:
+            # Its end of a connection is what ended, while a batch was taken over from it.
+            words = _killed(getattr(batches, "_workers", ()))
+            if words is None:
+                raise
+            raise RuntimeError(words) from error
+        finally:
+            # One that was killed is told by torch at every child that ends, in the middle of
+            # whatever is being done, for as long as a traceback keeps the others alive.
+            end = getattr(batches, "_shutdown_workers", None)
+            if end is not None:
+                end()
 
 
 def make_loader(
@@ -94,6 +111,16 @@ def _end_with_trainer(worker: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="fluxvla-trainer-watch", daemon=True).start()
+
+
+def _killed(workers: Sequence[Any]) -> str | None:
+    """What torch says of a worker that was killed, as one was that ends by a signal; else None."""
+    for worker in workers:
+        worker.join(_END_S)
+        if worker.exitcode is not None and worker.exitcode < 0:
+            name = signal.strsignal(-worker.exitcode)
+            return f"DataLoader worker (pid {worker.pid}) is killed by signal: {name}"
+    return None
 
 
 class _Failed:

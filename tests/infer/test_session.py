@@ -382,7 +382,7 @@ def switched_off(arm):
 
 def test_an_arm_that_does_not_stay_where_it_is_held_is_stopped(bench, real, gripping, asked):
     bench.arm, bench.policy = real, gripping
-    person = asked(Acts({"2": lambda: switched_off(real)}, "1", "2", polls=1000))
+    person = asked(Acts({"2": lambda: switched_off(real)}, "1", "2", polls=60))
 
     with pytest.raises(SafetyStop, match=r"shoulder is .* away from its command"):
         bench.run(task=None, max_publish_step=10)

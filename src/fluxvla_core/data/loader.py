@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import wait
 from typing import Any
@@ -35,8 +36,8 @@ class Loader:
                 if isinstance(batch, _Failed):
                     raise batch.error
                 yield batch
-        except (OSError, EOFError) as error:
-            # Its end of a connection is what ended, while a batch was taken over from it.
+        except (OSError, EOFError, RuntimeError) as error:
+            # Seen first may be that a connection to it broke, or that it is not there.
             words = _killed(getattr(batches, "_workers", ()))
             if words is None:
                 raise
@@ -115,8 +116,9 @@ def _end_with_trainer(worker: int) -> None:
 
 def _killed(workers: Sequence[Any]) -> str | None:
     """What torch says of a worker that was killed, as one was that ends by a signal; else None."""
+    until = time.monotonic() + _END_S
     for worker in workers:
-        worker.join(_END_S)
+        worker.join(max(0.0, until - time.monotonic()))
         if worker.exitcode is not None and worker.exitcode < 0:
             name = signal.strsignal(-worker.exitcode)
             return f"DataLoader worker (pid {worker.pid}) is killed by signal: {name}"

@@ -282,18 +282,21 @@ def test_motion_does_not_begin_with_an_answer_that_took_long(bench, make_arm):
     assert first["ms"]["policy"] < 300
 
 
-def test_a_policy_that_is_slow_for_good_moves_nothing(bench, make_arm):
+def test_a_policy_that_is_slow_for_good_is_not_asked_for_ever(bench, make_arm):
+    """Long chunks may make up for it; where they do not, starvation says so."""
     bench.arm = make_arm(realtime=True)
     think = bench.policy.predict_action
 
     def slow(observation):
-        time.sleep(0.2)
+        time.sleep(0.3)
         return think(observation)
 
     bench.policy.predict_action = slow
-    limits = {"starvation_s": 0.1, "first_chunk_s": 1.0}
-    fails(bench, SafetyStop, "gave no chunk within 1 s that took at most 0.1 s", safety=limits)
-    assert bench.arm.sent == []
+    bench.run(max_publish_step=20, safety={"starvation_s": 0.2})
+
+    first = next(row for row in bench.trace() if row["event"] == "chunk")
+    assert first["ms"]["policy"] >= 300
+    assert len(bench.policy.asked) >= 3
 
 
 def test_a_robot_whose_get_frame_hangs(bench, make_arm):

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
 
@@ -18,6 +19,7 @@ from fluxvla_core.errors import UsageError
 
 OWNER = """
 import os, sys, time
+from contextlib import closing
 from pathlib import Path
 from fluxvla_core.checkpoints.owner import claim
 held = claim(Path(sys.argv[1]), print)
@@ -60,7 +62,7 @@ def test_a_second_one_is_told_who_has_it_until_that_one_is_gone(tmp_path, monkey
         )
     finally:
         end(process)
-    with claim(tmp_path, pytest.fail):
+    with closing(claim(tmp_path, pytest.fail)):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
 
 
@@ -70,7 +72,7 @@ def test_a_loader_worker_that_lives_on_does_not_keep_it(tmp_path):
     end(process)
     try:
         os.kill(int(worker), 0)
-        with claim(tmp_path, pytest.fail) as mine:
+        with closing(claim(tmp_path, pytest.fail)) as mine:
             assert mine.held
     finally:
         os.kill(int(worker), signal.SIGKILL)
@@ -90,10 +92,10 @@ def in_use(work_dir):
 
 
 def test_a_claim_within_a_claim_ends_without_it(tmp_path):
-    with claim(tmp_path, pytest.fail) as outer:
+    with closing(claim(tmp_path, pytest.fail)) as outer:
         inner = claim(tmp_path, pytest.fail)
         assert not inner.held
-        inner.release()
+        inner.close()
         assert outer.held
         assert in_use(tmp_path)
     assert not in_use(tmp_path)

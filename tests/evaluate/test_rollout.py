@@ -109,7 +109,7 @@ def test_chunks_of_another_shape_are_refused(walk, chunk, text):
 def test_a_chunk_that_is_not_finite_is_a_failure_that_says_why(walk, value, limited):
     found = episode(walk.Walk(limited=limited), Says([[0.1], [value]]))
     assert (found["success"], found["steps"], found["calls"]) == (False, 0, 1)
-    assert found["problem"] == f"the policy's chunk is not finite: action 1, x is {value}"
+    assert found["problem"] == f"the policy's chunk is not finite: keyframe 1, x is {value}"
     assert episode(walk.Walk(), Says([[0.1]]))["problem"] is None
 
 

@@ -14,6 +14,7 @@ import weakref
 import pytest
 import torch
 
+from fluxvla_core.checkpoints import tensors
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders
 from fluxvla_core.checkpoints.disk import Disk
 from fluxvla_core.errors import RunFailed
@@ -150,8 +151,8 @@ def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, 
         return gathered
 
     plain = run(tmp_path / "plain")
-    monkeypatch.setattr(saver, "is_split", lambda tensor: True)
-    monkeypatch.setattr(saver, "whole", pretended)
+    monkeypatch.setattr(tensors, "is_split", lambda tensor: True)
+    monkeypatch.setattr(tensors, "whole", pretended)
     split = run(tmp_path / "split")
 
     assert len(most) > 10

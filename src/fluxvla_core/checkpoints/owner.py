@@ -15,7 +15,6 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 from weakref import WeakValueDictionary
 
@@ -27,7 +26,7 @@ PATIENCE_S = 5.0
 
 
 class Claim:
-    """A work dir that is this process's until ``release``; ``claim`` makes it.
+    """A work dir that is this process's until it is closed; ``claim`` makes it.
 
     Args:
         file: the lock; None where there is none to give back.
@@ -38,7 +37,7 @@ class Claim:
         self._file, self._outer = file, outer
         self.active = True
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Let others have it; any number of times."""
         file, self._file, self._outer, self.active = self._file, None, None, False
         if file is not None:
@@ -49,24 +48,13 @@ class Claim:
         """Whether it is this one that keeps others out."""
         return self._file is not None
 
-    def __enter__(self) -> Claim:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.release()
-
 
 # By process too: a fork inherits the table, and not the locks.
 _held: WeakValueDictionary[tuple[int, Path], Claim] = WeakValueDictionary()
 
 
 def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
-    """Keep other trainings out of ``work_dir``, which must exist, until the claim is released.
+    """Keep other trainings out of ``work_dir``, which must exist, until the claim is closed.
 
     Args:
         warn: is told if the file system has no locks; the claim then keeps nobody out.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -113,20 +113,25 @@ class TensorFile:
         kept = {key: local(tensor) for key, tensor in named.items()}
         return cls(name, _header(kept, describe_parts(named)), tuple(kept.values()), True)
 
-    def gathered(self) -> TensorFile:
-        """The same with whole tensors; all ranks call it, those that do not write get none."""
-        found = []
-        for tensor in self.tensors:
-            if self.mine or is_split(tensor):
-                full = whole(tensor)
-                if self.mine:
-                    found.append(full)
+    def gathered(self, keep: Callable[[int, Tensor], Tensor]) -> TensorFile:
+        """The same with whole tensors; all ranks call it, those that do not write get none.
+
+        Args:
+            keep: given the place of each tensor that had to be gathered and the whole of it, before
+                the next is gathered; what it returns is held instead.
+        """
+        found: list[Tensor] = []
+        for place, tensor in enumerate(self.tensors):
+            split = is_split(tensor)
+            full = whole(tensor) if self.mine or split else tensor
+            if self.mine:
+                found.append(keep(place, full) if split else full)
         return replace(self, tensors=tuple(found))
 
     def write(self, writer: CheckpointWriter) -> None:
         """Write it, one tensor at a time in memory."""
         if not self.mine:
-            self.gathered()
+            self.gathered(lambda place, tensor: tensor)
             return
         with writer.open(self.name) as file:
             file.write(struct.pack("<Q", len(self.header)) + self.header)

@@ -17,15 +17,13 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.errors import EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
 
-GRACE_S = 600
-"""Seconds for a checkpoint, between asking ranks to stop and killing them."""
 _STOP_S = 30
 """What torch's agent gives the others when a rank has failed: they have nothing left to save."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def launch(
-    nproc: int, words: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = GRACE_S
+    nproc: int, words: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = ranks.GRACE_S
 ) -> int:
     """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
 

@@ -17,6 +17,8 @@ from typing import NoReturn
 
 ERROR_DIR = "FLUXVLA_ERROR_DIR"
 LAUNCHER = "FLUXVLA_LAUNCHER_PID"
+GRACE_S = 600
+"""Seconds for a checkpoint, between asking ranks to stop and killing them."""
 
 
 def rank() -> int:

@@ -7,7 +7,7 @@ import errno
 import json
 import signal
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ class Run:
             type=positive,
             metavar="SECONDS",
             help="for processes to save when they are stopped, before they are killed "
-            "(default 600)",
+            f"(default {ranks.GRACE_S})",
         )
         parser.add_argument(
             "--eval-after-train",
@@ -88,9 +88,9 @@ class Run:
             if plan.trains and ranks.resume(args.resume, plan.work_dir) is None:
                 refuse_overwriting(plan.work_dir)
         if plan.trains and _launches(args):
-            from fluxvla_core.cli.launch import GRACE_S, launch
+            from fluxvla_core.cli.launch import launch
 
-            grace = args.grace or GRACE_S
+            grace = args.grace or ranks.GRACE_S
             with _terminable():
                 code = launch(args.nproc, _words(args), plan.work_dir, args.max_restarts, grace)
         else:
@@ -197,7 +197,7 @@ def _owned(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
     from fluxvla_core.checkpoints.owner import claim
 
     plan.work_dir.mkdir(parents=True, exist_ok=True)
-    return claim(plan.work_dir, reporter.warn)
+    return closing(claim(plan.work_dir, reporter.warn))
 
 
 def _run_section(plan: Plan, build: Any, context: Any) -> Any:

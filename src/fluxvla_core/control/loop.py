@@ -69,7 +69,7 @@ class Loop:
     Args:
         path: started at the arm's pose; sends every command.
         joiner: makes one motion of the chunks.
-        observe: makes an observation; given the ``(D,)`` command that the arm has.
+        observe: makes an observation.
         think: asks the policy, which may have to go on from the motion under way; ``(T, D)``
             keyframes, those to be played.
         admit: checks the keyframes of an answer, and takes note of it.
@@ -87,7 +87,7 @@ class Loop:
 
     path: CommandPath
     joiner: Joiner
-    observe: Callable[[Array], Seen]
+    observe: Callable[[], Seen]
     think: Callable[[Seen, Continuation | None], Any]
     admit: Callable[[Seen, Any], Array]
     keyframe_hz: float
@@ -172,9 +172,9 @@ class Loop:
 
         due = self.clock.now() + self.latency_s
         if self.lockstep:
-            seen = self.observe(last)
+            seen = self.observe()
             return Asked(self.worker.submit(lambda: think(seen)), last, due)
-        return Asked(self.worker.submit(lambda: think(self.observe(last))), last, due)
+        return Asked(self.worker.submit(lambda: think(self.observe())), last, due)
 
     def _first(self) -> tuple[tuple[Seen, Any], Array]:
         """The first answer: nothing moves, and the policy may have to warm up.

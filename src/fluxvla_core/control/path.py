@@ -71,7 +71,8 @@ class CommandPath:
         # When the arm had the command that ``on_sent`` is told of, at the latest; of those that a
         # loop with a beat of its own plays, when the first was.
         self.sent_at = 0.0
-        self._handed = self._between = self._unpaced = False
+        # Commands of a call that were sent, the one that is being sent among them.
+        self._played = 0
         rate.on_beat = self._beat
 
     def play(self, targets: npt.ArrayLike, filtered: bool = True) -> None:
@@ -91,23 +92,15 @@ class CommandPath:
 
     def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
         before = self.limiter.snapshot()
-        self._handed = False
-        played = 0
+        self._played = 0
         try:
             commands, clamps = self.limiter.run(shaped, speed)
-            played = self._send(wanted, commands, clamps)
-        except BaseException:
-            if self._unpaced:
-                played = len(shaped)
-            elif self._handed:
-                # The command that was being sent counts as sent; those after it were not.
-                played = len(shaped) - len(self._rows) + (0 if self._between else 1)
-            raise
+            self._send(wanted, commands, clamps)
         finally:
             self._rows.clear()
-            if played < len(shaped):
+            if self._played < len(shaped):
                 self.limiter.restore(before)
-                self.limiter.run(shaped[:played], speed)
+                self.limiter.run(shaped[: self._played], speed)
 
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
@@ -131,27 +124,25 @@ class CommandPath:
         commands: Array,
         clamps: Sequence[Sequence[Clamp]],
         held: bool = False,
-    ) -> int:
-        """Hand the commands over; how many were played."""
+    ) -> None:
         rows = zip(wanted, commands, clamps, strict=True)
         self._rows = deque(Sent(t, c, tuple(found), held) for t, c, found in rows)
-        self._between = self._unpaced = False
-        self._handed = True
         handed = commands.copy()
         handed.flags.writeable = False
         beats, self.sent_at = self.rate.beats, self.rate.clock.now()
+        self._played = 1
         self._execute(handed, self.rate)
         if self.rate.beats == beats:
             # A loop with a beat of its own: what it was given, it has played.
-            self._unpaced = True
+            self._played = len(commands)
             while self._rows:
                 self._on_sent(self._rows.popleft())
-        return len(commands) - len(self._rows)
+        self._played = len(commands) - len(self._rows)
 
     def _beat(self) -> None:
-        self._between, self.sent_at = True, self.rate.clock.now()
+        self.sent_at = self.rate.clock.now()
         self._on_sent(self._rows.popleft() if self._rows else None)
-        self._between = False
+        self._played += 1
 
     def _filtered(self, row: Array) -> Array:
         for apply in self._filters:

@@ -22,8 +22,9 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.evaluate.collecting import Recorded, collect_episodes
 from fluxvla_core.evaluate.policies import fit, resolve_name
-from fluxvla_core.evaluate.rollout import Commands, not_finite, shaped
+from fluxvla_core.evaluate.rollout import Commands, shaped
 from fluxvla_core.evaluate.worker import choose_tasks
+from fluxvla_core.safety.trips import not_finite
 from fluxvla_core.spec.embodiment import Camera
 
 SPARE_SEEDS = 6

@@ -20,7 +20,7 @@ from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSp
 from fluxvla_core.control.keyframes import interpolate
 from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.safety.limits import Limiter
-from fluxvla_core.safety.trips import action_columns
+from fluxvla_core.safety.trips import action_columns, not_finite
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]
@@ -194,16 +194,6 @@ def shaped(chunk: Any, dim: int) -> Array:
     if array.ndim != 2 or array.shape[1] != dim or not len(array):
         raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
     return array
-
-
-def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:
-    """What of a chunk ``(T, dim)`` is not finite; None if all of it is."""
-    bad = np.argwhere(~np.isfinite(chunk))
-    if not bad.size:
-        return None
-    row, column = bad[0]
-    value = chunk[row, column]
-    return f"the policy's chunk is not finite: action {row}, {joints[column]} is {value}"
 
 
 def _check_state(state: Any, steps: int) -> None:

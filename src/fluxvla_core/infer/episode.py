@@ -270,7 +270,7 @@ class Episode:
             raise
         return state
 
-    def _observe(self, last: Array) -> Seen:
+    def _observe(self) -> Seen:
         plan, clock = self._plan, self._plan.robot.clock
         began = time.perf_counter()
         window, frame = plan.look()

@@ -119,9 +119,9 @@ class RosOperator(ABC):
         """Called in every ``stop``, after the arm holds: stop what else can move."""
         return
 
-    def admit(self, action: Array) -> Array:
-        """What of an action is sent, given what the robot says now; raises Faulted if nothing."""
-        return action
+    def admit(self) -> None:
+        """Called before each command; raises Faulted where the robot says that it takes none."""
+        return
 
     # The contract.
 
@@ -232,9 +232,9 @@ class RosOperator(ABC):
             connection.check()
             if self._fault is not None:
                 raise self._fault
-            admitted = checked_action(self.embodiment, self.admit(checked))
-            self.publish_action(admitted)
-            self._last = admitted
+            self.admit()
+            self.publish_action(checked)
+            self._last = checked
 
     def stop(self) -> None:
         """Hold: repeat the last command, or where a joint is if it was kept from following.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,9 +105,7 @@ class TrackingWatch:
 
     def follows(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which joints, ``(dim,)``, are as near to ``command`` as they must be."""
-        measured = np.asarray(state, dtype=np.float64)[self._columns]
-        near: npt.NDArray[np.bool_] = np.abs(measured - command) <= self._allowed
-        return near
+        return self._error(command, state) <= self._allowed
 
     def check(self, state: npt.ArrayLike, measured: float) -> None:
         """Compare where the arm was with the command that it had then.
@@ -125,7 +123,7 @@ class TrackingWatch:
         command = next((c for at, c in reversed(tuple(self._sent)) if at <= measured), None)
         if command is None:
             return
-        error = np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
+        error = self._error(command, state)
         behind = error > self._allowed
         self._since = np.where(behind, np.minimum(self._since, measured), np.inf)
         late = np.flatnonzero(behind & (measured - self._since >= self._time))
@@ -138,6 +136,9 @@ class TrackingWatch:
                 cause="the arm is blocked, its drive is off, or somebody else commands it",
                 next="free the arm; safety.tracking_error sets what is allowed",
             )
+
+    def _error(self, command: Array, state: npt.ArrayLike) -> Array:
+        return np.abs(np.asarray(state, dtype=np.float64)[self._columns] - command)
 
 
 def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
@@ -189,12 +190,10 @@ def check_chunk(
             f"the policy's chunk has shape {keyframes.shape}; {embodiment.name} takes (T, {dim})"
         )
     names = embodiment.joint_names
-    bad = np.argwhere(~np.isfinite(keyframes))
-    if bad.size:
-        row, column = bad[0]
+    problem = not_finite(keyframes, names)
+    if problem is not None:
         raise BadChunk(
-            f"the policy's chunk is not finite: keyframe {row}, {names[column]} is "
-            f"{keyframes[row, column]}",
+            problem,
             cause="the policy diverged, or an input that it was given is not finite",
         )
     joints = embodiment.joints
@@ -224,3 +223,13 @@ def check_chunk(
             next="move the arm to the start pose first; safety.jump_s sets what is allowed",
         )
     return keyframes
+
+
+def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:
+    """What of a policy's chunk ``(T, dim)`` is not finite, in words; None if all of it is."""
+    bad = np.argwhere(~np.isfinite(chunk))
+    if not bad.size:
+        return None
+    row, column = bad[0]
+    value = chunk[row, column]
+    return f"the policy's chunk is not finite: keyframe {row}, {joints[column]} is {value}"

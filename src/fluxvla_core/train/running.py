@@ -111,7 +111,7 @@ class TrainRun:
                 self.metric.finalize()
             self.hooks.call("run_finished", outcome=outcome)
             if self._claim is not None:
-                self._claim.release()
+                self._claim.close()
             distributed.stop(self.world, failed=outcome == "failed")
         if number:
             raise stopped(number, f"step {self.progress.step} in {self.context.work_dir}")

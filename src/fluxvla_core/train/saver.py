@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from fluxvla_core.checkpoints.parts import is_split
-from fluxvla_core.checkpoints.tensors import TensorFile, whole
+from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.train.distributed import World, agree
 
 
@@ -84,7 +84,7 @@ class Saver:
         if not self.beside:
             self._run(job, lambda: write(self.world, files, warn))
             return
-        gathered = [self._gathered(file) for file in files]
+        gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
         ready = _reached(self.world.device)
         job.thread = threading.Thread(
             target=self._run,
@@ -134,16 +134,6 @@ class Saver:
         except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
             job.error = error
 
-    def _gathered(self, file: TensorFile) -> TensorFile:
-        """``file`` with its split tensors in host memory; all ranks call it."""
-        found: list[Tensor] = []
-        for tensor in file.tensors:
-            full = whole(tensor) if file.mine or is_split(tensor) else tensor
-            if file.mine:
-                place = (file.name, len(found))
-                found.append(self._copy(place, full) if is_split(tensor) else full)
-        return replace(file, tensors=tuple(found))
-
     def _held(
         self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
     ) -> Iterator[TensorFile]:
@@ -154,7 +144,7 @@ class Saver:
                     replace(
                         file,
                         tensors=tuple(
-                            self._copy((file.name, i), t) for i, t in enumerate(file.tensors)
+                            self._copy_of(file.name, i, t) for i, t in enumerate(file.tensors)
                         ),
                     )
                     for file in files
@@ -162,6 +152,9 @@ class Saver:
         finally:
             job.copied.set()
         yield from held
+
+    def _copy_of(self, file: str, index: int, tensor: Tensor) -> Tensor:
+        return self._copy((file, index), tensor)
 
     def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
         """``tensor`` in host memory that is kept from save to save, pinned if it is on a GPU."""

@@ -25,7 +25,7 @@ from fluxvla_core.ros2.streams import (
 from fluxvla_core.ros2.trouble import BadMessage, Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
-from fluxvla_ur.speed import check_not_paused
+from fluxvla_ur.readiness import check_not_paused
 
 Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
@@ -137,7 +137,6 @@ class UROperator(RosOperator):
             raise ConfigError(f"UROperator: {error}") from error
         topic, self._arm_message = CONTROLLERS[controller]
         self._arm_command = puppet_arm_left_cmd_topic or topic
-        self._forward = controller == "forward_position_controller"
         self._images = (img_front_topic, img_left_topic)
         self._depths = (img_front_depth_topic, img_left_depth_topic)
         self._arm_state = puppet_arm_left_topic
@@ -201,7 +200,7 @@ class UROperator(RosOperator):
             raise BadMessage(f"the speed scaling ({self._scaling_topic}) is {percent}")
         return min(max(percent / 100.0, 0.0), 1.0)
 
-    def admit(self, action: Array) -> Array:
+    def admit(self) -> None:
         running = self.newest("program running")
         if running is not None and not running.message.data:
             raise Faulted(
@@ -210,7 +209,6 @@ class UROperator(RosOperator):
                 next="look at the teach pendant, clear the stop, and play the program again",
             )
         check_not_paused(self.speed_scaling)
-        return action
 
     def publish_action(self, action: Array) -> None:
         closed, opened = self._gripper_ends

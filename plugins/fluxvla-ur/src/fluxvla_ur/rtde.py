@@ -23,14 +23,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE, Frame
-from fluxvla_core.errors import ConfigError, Faulted, LoadFailed, NotReady
+from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.ros2.actions import checked_action
 from fluxvla_core.ros2.trouble import Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import ACCELERATION, JOINTS, RATE_HZ, ur_spec
+from fluxvla_ur.readiness import check_not_paused, check_safety
 from fluxvla_ur.robotiq import PORT as GRIPPER_PORT
 from fluxvla_ur.robotiq import RobotiqGripper
-from fluxvla_ur.speed import check_not_paused
+from fluxvla_ur.rtde_client import disconnect, import_rtde
 from fluxvla_ur.video import VideoCamera
 
 Array = npt.NDArray[np.float64]
@@ -51,19 +52,6 @@ _VARIABLES = [
 # As often as is looked; the controller could send at 500 Hz, which costs this machine a core.
 _DATA_HZ = 125.0
 _DISCONNECT_S = 4.0
-# ``safety_mode`` of the RTDE guide.
-_SAFETY = {
-    1: "normal",
-    2: "reduced",
-    3: "protective stop",
-    4: "recovery",
-    5: "safeguard stop",
-    6: "system emergency stop",
-    7: "robot emergency stop",
-    8: "violation",
-    9: "fault",
-}
-_MAY_MOVE = (1, 2)
 
 
 @dataclass(frozen=True)
@@ -179,7 +167,7 @@ class URRTDEOperator:
         with self._opening:
             if self._control is not None:
                 return
-            control, receive = _import_rtde()
+            control, receive = import_rtde()
             self._closing = threading.Event()
             self._newest, self._last, self._moving = None, None, False
             self._broken = False
@@ -208,6 +196,23 @@ class URRTDEOperator:
             Faulted: the gripper reports a fault.
         """
         return min(self._reading().receipt, self._gripper_position()[0])
+
+    @property
+    def last_action(self) -> Array | None:
+        """``(7,)`` what holds arm and gripper, None before any command.
+
+        ``servoStop`` leaves the arm where it comes to rest, not at its last command.
+        """
+        with self._lock:
+            last = self._last
+            if last is None or self._control is None:
+                return None
+            return last.copy() if self._moving else np.append(self._reading().joints, last[_ARM])
+
+    @property
+    def speed_scaling(self) -> float:
+        """Share of the programmed speed that the robot runs at, 0 to 1."""
+        return self._reading().scaling
 
     def get_frame(self) -> Frame:
         """State and the newest pictures, in fresh arrays, with their receipt stamps.
@@ -239,7 +244,7 @@ class URRTDEOperator:
         checked = checked_action(self.embodiment, action)
         with self._lock:
             reading = self._reading()
-            _check_safety(reading.safety)
+            check_safety(reading.safety)
             check_not_paused(reading.scaling)
             if not self._listens():
                 raise self._not_obeying()
@@ -286,23 +291,6 @@ class URRTDEOperator:
 
     # Parts.
 
-    @property
-    def last_action(self) -> Array | None:
-        """``(7,)`` what holds arm and gripper, None before any command.
-
-        ``servoStop`` leaves the arm where it comes to rest, not at its last command.
-        """
-        with self._lock:
-            last = self._last
-            if last is None or self._control is None:
-                return None
-            return last.copy() if self._moving else np.append(self._reading().joints, last[_ARM])
-
-    @property
-    def speed_scaling(self) -> float:
-        """Share of the programmed speed that the robot runs at, 0 to 1."""
-        return self._reading().scaling
-
     def _open(self, control: Any, receive: Any) -> None:
         timeout = self._connect_timeout
         try:
@@ -313,7 +301,7 @@ class URRTDEOperator:
             self._watcher.start()
             self._wait_for(lambda: self._newest is not None, "the controller sends no data")
             assert self._newest is not None
-            _check_safety(self._newest.safety)
+            check_safety(self._newest.safety)
             self._control = control.RTDEControlInterface(self.robot_ip, _DATA_HZ)
             self._wait_for(self._control.isProgramRunning, "the control script does not run")
         except (OSError, RuntimeError) as error:
@@ -406,7 +394,7 @@ class URRTDEOperator:
         # The two connections tell of one stop a cycle apart; what ended the script is more to say.
         time.sleep(2.0 / _DATA_HZ)
         if self._newest is not None:
-            _check_safety(self._newest.safety)
+            check_safety(self._newest.safety)
         return Faulted(
             "the control script on the robot has ended, and nothing obeys commands",
             cause="a stop, local mode, a broken connection, or this program was silent for longer "
@@ -426,42 +414,8 @@ class URRTDEOperator:
         if control is None and receive is None:
             return
         # The client's own calls may hang for ever while it looks for its controller.
-        ending = threading.Thread(target=_disconnect, args=(control, receive), daemon=True)
+        ending = threading.Thread(target=disconnect, args=(control, receive), daemon=True)
         ending.start()
         ending.join(_DISCONNECT_S)
         if ending.is_alive():
             log.error("%s: the connection does not end; it will with the program", self.robot_ip)
-
-
-def _disconnect(control: Any, receive: Any) -> None:
-    calls: list[Callable[[], Any]] = []
-    if control is not None and control.isConnected():
-        calls.append(control.stopScript)
-    calls += [each.disconnect for each in (control, receive) if each is not None]
-    for call in calls:
-        try:
-            call()
-        # What C++ throws arrives as this; the calls after a failed one matter no less.
-        except RuntimeError as error:
-            log.warning("ending the connection to the robot: %s: %s", call.__name__, error)
-
-
-def _check_safety(mode: int) -> None:
-    if mode not in _MAY_MOVE:
-        raise Faulted(
-            f"the robot is in {_SAFETY.get(mode, f'safety mode {mode}')}, and ignores commands",
-            cause="it hit something, somebody pressed a stop, or a safety limit was reached",
-            next="look at the teach pendant, see that the way is free, and clear the stop there",
-        )
-
-
-def _import_rtde() -> tuple[Any, Any]:
-    try:
-        import rtde_control
-        import rtde_receive
-    except ImportError as error:
-        raise LoadFailed(
-            f"URRTDEOperator needs ur-rtde, which cannot be imported: {error}",
-            next="pip install 'fluxvla-ur[rtde]'",
-        ) from error
-    return rtde_control, rtde_receive

@@ -1,0 +1,42 @@
+"""ur-rtde's client: getting it, and letting go of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from fluxvla_core.errors import LoadFailed
+
+log = logging.getLogger("fluxvla.ur")
+
+
+def import_rtde() -> tuple[Any, Any]:
+    """Its modules for control and for receiving.
+
+    Raises:
+        LoadFailed: it is not installed.
+    """
+    try:
+        import rtde_control
+        import rtde_receive
+    except ImportError as error:
+        raise LoadFailed(
+            f"URRTDEOperator needs ur-rtde, which cannot be imported: {error}",
+            next="pip install 'fluxvla-ur[rtde]'",
+        ) from error
+    return rtde_control, rtde_receive
+
+
+def disconnect(control: Any, receive: Any) -> None:
+    """End both connections, where there are any; what fails is logged."""
+    calls: list[Callable[[], Any]] = []
+    if control is not None and control.isConnected():
+        calls.append(control.stopScript)
+    calls += [each.disconnect for each in (control, receive) if each is not None]
+    for call in calls:
+        try:
+            call()
+        # What C++ throws arrives as this; the calls after a failed one matter no less.
+        except RuntimeError as error:
+            log.warning("ending the connection to the robot: %s: %s", call.__name__, error)

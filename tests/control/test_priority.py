@@ -12,6 +12,7 @@ import time
 import pytest
 
 from fluxvla_core.control import priority
+from fluxvla_core.control.rate import Rate
 
 on_linux = pytest.mark.skipif(
     sys.platform != "linux" or os.sched_getscheduler(0) != os.SCHED_OTHER,
@@ -40,7 +41,7 @@ def test_everything_is_as_before_afterwards_also_after_an_error():
 
     def fail() -> None:
         with priority.first():
-            assert sys.getswitchinterval() == pytest.approx(priority.SWITCH_S)
+            assert sys.getswitchinterval() == pytest.approx(priority.SHARED_S)
             assert gc.get_freeze_count() > 0
             raise KeyError
 
@@ -64,34 +65,71 @@ def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has
     assert child == [str(os.SCHED_OTHER)]
 
 
-@on_linux
-def test_shortly_before_its_deadline_no_other_thread_takes_the_interpreter():
-    counted, over = [0], threading.Event()
+@pytest.fixture
+def counted():
+    """Counts on and on in a thread of its own."""
+    count, over = [0], threading.Event()
 
-    def count() -> None:
+    def work() -> None:
         while not over.is_set():
-            counted[0] += 1
+            count[0] += 1
             time.sleep(0)
 
-    thread = threading.Thread(target=count)
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield count
+    over.set()
+    thread.join()
+
+
+@on_linux
+def test_no_other_thread_takes_the_interpreter_before_a_deadline(counted):
     interval = sys.getswitchinterval()
     sys.setswitchinterval(60.0)
-    thread.start()
     try:
-        seen = []
-        for kept_s in (0.0, 0.2):
-            before, deadline = counted[0], time.monotonic() + 0.2
-            priority.wait_until(deadline, kept_s)
-            seen.append((counted[0] - before, time.monotonic() >= deadline))
+        time.sleep(0.05)  # whoever waits with the old interval is done with it
+        before, deadline = counted[0], time.monotonic() + 0.2
+        priority.wait_until(deadline)
+        kept = counted[0] - before, time.monotonic() >= deadline
+        time.sleep(0.05)
+        given = counted[0] - before
     finally:
-        over.set()
         sys.setswitchinterval(interval)
-        thread.join()
 
-    (given, on_time), (kept, on_time_too) = seen
+    assert kept == (0, True)
     assert given > 0
-    assert kept == 0
-    assert (on_time, on_time_too) == (True, True)
+
+
+@on_linux
+def test_from_waking_to_its_command_a_thread_keeps_the_interpreter_and_then_shares_it(counted):
+    with priority.first():
+        rate, kept, given = Rate(50, lead_s=0.004), [], []
+        for _ in range(25):
+            before = counted[0]
+            rate.sleep()
+            woke = counted[0]
+            rate.wait()
+            kept.append(counted[0] - woke)
+            given.append(woke - before)
+
+    # A machine that stands still meanwhile ends the time for which the interpreter is kept.
+    assert sorted(kept)[len(kept) // 2] == 0
+    assert min(given[1:]) > 0
+
+
+@on_linux
+def test_the_interpreter_is_kept_only_where_somebody_goes_first():
+    before = sys.getswitchinterval()
+    priority.keep()
+    priority.share()
+    assert sys.getswitchinterval() == before
+    with priority.first():
+        priority.keep()
+        assert sys.getswitchinterval() == pytest.approx(priority.KEPT_S)
+        priority.wait_until(time.monotonic())
+        assert sys.getswitchinterval() == pytest.approx(priority.SHARED_S)
+        priority.keep()
+    assert sys.getswitchinterval() == before
 
 
 @on_linux

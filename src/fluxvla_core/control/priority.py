@@ -4,7 +4,7 @@ Three things keep a Python thread from its deadline, and each has a means of its
 
 * other threads of the interpreter, which keep it for 5 ms unless they are asked to give it up
   earlier (``sys.setswitchinterval``), and have it just when a deadline comes unless it was taken
-  from them before (``wait_until``);
+  from them before (``keep``, ``wait_until``);
 * a full garbage collection, which stops all threads for as long as it takes to look at every
   object of every imported library (``gc.freeze`` takes those out);
 * other processes, which may also stop a thread that has the interpreter just then. Where the system
@@ -25,33 +25,45 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
-SWITCH_S = 0.0005
-KEPT_S = 0.0004
-"""A little less than ``SWITCH_S``: who waits longer than that for the interpreter demands it, and
-the thread that kept it would have to give it up just when its deadline is there."""
+SHARED_S = 0.0005
+KEPT_S = 0.01
+"""After which others demand the interpreter: longer than a command is made ready ahead, or the
+thread that keeps it would have to give it up just when its deadline is there."""
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
 _TIMER_ABSTIME = 1  # of <time.h>
+_firsts = 0  # blocks of ``first`` that are open
 
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-def wait_until(deadline: float, kept_s: float) -> None:
-    """Sleep until ``deadline`` (monotonic, in seconds), the last ``kept_s`` with the interpreter.
+def keep() -> None:
+    """Have the interpreter until ``share`` or a sleep; nothing outside of ``first``."""
+    if _firsts:
+        sys.setswitchinterval(KEPT_S)
 
-    A thread that wakes has to get the interpreter first. This one has it by then; meanwhile others
-    only compute outside of it, as torch's do. Off Linux it is given up as in any sleep.
+
+def share() -> None:
+    """Let others have it, who give it up soon when it is wanted; nothing outside of ``first``."""
+    if _firsts:
+        sys.setswitchinterval(SHARED_S)
+
+
+def wait_until(deadline: float) -> None:
+    """Sleep until ``deadline`` (monotonic, in seconds) with the interpreter; for milliseconds.
+
+    A thread that wakes has to get the interpreter first, and who has it may be stopped by other
+    processes just then. This one has it by then; meanwhile others only compute outside of it, as
+    torch's do. Off Linux it is given up as in any sleep.
     """
-    left = deadline - kept_s - time.monotonic()
-    if left > 0.0:
-        time.sleep(left)
     sleep = _keeping_sleep()
     if sleep is not None and time.monotonic() < deadline:
         seconds = int(deadline)
         until = _Timespec(seconds, int((deadline - seconds) * 1e9))
         sleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
+    share()
     # What is left where a signal ended it.
     left = deadline - time.monotonic()
     if left > 0.0:
@@ -77,8 +89,10 @@ def first() -> Iterator[bool]:
 
     Threads and processes that are begun inside are ordinary ones.
     """
+    global _firsts
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(min(interval, SWITCH_S))
+    _firsts += 1
+    share()
     _keeping_sleep()  # found now, not while an arm moves
     gc.collect()
     gc.freeze()
@@ -88,6 +102,7 @@ def first() -> Iterator[bool]:
     finally:
         _restore(before)
         gc.unfreeze()
+        _firsts -= 1
         sys.setswitchinterval(interval)
 
 

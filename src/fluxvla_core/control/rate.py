@@ -17,8 +17,8 @@ class Rate:
     the arm for a jump. Two beats are at least half a period apart, however late the first one was.
 
     What a command is made of takes a while, and not always the same. So ``sleep`` may return
-    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself; at
-    its very end, in real time, no other thread of the interpreter comes between.
+    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself; in
+    real time no other thread of the interpreter comes between.
 
     In a lockstep simulation both return at once.
 
@@ -50,6 +50,7 @@ class Rate:
         self.on_beat = on_beat
         self.lead_s = lead_s
         self._lockstep = in_lockstep(self.clock)
+        self._keeps = lead_s > 0.0 and type(self.clock) is MonotonicClock
         self.beats = 0
         self.skipped = 0
         self.late_s = 0.0
@@ -85,7 +86,11 @@ class Rate:
         missed = max(over, near, 0)
         self.skipped += missed
         deadline += missed * self.period
+        if self._keeps:
+            priority.share()
         self.clock.sleep_until(deadline)
+        if self._keeps:
+            priority.keep()
         self._woke = self.clock.now()
         late = max(0.0, self._woke - deadline)
         if not self._waits:
@@ -104,8 +109,8 @@ class Rate:
         self._waits = True
         self.late_s = 0.0
         if self._due is not None:
-            if type(self.clock) is MonotonicClock:
-                priority.wait_until(self._due, min(self.lead_s / 2, priority.KEPT_S))
+            if self._keeps:
+                priority.wait_until(self._due)
             else:
                 self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)

@@ -34,7 +34,7 @@ from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
 
 Array = npt.NDArray[np.float64]
 # How long before its deadline a command is made ready, in seconds and as a share of the period.
-_LEAD_S, _LEAD_SHARE = 0.002, 0.1
+_LEAD_S, _LEAD_SHARE = 0.004, 0.2
 _LOOK_S = 0.5  # that a reading may take
 _THERE = 1e-9  # from the start pose, in the joints' units
 # After these the arm no longer obeys, or nobody knows whether it does: it is not commanded on.

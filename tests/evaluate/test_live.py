@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, Rejected
+from fluxvla_core.errors import ConfigError, Rejected, RunFailed
 from fluxvla_core.evaluate.live import EnvironmentOperator
 from fluxvla_core.evaluate.live_settings import live_options
 from fluxvla_core.evaluate.runner import EvalRunner
@@ -66,6 +66,13 @@ def test_the_robots_safety_stops_a_policy_that_starves_it(tmp_path, walking):
     assert result["live"]["stopped_by"] == {"starvation": 1}
     assert "waits for a chunk" in record(tmp_path)["problem"]
     assert result["groups"]["policy"]["all"]["errors"] == 0, "it is the policy that failed"
+
+
+@pytest.mark.realtime
+def test_a_simulation_that_diverges_is_no_failure_of_the_policy(tmp_path, walking):
+    with pytest.raises(RunFailed, match="the environment's state is not finite after 3 steps"):
+        evaluate(tmp_path, {**LINE, "diverging": 2**63})
+    assert "the simulation diverged" in record(tmp_path)["error"]
 
 
 @pytest.mark.realtime

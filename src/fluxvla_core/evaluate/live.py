@@ -30,6 +30,7 @@ from fluxvla_core.contracts.optional import can_continue
 from fluxvla_core.control.clock import MonotonicClock
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
 from fluxvla_core.evaluate.live_settings import Live
+from fluxvla_core.evaluate.rollout import check_state
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera
 
@@ -49,7 +50,8 @@ class EnvironmentOperator:
 
     Attributes:
         ticks: control periods that have passed; ``late``: those of them that were stepped together
-            with others, because nobody came in time.
+            with others, because nobody came in time; ``failed``: the error of the environment that
+        ended the episode, if one did.
     """
 
     api: ClassVar[str] = "1.0"
@@ -66,6 +68,7 @@ class EnvironmentOperator:
         self.embodiment = replace(environment.spec.embodiment, cameras=cameras)
         self.clock = MonotonicClock()
         self.ticks = self.late = 0
+        self.failed: Exception | None = None
         self._environment = environment
         self._actor = actor
         self._task, self._seed, self._limit = task, seed, max_steps
@@ -142,7 +145,12 @@ class EnvironmentOperator:
         due = int((self.clock.now() - self._began) / self._period)
         self.late += max(0, min(due, self._limit) - self.ticks - 1)
         while self.ticks < due and not self._over():
-            self._found = self._environment.step(self._target)
+            try:
+                self._found = self._environment.step(self._target)
+                check_state(self._environment.state, self.ticks + 1)
+            except Exception as error:
+                self.failed = error
+                raise
             self.ticks += 1
 
     def _checked(self, action: Array) -> Array:
@@ -214,6 +222,7 @@ def run_live(
 
     Raises:
         ConfigError: the environment takes no joint targets, or an option does not fit.
+        RunFailed: the environment's state is not finite; or what its ``step`` raised.
     """
     if not environment.spec.limited:
         raise ConfigError(
@@ -239,6 +248,8 @@ def run_live(
     runner.run_setup()
     with suppress(SafetyStop):  # what the safety stopped has failed; its record says why
         runner.run()
+    if operator.failed is not None:  # to the runner a robot that broke, which no policy can help
+        raise operator.failed
     record = next((folder / "inference").glob("*/episode.json"))
     summary = json.loads(record.read_text(encoding="utf-8"))
     policy = summary["timings"].get("policy", {})

@@ -124,7 +124,7 @@ def run_episode(
     spec, limit = environment.spec, course.max_steps or task.max_steps
     commands = Commands(spec, getattr(actor, "action_rate_hz", None))
     start = environment.state
-    _check_state(start, 0)
+    check_state(start, 0)
     commands.start(start)
     own_hash = getattr(environment, "state_hash", None)
     digest = hashlib.sha256(start.tobytes())
@@ -138,7 +138,7 @@ def run_episode(
         at = time.perf_counter()
         observation = environment.observe(course.cameras)
         # Before the policy is asked: what it makes of such a state is not its fault.
-        _check_state(observation["qpos"], steps)
+        check_state(observation["qpos"], steps)
         seen = time.perf_counter()
         chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
         answered = time.perf_counter()
@@ -196,7 +196,8 @@ def shaped(chunk: Any, dim: int) -> Array:
     return array
 
 
-def _check_state(state: Any, steps: int) -> None:
+def check_state(state: Any, steps: int) -> None:
+    """Refuse a state that is not finite after so many steps: its episode tells nothing."""
     if not np.isfinite(state).all():
         raise RunFailed(
             f"the environment's state is not finite after {steps} steps",

@@ -7,8 +7,6 @@ obeys, and the operator's own ``stop`` is called where something went wrong.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +14,24 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.control.interrupt import Interrupted
 from fluxvla_core.control.loop import EpisodeOver, Loop, Seen
 from fluxvla_core.control.path import CommandPath, Sent
 from fluxvla_core.control.rate import Rate
-from fluxvla_core.errors import FluxError, NotReady, OperatorError, RunFailed
+from fluxvla_core.errors import FluxError, OperatorError, RunFailed
 from fluxvla_core.infer.episode_record import EpisodeRecord
 from fluxvla_core.infer.plan import Answer, Plan, PolicyFailed
+from fluxvla_core.infer.reading import Reader, Reading
 from fluxvla_core.infer.tasks import Task
 from fluxvla_core.record.replay_policy import ENDED, RecordingEnded
-from fluxvla_core.safety.gates import FreshnessGate, check_frame
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
-from fluxvla_core.safety.stops import BadChunk, BadFrame, BadTiming
+from fluxvla_core.safety.stops import BadChunk
 from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
 
 Array = npt.NDArray[np.float64]
 # How long before its deadline a command is made ready, in seconds and as a share of the period.
 _LEAD_S, _LEAD_SHARE = 0.004, 0.2
-_LOOK_S = 0.5  # that a reading may take
 _THERE = 1e-9  # from the start pose, in the joints' units
 # After these the arm no longer obeys, or nobody knows whether it does: it is not commanded on.
 _NOT_BRAKED = ("operator", "tracking", "execute")
@@ -91,13 +87,13 @@ class Episode:
             self._on_sent,
             plan.robot.speed,
         )
-        self._gate = FreshnessGate(settings.max_age_s, settings.max_skew_s)
         self._tracking = TrackingWatch(embodiment, settings)
         self._columns = action_columns(embodiment)
         self._grippers = np.array([joint.kind == "gripper" for joint in embodiment.joints])
         self._phase = "start"
         self._executing = False
         self._record = EpisodeRecord(plan, task, self._seed, folder, self._rate)
+        self._reader = Reader(plan, self._record)
 
     def run(self) -> dict[str, Any]:
         """The whole episode.
@@ -164,10 +160,9 @@ class Episode:
         """Read where the arm is, and bring it to the start pose."""
         plan = self._plan
         plan.robot.begin(self._task.instruction, self._number)
-        window, frame = self._first_reading()
-        state = self._checked(window, frame)
-        self._record.seen(state, window["images"], frame, {})
-        self._limiter.start(self._where(state))
+        reading = self._reader.first()
+        self._note(reading)
+        self._limiter.start(self._where(reading.state))
         plan.policy.reset(self._seed)
         if plan.start_pose is not None:
             self._phase = "ramp"
@@ -223,74 +218,17 @@ class Episode:
             kept = kept | self._tracking.follows(commanded, state)
         return np.where(kept, commanded, state[self._columns])
 
-    def _first_reading(self) -> tuple[dict[str, Any], Frame | None]:
-        until = time.monotonic() + self._plan.ready_s
-        while True:
-            self._plan.interrupts.check()
-            try:
-                window, frame = self._look(until)
-                _check_complete(window, self._plan.cameras)
-                if frame is not None:
-                    self._gate.check(frame.stamps, self._plan.cameras, self._plan.robot.clock.now())
-                return window, frame
-            except (NotReady, BadTiming) as error:
-                if time.monotonic() > until:
-                    raise NotReady(
-                        f"the robot gave no complete reading within {self._plan.ready_s:g} s: "
-                        f"{error.what}",
-                        cause=error.cause,
-                        next=error.next,
-                    ) from error
-                time.sleep(0.02)
-
-    def _look(self, until: float) -> tuple[dict[str, Any], Frame | None]:
-        """A reading in the thread that all readings are made in: cameras may be bound to one."""
-        plan = self._plan
-        if plan.robot.lockstep:
-            return plan.look()
-        # One that is begun shortly before the end is given its time, too.
-        until = max(until, time.monotonic() + _LOOK_S)
-        future = plan.worker.submit(plan.look)
-        while not future.done() and time.monotonic() < until:
-            plan.interrupts.check()
-            wait((future,), timeout=0.02)
-        if not future.done():
-            raise NotReady(f"{plan.robot.name}.get_frame does not return")
-        return future.result()
-
-    def _checked(self, window: dict[str, Any], frame: Frame | None) -> Array:
-        """The state of a reading that is what the embodiment describes, ``(state_dim,)``."""
-        state = np.asarray(window["qpos"] if frame is None else frame.state, dtype=np.float64)
-        stamps = frame.stamps if frame is not None else {}
-        reading = Frame(state=state, images=window["images"], stamps=stamps)
-        try:
-            check_frame(reading, self._plan.robot.embodiment, self._plan.cameras)
-        except BadFrame:
-            self._record.refused("reading", state=state, images=window["images"])
-            raise
-        return state
-
     def _observe(self) -> Seen:
-        plan, clock = self._plan, self._plan.robot.clock
-        began = time.perf_counter()
-        window, frame = plan.look()
-        seconds = {"sync": time.perf_counter() - began}
-        try:
-            _check_complete(window, plan.cameras)
-        except NotReady as error:
-            raise BadFrame(error.what, cause="a stream that was there is gone") from error
-        state = self._checked(window, frame)
-        now, age = clock.now(), 0.0
-        stamp = now
-        if frame is not None:
-            age = max(self._gate.check(frame.stamps, plan.cameras, now), 0.0)
-            stamp = frame.stamps[STATE]
-            seconds = {"receipt": age, **seconds}
-        if plan.robot.follows:
-            self._tracking.check(state, stamp)
-        self._record.seen(state, window["images"], frame, seconds)
-        observation = {**window, "task_description": self._task.instruction}
-        return Seen(observation, now - age)
+        reading = self._reader.read()
+        if self._plan.robot.follows:
+            self._tracking.check(reading.state, reading.measured)
+        self._note(reading)
+        observation = {**reading.window, "task_description": self._task.instruction}
+        return Seen(observation, reading.at)
+
+    def _note(self, reading: Reading) -> None:
+        images = reading.window["images"]
+        self._record.seen(reading.state, images, reading.frame, reading.seconds)
 
     def _think(self, seen: Seen, rest: Continuation | None) -> Answer:
         policy: Any = self._plan.policy
@@ -434,12 +372,3 @@ def _frozen(observation: dict[str, Any]) -> dict[str, Any]:
     for array in (shown["qpos"], *images.values()):
         array.flags.writeable = False
     return shown
-
-
-def _check_complete(window: dict[str, Any], cameras: Sequence[str]) -> None:
-    """A stream that has not come yet is None in an operator of the specification's shape."""
-    if window.get("qpos") is None:
-        raise NotReady("there are no joint states yet")
-    missing = [name for name in cameras if window["images"].get(name) is None]
-    if missing:
-        raise NotReady(f"there is no picture of {', '.join(missing)} yet")

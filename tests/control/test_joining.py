@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.control.joining import Chunk, LatestOnly, Synchronous
+from fluxvla_core.control.keyframes import sample
 
 
 def chunk(values, observed=0.0, anchor=0.0, rate=10.0):
@@ -73,3 +74,15 @@ def test_a_newer_chunk_replaces_and_an_older_one_does_not():
     assert at(joiner, 2.3) == 2.0
     joiner.reset()
     assert joiner.target(2.3) is None
+
+
+def test_a_moment_of_a_chunk_is_that_of_its_samples_bit_for_bit():
+    random = np.random.default_rng(3)
+    for count in (1, 2, 7):
+        one = Chunk(random.normal(size=(count, 4)), 10.0, 5.0, random.normal(size=4))
+        moments = np.concatenate(
+            [random.uniform(-0.2, count / 10 + 0.2, 40), np.arange(count + 1) / 10]
+        )
+        for elapsed in moments:
+            expected = sample(one.anchor, one.keyframes, one.rate_hz, [elapsed])[0]
+            np.testing.assert_array_equal(one.at(elapsed), expected)

@@ -9,7 +9,14 @@ import pytest
 
 from fluxvla_core.errors import SafetyStop
 from fluxvla_core.safety.settings import SafetySettings
-from fluxvla_core.safety.trips import Latch, TrackingWatch, Trip, action_columns, check_chunk
+from fluxvla_core.safety.trips import (
+    Latch,
+    TrackingWatch,
+    Trip,
+    action_columns,
+    check_beginning,
+    check_chunk,
+)
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
@@ -113,11 +120,12 @@ LAST = np.array([0.0, 0.5, 0.0])
 
 
 def checked(rows, rate=10.0, settings=SETTINGS):
-    return check_chunk(np.array(rows, dtype=float), ARM, LAST, rate, settings)
+    keyframes = check_chunk(np.array(rows, dtype=float), ARM, rate, settings)
+    check_beginning(keyframes, ARM, LAST, rate, settings)
 
 
 def test_a_motion_passes_as_float64():
-    chunk = check_chunk([[0, 0.5, 0], [0.2, 0.5, 1]], ARM, LAST, 10.0, SETTINGS)
+    chunk = check_chunk([[0, 0.5, 0], [0.2, 0.5, 1]], ARM, 10.0, SETTINGS)
 
     assert chunk.dtype == np.float64
     np.testing.assert_array_equal(chunk, [[0, 0.5, 0], [0.2, 0.5, 1]])
@@ -158,4 +166,13 @@ def test_thresholds_are_the_settings():
 
 def test_numbers_of_other_kinds_are_taken_and_words_are_not():
     with pytest.raises(SafetyStop, match="the policy's chunk is no array of numbers"):
-        check_chunk([["a", "b", "c"]], ARM, LAST, 10.0, SETTINGS)
+        check_chunk([["a", "b", "c"]], ARM, 10.0, SETTINGS)
+
+
+def test_only_the_way_to_its_beginning_depends_on_where_the_arm_is():
+    rows = np.array([[2.5, 0.5, 0.0], [2.5, 0.5, 0.0]])
+    keyframes = check_chunk(rows, ARM, 10.0, SETTINGS)
+
+    check_beginning(keyframes, ARM, rows[0], 10.0, SETTINGS)
+    with pytest.raises(SafetyStop, match=r"keyframe 0 wants turn to jump by 2\.5"):
+        check_beginning(keyframes, ARM, LAST, 10.0, SETTINGS)

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.control.keyframes import sample
 
 Array = npt.NDArray[np.float64]
 # A lockstep clock sums its steps, and the sum is rounded: half a microsecond is nothing.
@@ -50,8 +49,18 @@ class Chunk:
         return elapsed <= self.seconds + 1e-6 / self.rate_hz
 
     def at(self, elapsed: float) -> Array:
-        """``(D,)`` where it is after ``elapsed`` seconds; its first or last point outside it."""
-        point: Array = sample(self.anchor, self.keyframes, self.rate_hz, [elapsed])[0]
+        """``(D,)`` where it is after ``elapsed`` seconds; its first or last point outside it.
+
+        As ``keyframes.sample`` has it. That works on the whole chunk, and numpy gives the
+        interpreter up for arrays of that size: a thread that sends would have to get it again.
+        """
+        count = len(self.keyframes)
+        position = min(max(elapsed * self.rate_hz, 0.0), float(count))
+        before = min(int(position), max(count - 1, 0))
+        share = position - before
+        start = self.keyframes[before - 1] if before else self.anchor
+        end = self.keyframes[before] if before < count else start
+        point: Array = start * (1.0 - share) + end * share
         return point
 
 

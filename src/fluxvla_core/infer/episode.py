@@ -27,7 +27,7 @@ from fluxvla_core.record.replay_policy import ENDED, RecordingEnded
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
 from fluxvla_core.safety.stops import BadChunk
-from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_chunk
+from fluxvla_core.safety.trips import TrackingWatch, action_columns, check_beginning, check_chunk
 
 Array = npt.NDArray[np.float64]
 # How long before its deadline a command is made ready, in seconds and as a share of the period.
@@ -244,25 +244,42 @@ class Episode:
             raise
         except Exception as error:
             raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
-        return Answer(chunk, time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread
+        # that sends would have to get it again.
+        try:
+            return Answer(chunk, seconds, self._keyframes(chunk))
+        except BadChunk as problem:
+            return Answer(chunk, seconds, problem)
+
+    def _keyframes(self, chunk: Any) -> Array:
+        plan, policy = self._plan, self._plan.policy
+        keyframes = check_chunk(
+            chunk, plan.robot.embodiment, policy.action_rate_hz, plan.settings
+        ).copy()
+        if len(keyframes) != policy.horizon:
+            raise BadChunk(
+                f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+            )
+        keyframes.flags.writeable = False
+        return keyframes
 
     def _admit(self, seen: Seen, answer: Answer) -> Array:
-        plan, policy = self._plan, self._plan.policy
-        embodiment, last = plan.robot.embodiment, self._limiter.last
+        plan, policy, keyframes = self._plan, self._plan.policy, answer.keyframes
         try:
-            keyframes = check_chunk(
-                answer.chunk, embodiment, last, policy.action_rate_hz, plan.settings
+            if isinstance(keyframes, BadChunk):
+                raise keyframes
+            check_beginning(
+                keyframes,
+                plan.robot.embodiment,
+                self._limiter.last,
+                policy.action_rate_hz,
+                plan.settings,
             )
-            if len(keyframes) != policy.horizon:
-                raise BadChunk(
-                    f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
-                )
         except BadChunk:
             self._record.refused("chunk", answer=answer.chunk)
             raise
         self._phase = "run"
-        keyframes = keyframes.copy()
-        keyframes.flags.writeable = False
         if plan.hooks:
             plan.hooks.call("observed", observation=_frozen(seen.observation))
             plan.hooks.call("inferred", chunk=keyframes, latency_s=answer.seconds)

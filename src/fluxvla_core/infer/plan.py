@@ -6,6 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.protocols import Policy
@@ -17,6 +20,7 @@ from fluxvla_core.errors import RunFailed
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.infer.robot import Robot
 from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.stops import BadChunk
 from fluxvla_core.safety.trips import Latch
 
 
@@ -28,10 +32,17 @@ class PolicyFailed(RunFailed):
 
 @dataclass(frozen=True)
 class Answer:
-    """A policy's chunk, unchecked, and how long it took."""
+    """What a policy said.
+
+    Args:
+        chunk: as it came.
+        seconds: how long it took.
+        keyframes: ``(T, D)`` of it, read-only, or why they are refused.
+    """
 
     chunk: Any
     seconds: float
+    keyframes: npt.NDArray[np.float64] | BadChunk
 
 
 @dataclass(frozen=True)

@@ -160,16 +160,16 @@ def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
 def check_chunk(
     chunk: npt.ArrayLike,
     embodiment: EmbodimentSpec,
-    last: Array,
     rate_hz: float,
     settings: SafetySettings,
 ) -> Array:
     """Refuse a chunk that is no motion; what is merely too fast or too far is left to the limits.
 
+    Whether the arm gets to its beginning is for ``check_beginning``.
+
     Args:
         chunk: ``(T, dim)`` keyframes from a policy.
         embodiment: whose joints they are for.
-        last: ``(dim,)`` the command that the arm has now.
         rate_hz: keyframes a second.
         settings: ``jump_s`` and ``excess``.
 
@@ -210,19 +210,52 @@ def check_chunk(
             f"limits [{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
             cause="the policy's units or statistics are not this robot's",
         )
-    reachable = np.clip(keyframes, lower, upper)
-    moves = np.diff(np.vstack([last, reachable]), axis=0)
+    _check_jumps(np.clip(keyframes, lower, upper), 1, embodiment, rate_hz, settings)
+    return keyframes
+
+
+def check_beginning(
+    keyframes: Array,
+    embodiment: EmbodimentSpec,
+    last: Array,
+    rate_hz: float,
+    settings: SafetySettings,
+) -> None:
+    """Refuse a chunk whose first keyframe is too far from where the arm is commanded to be.
+
+    Args:
+        keyframes: ``(T, dim)`` that ``check_chunk`` let through.
+        embodiment: whose joints they are for.
+        last: ``(dim,)`` the command that the arm has now.
+        rate_hz: keyframes a second.
+        settings: ``jump_s``.
+
+    Raises:
+        BadChunk: no motion explains the jump.
+    """
+    lower, upper = np.array([(j.lower, j.upper) for j in embodiment.joints]).T
+    way = np.array([last, np.clip(keyframes[0], lower, upper)])
+    _check_jumps(way, 0, embodiment, rate_hz, settings)
+
+
+def _check_jumps(
+    way: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
+) -> None:
+    """Of the points ``(N, dim)`` of a way, the second of which is keyframe ``first``."""
+    if len(way) < 2:
+        return
+    moves = np.diff(way, axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
-    seconds = np.abs(moves) / np.array([j.velocity for j in joints]) - 1.0 / rate_hz
+    seconds = np.abs(moves) / np.array([j.velocity for j in embodiment.joints]) - 1.0 / rate_hz
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)
     if seconds[row, column] > settings.jump_s:
+        name = embodiment.joint_names[column]
         raise BadChunk(
-            f"keyframe {row} wants {names[column]} to jump by {moves[row, column]:.4g}; at full "
+            f"keyframe {row + first} wants {name} to jump by {moves[row, column]:.4g}; at full "
             f"speed that takes {seconds[row, column]:.2f} s more than there are",
             cause="the policy is not for the pose that the arm is in, or it diverged",
             next="move the arm to the start pose first; safety.jump_s sets what is allowed",
         )
-    return keyframes
 
 
 def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:

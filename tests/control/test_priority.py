@@ -9,10 +9,16 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from fluxvla_core.control import priority
+from fluxvla_core.control.joining import Chunk
 from fluxvla_core.control.rate import Rate
+from fluxvla_core.safety.limits import Limiter
+from fluxvla_core.safety.settings import SafetySettings
+from fluxvla_core.safety.trips import TrackingWatch, check_beginning
+from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 on_linux = pytest.mark.skipif(
     sys.platform != "linux" or os.sched_getscheduler(0) != os.SCHED_OTHER,
@@ -98,6 +104,32 @@ def test_no_other_thread_takes_the_interpreter_before_a_deadline(counted):
 
     assert kept == (0, True)
     assert given > 0
+
+
+@on_linux
+def test_what_a_command_is_made_of_gives_the_interpreter_to_nobody(counted):
+    """As numpy would for arrays of more than 500 numbers, such as chunks, and for ``argmax``."""
+    joints = tuple(Joint(f"j{n}", "rad", -3.0, 3.0, 2.0, 20.0) for n in range(14))
+    spec = EmbodimentSpec("arm", joints, (), 50.0)
+    settings, limiter = SafetySettings(), Limiter(spec, 0.02)
+    watch = TrackingWatch(spec, settings)
+    limiter.start(np.zeros(14))
+    chunk = Chunk(np.full((200, 14), 0.1), 50.0, 0.0, np.zeros(14))
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(60.0)
+    try:
+        time.sleep(0.05)  # whoever waits with the old interval is done with it
+        before = counted[0]
+        for step in range(250):
+            check_beginning(chunk.keyframes, spec, limiter.last, 50.0, settings)
+            (command,), _ = limiter.run(chunk.at(step / 50)[None])
+            watch.sent(command, step / 50)
+            watch.check(command, step / 50)
+        given = counted[0] - before
+    finally:
+        sys.setswitchinterval(interval)
+
+    assert given == 0
 
 
 @on_linux

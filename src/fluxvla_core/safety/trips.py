@@ -242,20 +242,19 @@ def _check_jumps(
     way: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
 ) -> None:
     """Of the points ``(N, dim)`` of a way, the second of which is keyframe ``first``."""
-    if len(way) < 2:
-        return
     moves = np.diff(way, axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
     seconds = np.abs(moves) / np.array([j.velocity for j in embodiment.joints]) - 1.0 / rate_hz
+    if not (seconds > settings.jump_s).any():
+        return
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)
-    if seconds[row, column] > settings.jump_s:
-        name = embodiment.joint_names[column]
-        raise BadChunk(
-            f"keyframe {row + first} wants {name} to jump by {moves[row, column]:.4g}; at full "
-            f"speed that takes {seconds[row, column]:.2f} s more than there are",
-            cause="the policy is not for the pose that the arm is in, or it diverged",
-            next="move the arm to the start pose first; safety.jump_s sets what is allowed",
-        )
+    raise BadChunk(
+        f"keyframe {row + first} wants {embodiment.joint_names[column]} to jump by "
+        f"{moves[row, column]:.4g}; at full speed that takes {seconds[row, column]:.2f} s more "
+        "than there are",
+        cause="the policy is not for the pose that the arm is in, or it diverged",
+        next="move the arm to the start pose first; safety.jump_s sets what is allowed",
+    )
 
 
 def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:

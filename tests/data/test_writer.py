@@ -275,6 +275,23 @@ def test_a_crash_leaves_no_dataset_and_the_saved_episodes(tmp_path, spec, takes)
     assert not list(tmp_path.glob(".*"))
 
 
+def test_dying_in_the_middle_of_a_file_leaves_the_one_before(tmp_path, spec, takes, monkeypatch):
+    root = tmp_path / "d"
+    writer = LeRobotWriter(root, 10, spec())
+    takes[0].record(writer)
+
+    def die(path, text, **options):
+        path.write_bytes(text.encode()[:3])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(root), "write_text", die)
+        with pytest.raises(KeyboardInterrupt):
+            takes[1].record(writer)
+    with LeRobotWriter(root, 10, spec(), recover=True) as writer:
+        assert writer.episodes == 1
+
+
 def test_dying_while_finalizing_leaves_no_dataset(tmp_path, spec, takes, monkeypatch):
     root = tmp_path / "d"
     writer = LeRobotWriter(root, 10, spec())

@@ -153,12 +153,13 @@ def test_slips_are_told_before_anything_starts(tmp_path, capsys, more, text):
 def test_a_collection_goes_on_after_kill_9_at_any_moment(tmp_path):
     def run(out, *more):
         command = [sys.executable, "-m", "fluxvla_core", *words(out, *more, episodes=12)]
-        return subprocess.Popen(
-            [*command, "--set", "env.slow=0.01"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        with (tmp_path / "said.txt").open("w") as said:
+            return subprocess.Popen(
+                [*command, "--set", "env.slow=0.01"],
+                stdout=said,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
 
     whole = run(tmp_path / "whole")
     began = time.monotonic()
@@ -172,6 +173,6 @@ def test_a_collection_goes_on_after_kill_9_at_any_moment(tmp_path):
         process.wait(60)
         while not out.exists():
             again = run(out, *(["--resume"] if staging_of(out).exists() else []))
-            assert again.wait(300) == 0
+            assert again.wait(300) == 0, (tmp_path / "said.txt").read_text()
         assert table(out) == table(tmp_path / "whole")
         assert videos(out) == videos(tmp_path / "whole")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data.encode import CODECS, Clip, join_clips
+from fluxvla_core.data.files import write_json
 from fluxvla_core.data.optional import arrow, parquet
 from fluxvla_core.data.statistics import (
     Stats,
@@ -248,9 +248,3 @@ def _write_extras(episodes: Sequence[Episode], out: Path) -> None:
         # Of the clip as it was encoded: merging then splits files where recording did.
         extras[f"bytes/{name}"] = pa.array([e.clips[name].size for e in episodes], pa.int64())
     pq.write_table(pa.table(extras), out / v3.EXTRAS)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON that people can read."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")

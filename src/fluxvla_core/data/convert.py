@@ -22,13 +22,12 @@ from fluxvla_core.data.assemble import (
     flat_statistics,
     split_by_size,
     statistics_of,
-    write_json,
     write_tables,
     write_videos,
 )
 from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.encode import Clip, whole_clip
-from fluxvla_core.data.files import read_table
+from fluxvla_core.data.files import read_table, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.optional import arrow, parquet
 from fluxvla_core.data.statistics import LEVELS, as_lists, image_histogram

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data.columns import read_columns
-from fluxvla_core.data.files import read_json
+from fluxvla_core.data.files import read_json, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.recording import make_track
 from fluxvla_core.data.statistics import (
@@ -150,9 +149,7 @@ def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
     path = meta.root / v3.STATS
     before = read_json(path) if path.is_file() else {}
     after = {**before, **{key: as_lists(entry) for key, entry in stats.items()}}
-    aside = path.with_name(f".{path.name}.writing")
-    aside.write_text(json.dumps(after, indent=4) + "\n", encoding="utf-8")
-    os.replace(aside, path)
+    write_json(path, after)
     return path
 
 

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.assemble import Episode, write_json
+from fluxvla_core.data.assemble import Episode
 from fluxvla_core.data.encode import Clip, Codec, EpisodeEncoder
+from fluxvla_core.data.files import write_json
 from fluxvla_core.data.statistics import LEVELS, image_histogram
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import EmbodimentSpec

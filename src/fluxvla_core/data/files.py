@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -62,3 +63,11 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON lines ({error})") from error
     return found
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as JSON that people can read, in one step: a kill leaves what was before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.writing")
+    aside.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(aside, path)

@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.assemble import Recording, assemble, write_json
+from fluxvla_core.data.assemble import Recording, assemble
 from fluxvla_core.data.draft import EpisodeDraft, Sizes, load_episode
 from fluxvla_core.data.encode import find_codec
+from fluxvla_core.data.files import write_json
 from fluxvla_core.errors import DataError, RunFailed
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 

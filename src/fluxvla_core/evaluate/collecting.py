@@ -75,6 +75,7 @@ def collect_episodes(
         UsageError: there is an interrupted collection, or it had other settings.
         RunFailed: an episode fails, workers cannot be started, or the disk is full.
     """
+    from fluxvla_core.data.files import write_json
     from fluxvla_core.data.writer import LeRobotWriter, staging_of
 
     note = staging_of(out) / SETTINGS
@@ -87,7 +88,7 @@ def collect_episodes(
         )
     began, retried, frames = time.monotonic(), 0, 0
     with LeRobotWriter(out, fps, embodiment, recover=resume) as writer:
-        note.write_text(json.dumps(dict(settings)), encoding="utf-8")
+        write_json(note, dict(settings))
         kept = writer.episodes
         jobs = range(kept, episodes)
         with closing(run_jobs(factory, jobs, workers)) as outcomes:

@@ -48,7 +48,9 @@ def finish_recording(folder: str | Path) -> bool:
         shutil.rmtree(aside, ignore_errors=True)
     if not (place / SUMMARY).exists():
         text = json.dumps(recorded.summary(), indent=1) + "\n"
-        (place / SUMMARY).write_text(text, encoding="utf-8")
+        part = place / f"{SUMMARY}.part"
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, place / SUMMARY)
     return True
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config import Config, environment, resolved, write_resolved
+from fluxvla_core import atomic
+from fluxvla_core.config import Config, environment, write_resolved
 from tests.conftest import Install
 
 
@@ -37,7 +38,7 @@ def test_a_write_that_fails_leaves_the_older_file(
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(resolved.os, "replace", full)
+    monkeypatch.setattr(atomic.os, "replace", full)
     with pytest.raises(OSError, match="No space left"):
         write_resolved(path, Config({"a": 2}))
     assert path.read_text() == before

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.tree import Config
 from fluxvla_core.plugins._metadata import CORE, index, version
@@ -57,10 +57,5 @@ def environment() -> dict[str, Any]:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON beside ``path`` and rename it there: a reader never sees half a file."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        aside.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    """Write JSON for machines and people, in one step."""
+    atomic.write_text(path, json.dumps(data, indent=1, ensure_ascii=False) + "\n")

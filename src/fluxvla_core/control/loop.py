@@ -70,9 +70,10 @@ class Loop:
         path: started at the arm's pose; sends every command.
         joiner: makes one motion of the chunks.
         observe: makes an observation.
-        think: asks the policy, which may have to go on from the motion under way; ``(T, D)``
-            keyframes, those to be played.
-        admit: checks the keyframes of an answer, and takes note of it.
+        think: asks the policy, which may have to go on from the motion under way, and checks what
+            it says; what takes long belongs here, not in the thread that sends.
+        admit: the ``(T, D)`` keyframes of an answer that are played, as it arrives; refuses it, or
+            takes note of it.
         keyframe_hz, horizon: keyframes a second, and in each answer of the policy.
         clock: the operator's.
         lockstep: whether time stands still between commands.

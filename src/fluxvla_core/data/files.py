@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.data.optional import arrow, parquet
 from fluxvla_core.errors import DataError
 
@@ -68,6 +68,4 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as JSON that people can read, in one step: a kill leaves what was before."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.writing")
-    aside.write_text(json.dumps(value, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(aside, path)
+    atomic.write_text(path, json.dumps(value, indent=4, ensure_ascii=False) + "\n")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluate.ledger import DONE
@@ -20,15 +20,13 @@ NAMED = 5
 
 
 def write_results(path: Path, results: Mapping[str, Any]) -> None:
-    """Write JSON beside ``path`` and rename it, so that what is there is whole.
+    """Write JSON, so that what is there is whole.
 
     Raises:
         RunFailed: the disk is full, or the folder was taken away.
     """
-    part = path.with_suffix(".json.part")
     try:
-        part.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        os.replace(part, path)
+        atomic.write_text(path, json.dumps(results, indent=1) + "\n")
     except OSError as error:
         full = error.errno == errno.ENOSPC
         raise RunFailed(

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+from fluxvla_core import atomic
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import ConfigError
 
@@ -40,10 +41,8 @@ class JsonlTracker:
     def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
         path = run_dir / "metrics.jsonl"
         kept = [line for line in _lines(path) if _step(line) <= step]
-        aside = path.with_name(f".{path.name}.{os.getpid()}")
         run_dir.mkdir(parents=True, exist_ok=True)
-        aside.write_text("".join(kept), encoding="utf-8")
-        os.replace(aside, path)
+        atomic.write_text(path, "".join(kept))
         self._file = path.open("a", encoding="utf-8")
 
     def log(self, step: int, values: Values) -> None:

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.errors import DataError
 from fluxvla_core.record import ros_messages as ros
 from fluxvla_core.record.mcap import McapFile
@@ -47,10 +48,7 @@ def finish_recording(folder: str | Path) -> bool:
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     if not (place / SUMMARY).exists():
-        text = json.dumps(recorded.summary(), indent=1) + "\n"
-        part = place / f"{SUMMARY}.part"
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, place / SUMMARY)
+        atomic.write_text(place / SUMMARY, json.dumps(recorded.summary(), indent=1) + "\n")
     return True
 
 

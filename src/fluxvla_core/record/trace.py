@@ -8,7 +8,6 @@ pictures long before events.
 from __future__ import annotations
 
 import json
-import os
 import queue
 import re
 import threading
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core import atomic
 from fluxvla_core.control import priority
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.record.logs import Bag, JsonLines, Log
@@ -153,9 +153,7 @@ class EpisodeTrace:
         self._thread.join()
         whole = {**summary, "dropped": dict(self.dropped)}
         try:
-            part = self.folder / (SUMMARY + ".part")
-            part.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
-            os.replace(part, self.folder / SUMMARY)
+            atomic.write_text(self.folder / SUMMARY, json.dumps(whole, indent=1) + "\n")
         except OSError as error:
             self._error = self._error or error
         if self._error is not None:

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.report.curves import curves
 from fluxvla_core.report.episode_view import episode_view, total_ms
@@ -50,11 +51,9 @@ def build_report(work_dir: Path | str, out: Path | str | None = None, title: str
     if not folder.is_dir():
         raise UsageError("there is no such work dir to report on", where=str(folder))
     html = render(read_facts(folder), target.parent, title)
-    part = target.with_name(target.name + ".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(html, encoding="utf-8")
-        os.replace(part, target)
+        atomic.write_text(target, html)
     except OSError as error:
         raise RunFailed(f"the report cannot be written: {error}", where=str(target)) from error
     return target

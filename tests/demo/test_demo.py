@@ -158,6 +158,20 @@ def test_other_code_or_another_stage_before_it_means_anew(
     assert f"{programs.work} was made with other inputs: starting it anew" in "\n".join(said)
 
 
+def test_a_demo_made_anew_has_the_whole_time_again(programs: Programs, said: list[str]) -> None:
+    programs.step_s = 1.0
+    demo(programs, said, "default").run()
+    journal = Journal(programs.root / "journal.json")
+    steps = journal.entries["measure"].result["steps"]
+    for entry in journal.entries.values():
+        entry.seconds += 200.0
+    journal.save()
+    demo(programs, said, "default", build="2").run()
+    again = Journal(programs.root / "journal.json")
+    assert again.entries["measure"].result["steps"] == steps
+    assert again.entries["install"].seconds == 10.0
+
+
 def test_a_damaged_journal_only_costs_time(programs: Programs, said: list[str]) -> None:
     demo(programs, said).run()
     for content in ("", "{", "[]", '{"collect": {"nonsense": 1}}'):

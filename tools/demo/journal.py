@@ -37,6 +37,12 @@ class Journal:
         except (OSError, ValueError, TypeError, AttributeError):
             self.entries = {}
 
+    def forget_from(self, name: str) -> None:
+        """Drop a stage and those after it: they are done anew, and their time was another's."""
+        names = list(self.entries)
+        for later in names[names.index(name) :] if name in names else ():
+            del self.entries[later]
+
     def save(self) -> None:
         """Write the file; a reader never sees half of it."""
         part = self.path.with_suffix(".part")

@@ -50,7 +50,9 @@ class Demo:
         self._build = build
         root.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(self.places.journal)
-        install = self.journal.entries.setdefault(INSTALL, Entry(key="", done=True))
+        install = self.journal.entries.get(INSTALL)
+        if install is None or install.key != build:
+            install = self.journal.entries[INSTALL] = Entry(key=build, done=True)
         install.seconds += installed_s
         self._before = ""
         self._number = 0
@@ -110,6 +112,7 @@ class Demo:
             self._say(f"{head}: going on · {clock(self.elapsed_s())} so far")
         else:
             self._clear(stage)
+            self.journal.forget_from(stage.name)
             entry = Entry(key, command=shlex.join(stage.command))
             self._say(f"{head} · {clock(self.elapsed_s())} so far")
         self.journal.entries[stage.name] = entry

@@ -9,8 +9,14 @@ import threading
 from collections.abc import Iterator
 
 # Before torch and MuJoCo are imported: sums must not depend on a number of threads where results
-# of several processes are compared bit for bit, and there is no display to render to.
-for name, value in (("OMP_NUM_THREADS", "1"), ("MUJOCO_GL", "egl"), ("LP_NUM_THREADS", "1")):
+# of several processes are compared bit for bit, and there is no display to render to. A machine
+# with one GPU could not run two ranks on it, and what is compared to the bit is compared on CPUs.
+for name, value in (
+    ("OMP_NUM_THREADS", "1"),
+    ("MUJOCO_GL", "egl"),
+    ("LP_NUM_THREADS", "1"),
+    ("CUDA_VISIBLE_DEVICES", ""),
+):
     os.environ.setdefault(name, value)
 
 # Started in the background of a script, a process ignores Ctrl-C, under nohup the loss of its

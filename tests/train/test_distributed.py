@@ -99,6 +99,12 @@ def test_devices_that_are_not_there_are_refused(monkeypatch):
     with pytest.raises(ConfigError, match="device is 'cuda', but torch finds no GPU here"):
         start("cuda")
     assert start("auto").device.type == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with pytest.raises(ConfigError, match="process 2 .* no GPU of its own: torch sees 1") as found:
+        start("auto")
+    assert "--nproc 1, or device='cpu'" in str(found.value)
 
 
 def test_a_lost_rank_is_explained_and_other_errors_are_not():

@@ -66,7 +66,7 @@ def start(device: str = "auto", group_of_one: bool = False) -> World:
         group_of_one: make a process group for a single process too, as sharding needs.
 
     Raises:
-        ConfigError: ``cuda`` without a GPU, or an unknown device.
+        ConfigError: ``cuda`` without a GPU, more processes than GPUs, or an unknown device.
     """
     rank, size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
@@ -98,11 +98,28 @@ def _device(name: str, local_rank: int) -> torch.device:
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device {name!r} is none of 'auto', 'cpu', 'cuda'")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device is 'cuda', but torch finds no GPU here", next="fluxvla doctor")
+        raise ConfigError(
+            "device is 'cuda', but torch finds no GPU here",
+            cause=_why_no_gpu(),
+            next="device='auto' in the runner's table, which takes the CPU where there is no GPU",
+        )
     if name == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
+    if local_rank >= torch.cuda.device_count():
+        raise ConfigError(
+            f"process {local_rank + 1} on this machine finds no GPU of its own: torch sees "
+            f"{torch.cuda.device_count()}",
+            cause="--nproc (or torchrun's --nproc-per-node) is larger than the number of GPUs",
+            next=f"--nproc {torch.cuda.device_count()}, or device='cpu' in the runner's table",
+        )
     torch.cuda.set_device(local_rank)
     return torch.device("cuda", local_rank)
+
+
+def _why_no_gpu() -> str:
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} was built for CPUs alone"
+    return "no NVIDIA driver that torch can use, or CUDA_VISIBLE_DEVICES hides the GPUs"
 
 
 def stop(world: World, failed: bool = False) -> None:

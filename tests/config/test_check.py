@@ -112,6 +112,20 @@ def test_an_unknown_key(write: Write) -> None:
     assert "ToyTrainRunner takes no 'zzz' (defined at toy/runners.py:4)" in text
 
 
+def test_a_misspelt_key_beside_the_inherited_one(write: Write) -> None:
+    write("base.py", GOOD.replace("max_epochs=1", "max_epochs=1,\n  learning_rate=1e-3"))
+    path = write("c.toml", "_base_ = 'base.py'\n[runner]\nmax_epoch = 2\nlearning_rte = 1.0\n")
+    config = apply_overrides(load_config(path), ["runner.learning_rat+=1"])
+    assert [str(problem) for problem in examine(config).problems] == [
+        "c.toml:3: runner.max_epoch: ToyTrainRunner takes no 'max_epoch'; did you mean "
+        "'max_epochs'? (set at base.py:6)",
+        "c.toml:4: runner.learning_rte: ToyTrainRunner takes no 'learning_rte'; did you mean "
+        "'learning_rate'? (set at base.py:7)",
+        "--set runner.learning_rat+=1: runner.learning_rat: ToyTrainRunner takes no "
+        "'learning_rat'; did you mean 'learning_rate'? (set at base.py:7)",
+    ]
+
+
 def test_all_problems_at_once_in_the_order_of_the_file(write: Write) -> None:
     text = findings(
         """\
@@ -263,11 +277,57 @@ def test_a_key_left_over_from_a_replaced_class(write: Write) -> None:
         "to that table, or override the whole table 'inference.operator'"
     ) in text
     text = findings(GOOD, write, None, "inference.operator.type=ToySimOperator")
-    assert "the class that --set inference.operator.type=ToySimOperator replaced" in text
+    assert text.endswith(
+        "it was written for the class that --set inference.operator.type=ToySimOperator replaced: "
+        "set the whole table: --set 'inference.operator={type = ...}'"
+    )
     config = apply_overrides(
         load_config("c.py"), ['inference.operator={type = "ToySimOperator", seed = 3}']
     )
     assert examine(config).problems == ()
+
+
+def test_a_key_left_over_through_several_files(write: Write) -> None:
+    write("base.py", GOOD)
+    write("sim.py", "_base_ = 'base.py'\ninference = dict(operator=dict(type='ToySimOperator'))\n")
+    text = findings("_base_ = 'sim.py'\n", write)
+    assert "it was written for the class that sim.py:2 replaced: add _delete_=True" in text
+    path = write("c.toml", "_base_ = 'sim.py'\n[inference.operator]\ntopic = '/b'\n")
+    (problem,) = examine(load_config(path)).problems
+    assert problem.what == "ToySimOperator takes no 'topic' (defined at toy/robot.py:4)"
+
+
+def test_a_key_left_over_that_also_looks_misspelt(write: Write) -> None:
+    write("base.py", GOOD.replace("topic='/a'", "topic='/a', seeds=3"))
+    text = findings(
+        "_base_ = 'base.py'\ninference = dict(operator=dict(type='ToySimOperator'))\n", write
+    )
+    assert (
+        "ToySimOperator takes no 'seeds'; did you mean 'seed'? (defined at toy/robot.py:5); or it "
+        "was written for the class that c.py:2 replaced: add _delete_=True"
+    ) in text
+
+
+@pytest.mark.parametrize("text", ["topic = '/b'", "type = 'ToySimOperator'\ntopic = '/b'"])
+def test_a_key_written_for_the_class_that_is_there_is_not_left_over(
+    write: Write, text: str
+) -> None:
+    write("base.py", GOOD.replace("'ToyOperator', topic='/a'", "'ToySimOperator'"))
+    path = write("c.toml", f"_base_ = 'base.py'\n[inference.operator]\n{text}\n")
+    config = load_config(path)
+    for key in ("rate", "zzz"):
+        config = apply_overrides(config, [f"inference.operator.{key}+=1"])
+    assert [problem.what for problem in examine(config).problems] == [
+        f"ToySimOperator takes no {name!r} (defined at toy/robot.py:4)"
+        for name in ("topic", "rate", "zzz")
+    ]
+
+
+def test_a_side_by_side_base_replaces_no_class(write: Write) -> None:
+    write("robot.py", GOOD.replace("'ToyOperator', topic='/a'", "'ToySimOperator'"))
+    write("more.py", "inference = dict(operator=dict(topic='/b'))\n")
+    text = findings("_base_ = ['more.py', 'robot.py']\n", write)
+    assert text.endswith("ToySimOperator takes no 'topic' (defined at toy/robot.py:4)")
 
 
 def test_hooks_are_names_or_tables(write: Write) -> None:

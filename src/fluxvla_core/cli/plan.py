@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tempfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fluxvla_core.config import Checked, Config, apply_overrides, check_config, examine, load_config
@@ -54,7 +54,7 @@ def make_plan(
 def _with_settings(config: Config, section: str, settings: Mapping[str, str]) -> Config:
     tree = {**config.tree, section: {**config.tree[section], **settings}}
     origins = {**config.origins, **{f"{section}.{key}": f"--{key}" for key in settings}}
-    return Config(tree, origins, config.file)
+    return replace(config, tree=tree, origins=origins)
 
 
 def _configs_here() -> str:

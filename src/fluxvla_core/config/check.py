@@ -240,21 +240,33 @@ class _Walk:
             )
 
     def _unknown(self, key: str, name: str, signature: Signature, table: dict[str, Any]) -> str:
-        free = [p for p in signature.parameters if p.name not in table and p.name not in INJECTED]
-        near = difflib.get_close_matches(name, [p.name for p in free], 1)
+        places = {p.name: p.place for p in signature.parameters if p.name not in INJECTED}
+        near = difflib.get_close_matches(name, places, 1)
         text = f"{signature.name} takes no {name!r}"
-        if near:
-            place = next(p.place for p in free if p.name == near[0])
-            return f"{text}; did you mean {near[0]!r}? (defined at {place})"
-        text += f" (defined at {signature.place})"
+        if not near:
+            text += f" (defined at {signature.place})"
+        elif near[0] in table:
+            # Inherited, more often than not, so that a misspelt key stands beside the right one.
+            set_at = self.config.where(keys.child(key, near[0]))
+            text += f"; did you mean {near[0]!r}? (set at {set_at})"
+        else:
+            text += f"; did you mean {near[0]!r}? (defined at {places[near[0]]})"
+        history = self._left_over(key, name)
+        return f"{text}; {'or ' if near else ''}{history}" if history else text
+
+    def _left_over(self, key: str, name: str) -> str:
+        """What to do about a key that was written for another class; empty if it was not."""
         here, there = (self.config.where(keys.child(key, n)) for n in (name, "type"))
-        if _file(here) != _file(there):
-            text += (
-                f"; it was written for the class that {there} replaced: "
-                f"add _delete_=True to that table, or override the whole table {key!r}"
-            )
-        return text
+        if _typed(here):
+            return ""
+        text = f"it was written for the class that {there} replaced: "
+        if _typed(there):
+            return f"{text}set the whole table: --set '{key}={{type = ...}}'"
+        if keys.child(key, name) in self.config.left_over:
+            return f"{text}add _delete_=True to that table, or override the whole table {key!r}"
+        return ""
 
 
-def _file(place: str) -> str:
-    return place if place.startswith("--set") else place.rpartition(":")[0]
+def _typed(place: str) -> bool:
+    """Whether a place is an option of the command line and no line of a file."""
+    return place.startswith("--")

@@ -26,6 +26,11 @@ def parent(key: str) -> str:
     return key[: matches[-1].start()] if matches else ""
 
 
+def within(key: str, table: str) -> bool:
+    """Whether ``key`` is ``table`` or lies in it."""
+    return key == table or key.startswith(f"{table}.")
+
+
 def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Every (key, scalar) below ``value``; empty tables and lists count as leaves."""
     if isinstance(value, dict) and value:

@@ -21,19 +21,22 @@ def merge(base: Config, over: Config) -> Config:
     Raises:
         ConfigError: a table meets a scalar or a list, or ``_delete_`` is no boolean; all at once.
     """
-    tree, origins = copy.deepcopy(base.tree), dict(base.origins)
+    tree, origins, left_over = copy.deepcopy(base.tree), dict(base.origins), set(base.left_over)
     problems: list[Problem] = []
 
     def put(into: dict[str, Any], name: str, value: Any, key: str) -> None:
-        prefix = f"{key}."
-        for old in [k for k in origins if k == key or k.startswith(prefix)]:
+        for old in [k for k in origins if keys.within(k, key)]:
             del origins[old]
         for new, place in over.origins.items():
-            if new == key or new.startswith(prefix):
+            if keys.within(new, key):
                 origins[new] = place
+        left_over.difference_update([k for k in left_over if keys.within(k, key)])
+        left_over.update(k for k in over.left_over if keys.within(k, key))
         into[name] = strip(copy.deepcopy(value))
 
     def walk(into: dict[str, Any], new: dict[str, Any], at: str) -> None:
+        if _another_type(into, new):
+            left_over.update(keys.child(at, name) for name in into.keys() - new.keys())
         for name, value in new.items():
             if name == DELETE:
                 continue
@@ -64,7 +67,7 @@ def merge(base: Config, over: Config) -> Config:
     walk(tree, over.tree, "")
     if problems:
         raise ConfigError.from_problems(tuple(problems))
-    return Config(tree, origins, over.file)
+    return Config(tree, origins, over.file, frozenset(left_over))
 
 
 def join_bases(bases: list[Config]) -> Config:
@@ -91,6 +94,11 @@ def join_bases(bases: list[Config]) -> Config:
             tuple(problems), next="keep the key in one of the bases, or let one inherit the other"
         )
     return joined
+
+
+def _another_type(old: dict[str, Any], new: dict[str, Any]) -> bool:
+    """Whether ``new`` makes another class of the table ``old``."""
+    return "type" in old and new.get("type", old["type"]) != old["type"]
 
 
 def _clash(old: Any, new: Any) -> bool:

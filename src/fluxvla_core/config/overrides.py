@@ -6,6 +6,7 @@ import copy
 import difflib
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 from fluxvla_core.config import keys
@@ -37,12 +38,12 @@ def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
         except _BadOverride as bad:
             problems.append(Problem(place, "", str(bad)))
             continue
-        for old in [k for k in origins if k == key or k.startswith(f"{key}.")]:
+        for old in [k for k in origins if keys.within(k, key)]:
             del origins[old]
         origins[key] = place
     if problems:
         raise ConfigError.from_problems(tuple(problems))
-    return Config(tree, origins, config.file)
+    return replace(config, tree=tree, origins=origins)
 
 
 class _BadOverride(Exception):

@@ -22,11 +22,14 @@ class Config:
             that a run and the ``config.resolved.json`` that it wrote build the same objects.
         origins: dotted key -> ``file:line`` (or the ``--set`` that put it there).
         file: the file that was asked for, as messages show it.
+        left_over: keys whose table got another ``type`` from a file that inherits theirs, and
+            that this file did not repeat: they were written for another class.
     """
 
     tree: dict[str, Any]
     origins: Mapping[str, str] = field(default_factory=dict)
     file: str = ""
+    left_over: frozenset[str] = frozenset()
 
     def where(self, key: str) -> str:
         """The place of ``key``, or of the nearest table around it that has one."""

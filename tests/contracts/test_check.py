@@ -2,9 +2,13 @@ from __future__ import annotations
 
 import pytest
 
+from fluxvla_core.config.resolve import installed
+from fluxvla_core.contracts import API
 from fluxvla_core.contracts.check import check_class, is_train_runner, missing_operator_methods
 from fluxvla_core.contracts.optional import can_continue
-from fluxvla_core.errors import LoadFailed
+from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
+from fluxvla_core.plugins.groups import REGISTRIES
+from fluxvla_core.plugins.registry import BY_NAME
 
 
 class Train:
@@ -91,3 +95,25 @@ def test_whether_a_policy_can_go_on_from_a_chunk():
     assert can_continue(able())
     assert not can_continue(type("Unable", (able,), {"continues": False})())
     assert not can_continue(object())
+
+
+def test_every_contract_has_a_version():
+    assert tuple(API) == REGISTRIES
+
+
+@pytest.mark.parametrize("registry", REGISTRIES)
+def test_a_class_for_another_contract_is_refused_in_every_registry(install, registry):
+    """When it is registered, when it is loaded, and by a check that imports nothing."""
+    install(
+        "acme-late",
+        entry_points=f"[fluxvla.{registry}]\nLate = acme_late:Late\n",
+        files={"acme_late.py": "class Late:\n    api = '9.0'\n"},
+    )
+    there = BY_NAME[registry]
+    message = rf"Late is written for {registry} 9\.0, this core speaks 1\.0"
+    with pytest.raises(IncompatiblePlugin, match=message):
+        there.register_module()(type("Late", (), {"api": "9.0"}))
+    with pytest.raises(IncompatiblePlugin, match=message):
+        there.get("Late")
+    with pytest.raises(IncompatiblePlugin, match=message):
+        installed(*there.installed()["Late"])

@@ -20,6 +20,23 @@ if TYPE_CHECKING:
 API: Mapping[str, str] = {
     "runners": "1.0",
     "operators": "1.0",
+    "vlas": "1.0",
+    "vision_backbones": "1.0",
+    "llm_backbones": "1.0",
+    "vlm_backbones": "1.0",
+    "projectors": "1.0",
+    "heads": "1.0",
+    "datasets": "1.0",
+    "transforms": "1.0",
+    "collators": "1.0",
+    "tokenizers": "1.0",
+    "processors": "1.0",
+    "metrics": "1.0",
+    "optimizers": "1.0",
+    "action_filters": "1.0",
+    "hooks": "1.0",
+    "environments": "1.0",
+    "policies": "1.0",
     "commands": "1.0",
 }
 """Contract version that this core speaks, by registry. A plugin declares ``api = "1.0"``: same

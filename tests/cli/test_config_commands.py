@@ -34,6 +34,16 @@ def test_show_with_origins(fluxvla: Fluxvla, write: Write) -> None:
     assert rows['eval.type = "ToyEvalRunner"'] == "c.py:4"
 
 
+def test_show_blames_an_addition_only_for_what_it_added(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.toml", "_base_ = 'c.py'\n[eval]\nnames = ['a']\n")
+    words = ("--set", "eval.names+=['b', 'c']", "--set", "eval.operator+={port = 2}")
+    ended = fluxvla("config", "show", "--origin", "d.toml", *words)
+    rows = dict(map(str.strip, line.split("  # ")) for line in ended.out.splitlines())
+    assert rows['eval.names = ["a", "b", "c"]'] == "d.toml:3, --set eval.names+=['b', 'c']"
+    assert rows['eval.operator.type = "ToyOperator"'] == "c.py:4"
+    assert rows["eval.operator.port = 2"] == "--set eval.operator+={port = 2}"
+
+
 def test_check_says_what_is_used(fluxvla: Fluxvla, write: Write) -> None:
     ended = fluxvla("config", "check", "c.py", "--plugin", "toy.py")
     assert ended.code == 0

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fluxvla_core.config import Config, apply_overrides
+from fluxvla_core.config import Config, apply_overrides, keys
 from fluxvla_core.errors import ConfigError
 
 TREE: dict[str, Any] = {
@@ -87,6 +87,27 @@ def test_the_override_becomes_the_place_of_its_key() -> None:
     assert config.where("runner.op.x") == "--set runner.op={type='B', x=2}"
     assert config.where("runner.keys.1") == "--set runner.keys+=b"
     assert config.where("runner.max_epochs") == "c.py:1"
+
+
+def test_what_was_there_before_something_was_added_keeps_its_place() -> None:
+    origins = {"runner.op": "c.py:2", "runner.keys": "c.py:4", "transforms.0": "c.py:5"}
+    config = Config(TREE, {**CONFIG.origins, **origins}, "c.py")
+    more = ["runner.op+={y = 2, type = 'B'}", "runner.keys+=['b', 'c']", "transforms.0+={z = 1}"]
+    config = apply_overrides(config, more)
+    assert {key: config.where(key) for key, _ in keys.leaves(config.tree)} == {
+        "runner.max_epochs": "c.py:1",
+        "runner.keys": "c.py:4",
+        "runner.op.type": f"--set {more[0]}",
+        "runner.op.x": "c.py:3",
+        "runner.op.y": f"--set {more[0]}",
+        r"runner.stats\.q": "c.py",
+        "transforms.0.type": "c.py:5",
+        "transforms.0.height": "c.py:5",
+        "transforms.0.z": f"--set {more[2]}",
+        "transforms.1.type": "c.py",
+    }
+    places = [config.where(f"runner.keys.{i}") for i in range(3)]
+    assert places == ["c.py:4", *[f"--set {more[1]}"] * 2]
 
 
 def test_a_key_must_exist() -> None:

@@ -57,11 +57,22 @@ class Check:
 
 def listing(config: Config, origin: bool) -> list[str]:
     """``key = value`` lines; with ``origin`` each ends in its ``# file:line``."""
-    rows = [(key, f"{key} = {literal(value)}") for key, value in keys.leaves(config.tree)]
+    leaves = list(keys.leaves(config.tree))
+    texts = [f"{key} = {literal(value)}" for key, value in leaves]
     if not origin:
-        return [text for _, text in rows]
-    width = min(max((len(text) for _, text in rows), default=0), 60)
-    return [f"{text:{width}}  # {config.where(key)}" for key, text in rows]
+        return texts
+    width = min(max(map(len, texts), default=0), 60)
+    places = [_places(config, key, value) for key, value in leaves]
+    return [f"{text:{width}}  # {place}" for text, place in zip(texts, places, strict=True)]
+
+
+def _places(config: Config, key: str, value: Any) -> str:
+    """Where ``key`` was written, and what was appended to it on the command line."""
+    items = range(len(value)) if isinstance(value, list) else ()
+    appended = [
+        place for i in items if (place := config.where(keys.child(key, i))).startswith("--")
+    ]
+    return ", ".join(dict.fromkeys([config.where(key), *appended]))
 
 
 def literal(value: Any) -> str:

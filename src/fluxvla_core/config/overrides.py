@@ -34,13 +34,14 @@ def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
         place = f"--set {text}"
         try:
             key, add, value = _parse(text)
-            key = _put(tree, key, value, add)
+            written = _put(tree, key, value, add)
         except _BadOverride as bad:
             problems.append(Problem(place, "", str(bad)))
             continue
-        for old in [k for k in origins if keys.within(k, key)]:
-            del origins[old]
-        origins[key] = place
+        for key in written:
+            for old in [k for k in origins if keys.within(k, key)]:
+                del origins[old]
+            origins[key] = place
     if problems:
         raise ConfigError.from_problems(tuple(problems))
     return replace(config, tree=tree, origins=origins)
@@ -91,8 +92,8 @@ def _number(text: str) -> float | int | None:
     return int(number) if number.is_integer() else number
 
 
-def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> str:
-    """Set ``key`` in ``tree``; returns the key that now holds the value."""
+def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> list[str]:
+    """Set ``key`` in ``tree``; returns the keys that now hold what was given."""
     *above, last = keys.split(key)
     at: Any = tree
     done = ""
@@ -101,27 +102,26 @@ def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> str:
         done = keys.child(done, part)
     if isinstance(at, list):
         index = _index(at, last, key)
-        at[index] = _added(at[index], value) if add else value
-        return key
+        at[index], written = _added(at[index], value, key) if add else (value, [key])
+        return written
     if not isinstance(at, dict):
         raise _BadOverride(f"{done!r} is a single value, it has no {last!r}")
     if last not in at and not add:
         raise _BadOverride(f"no {key!r} in the config{_hint(tree, key, last)}")
     if last not in at or not add:
         at[last] = value
-        return key
-    old = at[last]
-    at[last] = _added(old, value)
-    if isinstance(old, list) and not isinstance(value, list):
-        return keys.child(key, len(old))
-    return key
+        return [key]
+    at[last], written = _added(at[last], value, key)
+    return written
 
 
-def _added(old: Any, value: Any) -> Any:
+def _added(old: Any, value: Any, key: str) -> tuple[Any, list[str]]:
+    """``value`` added to what ``key`` holds, and the keys of what is new."""
     if isinstance(old, list):
-        return [*old, *value] if isinstance(value, list) else [*old, value]
+        more = value if isinstance(value, list) else [value]
+        return [*old, *more], [keys.child(key, len(old) + i) for i in range(len(more))]
     if isinstance(old, dict) and isinstance(value, dict):
-        return {**old, **value}
+        return {**old, **value}, [keys.child(key, name) for name in value]
     raise _BadOverride(f"it is there already, as {old!r}; += adds a key or appends, = replaces")
 
 

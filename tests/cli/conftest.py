@@ -39,7 +39,7 @@ class ToyOperator:
 
 @RUNNERS.register_module()
 class ToyTrainRunner:
-    def __init__(self, max_epochs, mode="", context=None):
+    def __init__(self, max_epochs, mode="", resume_from=None, context=None):
         self.context, self.mode, self.max_epochs = context, mode, max_epochs
 
     def run_setup(self, n_train_examples):

@@ -123,6 +123,28 @@ def test_torchrun_starts_ranks_and_restarts_them_too(tiny: None, whole: Path) ->
     assert differing(whole, Path("cut")) == []
 
 
+def going_on(place: str, steps: int, *words: str, module: tuple[str, ...] = ()) -> str:
+    """What a training says whose config, and no option, tells it to resume."""
+    words += ("--set", f"runner.resume_from+={place}", "--set", f"runner.max_steps={steps}")
+    code, out, err = start("work", *words, "--set", "runner.collator.lives=0", module=module)
+    assert code == 0, err
+    return out
+
+
+def test_a_config_that_resumes_needs_no_option(tiny: None) -> None:
+    assert "training starts afresh" in going_on("auto", 3)
+    assert "resuming from work/checkpoints/step-000000003 (step 3)" in going_on(
+        "auto", 4, "--nproc", "2"
+    )
+    torchrun = ("torch.distributed.run", "--standalone", "-m", "fluxvla_core")
+    assert "resuming from work/checkpoints/step-000000004 (step 4)" in going_on(
+        "auto", 5, module=torchrun
+    )
+    out = going_on("work/checkpoints/step-000000003", 6)
+    assert "a later checkpoint is set aside as step-000000005.set-aside" in out
+    assert "resuming from work/checkpoints/step-000000003 (step 3)" in out
+
+
 # -- in this process -------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ import pytest
 from fluxvla_core.cli import plan as plan_module
 from fluxvla_core.cli.plan import default_work_dir
 
-from .conftest import Fluxvla, Write
+from .conftest import CONFIG, Fluxvla, Write
 
 
 def said(folder: str = "work_dirs/c", rank: int = 0) -> dict[str, object]:
@@ -240,6 +240,26 @@ def test_a_fresh_training_does_not_land_on_another(run: Fluxvla, write: Write) -
     ended = run("--config", "c.py", "--section", "runner", "--resume", "auto")
     assert ended.code == 0, ended.err
     assert said()["resume"] == "auto"
+
+
+def test_nor_does_one_that_goes_on_from_elsewhere(run: Fluxvla, write: Write) -> None:
+    """A restart would go on from what lies there, whatever was asked for."""
+    for work_dir in ("work_dirs/c", "other"):
+        write(f"{work_dir}/checkpoints/step-000000100/manifest.json", "{}")
+    words = ("--config", "c.py", "--section", "runner")
+    ended = run(*words, "--resume", "other", "--max-restarts", "1")
+    assert ended.code == 2
+    assert "work_dirs/c: the work dir already holds checkpoints" in ended.err
+    for place, code in (
+        ("auto", 0),
+        ("work_dirs/c/checkpoints/step-000000100", 0),
+        ("work_dirs/c", 0),
+        ("other", 2),
+        ("", 2),
+    ):
+        write("resumes.py", f"{CONFIG}runner['resume_from'] = {place!r}\n")
+        ended = run("--config", "resumes.py", "--section", "runner", "--work-dir", "work_dirs/c")
+        assert (ended.code, "already holds" in ended.err) == (code, code == 2)
 
 
 def test_options_that_do_not_fit_the_section(run: Fluxvla) -> None:

@@ -125,14 +125,23 @@ def prepare_work_dir(path: Path) -> None:
         ) from error
 
 
-def refuse_overwriting(work_dir: Path) -> None:
-    """A fresh training must not land among the checkpoints of another.
+def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
+    """A training must not land among the checkpoints of another.
+
+    Here and not only where it begins: a restart would go on from whatever lies there.
+
+    Args:
+        resume: what it goes on from: ``auto``, a path, or None for nothing.
 
     Raises:
         UsageError: there are checkpoints, with both ways on.
     """
     from fluxvla_core.checkpoints.checkpoint import folders, step_of
 
+    if resume == "auto":
+        return
+    if resume is not None and Path(resume).resolve().is_relative_to(work_dir.resolve()):
+        return
     found = folders(work_dir)
     if found:
         raise UsageError(

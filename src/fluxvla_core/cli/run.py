@@ -85,8 +85,10 @@ class Run:
             return 0
         if ranks.rank() == 0 and not ranks.launched():
             prepare_work_dir(plan.work_dir)
-            if plan.trains and ranks.resume(args.resume, plan.work_dir) is None:
-                refuse_overwriting(plan.work_dir)
+            if plan.trains:
+                asked = ranks.resume(args.resume, plan.work_dir)
+                configured = plan.config.tree[plan.section].get("resume_from")
+                refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
             from fluxvla_core.cli.launch import launch
 

@@ -12,6 +12,7 @@ import pytest
 
 from fluxvla_core.cli import plan as plan_module
 from fluxvla_core.cli.plan import default_work_dir
+from tests.conftest import Install
 
 from .conftest import CONFIG, Fluxvla, Write
 
@@ -186,6 +187,35 @@ def test_nothing_to_run(run: Fluxvla, write: Write) -> None:
     write("e.py", "rehearse = dict(type='ToyEvalRuner')\n")
     ended = run("--config", "e.py")
     assert "rehearse.type: no plugin named 'ToyEvalRuner' in any registry" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (
+            "DeepSpeedTrainRunner",
+            "no plugin named 'DeepSpeedTrainRunner'; fluxvla-deepspeed provides it and is not "
+            "installed: pip install fluxvla-deepspeed",
+        ),
+        ("ToyTrainRuner", "no plugin named 'ToyTrainRuner' in any registry; did you mean 'ToyTrai"),
+    ],
+)
+def test_a_section_whose_runner_is_not_there(
+    run: Fluxvla,
+    write: Write,
+    install: Install,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    text: str,
+) -> None:
+    monkeypatch.setenv("FLUXVLA_PLUGINS", "toy")
+    install("fluxvla-toy")
+    config = Path("c.py").read_text().replace("'ToyEvalRunner'", "'FarEvalRunner'")
+    write("d.py", config + f"finetune = dict(type='{kind}')\n")
+    ended = run("--config", "d.py", "--section", "finetune")
+    assert ended.code == 2
+    assert ended.err.startswith(f"1 problem in the config:\n  d.py:5: finetune.type: {text}")
+    assert ended.err.endswith("next: fluxvla plugins list\n")
 
 
 # -- bad input -------------------------------------------------------------------------------

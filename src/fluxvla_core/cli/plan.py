@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fluxvla_core.config import Checked, Config, apply_overrides, check_config, examine, load_config
-from fluxvla_core.config.check import Use
+from fluxvla_core.config.check import Use, type_key
 from fluxvla_core.config.resolved import CONFIG_FILE
-from fluxvla_core.errors import ConfigError, UsageError
+from fluxvla_core.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def make_plan(
     if file is None:
         raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
     config = apply_overrides(load_config(file), overrides)
-    name = choose_section(config, examine(config), section)
+    name = choose_section(config, examine(config, section), section)
     config = _with_settings(config, name, settings or {})
     checked = check_config(config, name)
     place = Path(work_dir) if work_dir is not None else default_work_dir(Path(file))
@@ -69,13 +69,15 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
 
     Raises:
         UsageError: ``wanted`` is not there or cannot run; or there are several, or none.
-        ConfigError: none, because the config has problems.
+        ConfigError: none, or not ``wanted``, because the config has problems.
     """
     names = checked.sections
     listed = ", ".join(f"{name} ({config.tree[name].get('type')})" for name in names)
     if wanted is not None:
         if wanted in names:
             return wanted
+        if type_key(wanted) in {problem.key for problem in checked.problems}:
+            raise checked.error()  # without its plugin nothing tells that it is a runner's table
         if wanted in config.tree:
             what = f"section {wanted!r} cannot be run: it is no table whose type is a runner"
         else:
@@ -91,7 +93,7 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
             next=f"name one: --section {names[0]}",
         )
     if checked.problems:
-        raise ConfigError.from_problems(checked.problems)
+        raise checked.error()
     raise UsageError(
         "nothing to run: no table at the top has a type that is a runner",
         where=config.file,

@@ -61,13 +61,16 @@ class Checked:
     problems: tuple[Problem, ...]
     missing: bool = False
 
+    def error(self) -> ConfigError:
+        """All problems as one error."""
+        return ConfigError.from_problems(self.problems, next=LIST if self.missing else None)
+
 
 def check_config(config: Config, section: str | None = None) -> Checked:
     """:func:`examine`, with all problems raised as one ConfigError."""
     checked = examine(config, section)
     if checked.problems:
-        next_step = LIST if checked.missing else None
-        raise ConfigError.from_problems(checked.problems, next=next_step)
+        raise checked.error()
     return checked
 
 
@@ -88,12 +91,19 @@ def examine(config: Config, section: str | None = None) -> Checked:
         if name in trains and section in (None, name):
             problems += _loader_problems(config, name)
     missing = walk.missing
-    if section in sections:
+    # Where a section's runner is missing, only its being asked for tells that it is a section.
+    asked = section is not None and type_key(section) in {p.key for p in missing}
+    if section is not None and (section in sections or asked):
         needed = _needed(config, section, section not in walk.runs, sections)
         missing = [p for p in missing if p.key.partition(".")[0] in needed]
     order = {p: i for i, p in enumerate(keys.every(config.tree))}
     problems = sorted([*problems, *missing], key=lambda p: order.get(p.key, -1))
     return Checked(sections, trains, tuple(walk.uses), tuple(problems), bool(missing))
+
+
+def type_key(section: str) -> str:
+    """The key that names the runner of ``section``."""
+    return keys.child(keys.child("", section), "type")
 
 
 def _needed(config: Config, section: str, trains: bool, sections: tuple[str, ...]) -> set[str]:

@@ -165,6 +165,41 @@ class TestCommanding:
         with pytest.raises(NotReady, match="arm is not connected"):
             arm.send_action([0.0, 0.0, 0.0])
 
+    def test_a_later_stop_sends_the_arm_nothing(self, arm, robot):
+        """Somebody may have moved it since: it would be thrown back in one step."""
+        commanded(arm, robot, [0.15, 0.1, 0.3])
+        arm.stop()
+        wait_for(lambda: len(robot.on("/arm/command")) == 2)
+        robot.tell(change={"/arm/state": {"positions": [0.5, 9.0, 0.25, 0.2]}})
+        wait_for(lambda: arm.get_state()[0] == 0.25)
+        arm.stop()
+        arm.close()
+        settled(robot)
+
+        assert [h["position"] for h in robot.on("/arm/command")] == [[0.15, 0.1, 0.3]] * 2
+
+    def test_an_arm_that_was_commanded_again_is_held_again(self, arm, robot):
+        for count in (1, 3):
+            arm.send_action([0.15, 0.1, 0.3])
+            wait_for(lambda n=count: len(robot.on("/arm/command")) == n)
+            arm.stop()
+            wait_for(lambda n=count: len(robot.on("/arm/command")) == n + 1)
+
+    def test_no_stop_commands_an_arm_that_another_node_commands(self, arm, robot, drivers):
+        commanded(arm, robot, [0.15, 0.1, 0.3])
+        teleop = drivers([{**STATE, "topic": "/arm/command"}], name="teleop")
+        wait_for(lambda: arm._fault)
+        arm.stop()
+        teleop.close()
+        wait_for(lambda: not arm._fault)
+        arm.stop()
+        arm.close()
+        settled(robot)
+
+        ours = [h for h in robot.on("/arm/command") if tuple(h["name"]) == NAMES]
+        assert [h["position"] for h in ours] == [[0.15, 0.1, 0.3]]
+        assert arm.last_action is None
+
     def test_what_fails_while_stopping_is_logged_and_the_rest_is_done(self, arm, caplog):
         done = []
         arm.send_action([0.1, 0.2, 0.5])

@@ -23,6 +23,7 @@ class SmallOperator:
     api = "1.0"
     def __init__(self, speed: float = 1.0):
         self._state = None
+        self.heard = 0
     @property
     def embodiment(self):
         return SPEC
@@ -40,6 +41,7 @@ class SmallOperator:
         if np.shape(action) != (2,) or not np.isfinite(action).all() or (abs(action) > 1).any():
             raise Rejected("out of spec")
         self._state = np.array(action)
+        self.heard += 1
     def stop(self):
         pass
     def close(self):
@@ -49,6 +51,8 @@ OPERATORS.register_module()(SmallOperator)
 
 class TestSmall(OperatorConformance):
     entry_point = "SmallOperator"
+    def commands_heard(self, operator):
+        return operator.heard
 """
 
 BROKEN = {
@@ -56,8 +60,8 @@ BROKEN = {
     "test_import_is_light": ("import time\n", "import time, torch\n"),
     "test_constructor_names_every_parameter": ("speed: float = 1.0", "**options"),
     "test_constructor_does_no_io": (
-        "        self._state = None\n    @property",
-        "        self._state = None\n"
+        "        self.heard = 0\n    @property",
+        "        self.heard = 0\n"
         "        import socket\n"
         "        socket.socket().bind(('127.0.0.1', 0))\n"
         "    @property",
@@ -82,6 +86,10 @@ BROKEN = {
     "test_stop_works_in_any_state": (
         "def stop(self):\n        pass",
         "def stop(self):\n        self._state[0]",
+    ),
+    "test_a_later_stop_sends_the_arm_nothing": (
+        "def stop(self):\n        pass",
+        "def stop(self):\n        if self._state is not None: self.send_action(self._state)",
     ),
     "test_close_gives_everything_back": (
         "def close(self):\n        self._state = None",
@@ -116,7 +124,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 def test_a_right_operator_passes_every_check(outcomes):
     right = {k: v for k, v in outcomes.items() if k.startswith("specimen_right.py::")}
-    assert len(right) >= 19
+    assert len(right) >= 20
     assert set(right.values()) == {"PASSED"}
 
 

@@ -89,6 +89,18 @@ def test_stop_holds_where_the_robot_is(live):
     assert live.get_state()[0] == pytest.approx(stopped, abs=0.06)
 
 
+def test_a_later_stop_changes_nothing(live):
+    target = HOME.copy()
+    target[0] = 0.1
+    live.send_action(target)
+    live.stop()
+    held = live._target.copy()
+    threading.Event().wait(0.2)
+    live.get_state()
+    live.stop()
+    np.testing.assert_array_equal(live._target, held)
+
+
 def test_an_episode_begins_with_its_instructions_task_and_its_numbers_cube():
     aloha = AlohaSimOperator(seed=20, **SMALL)
     aloha.connect()

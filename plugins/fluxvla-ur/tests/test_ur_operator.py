@@ -299,3 +299,7 @@ class TestConformance(OperatorConformance):
     @pytest.fixture(autouse=True)
     def driver(self, lasting_robot):
         """Who stands in for the arm."""
+        self.arm = lasting_robot
+
+    def commands_heard(self, operator):
+        return len(self.arm.on(COMMANDS))

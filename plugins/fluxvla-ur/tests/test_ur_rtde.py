@@ -360,5 +360,9 @@ class TestConformance(OperatorConformance):
     @classmethod
     def robot(cls):
         with FakeUR() as fake:
-            cls.arguments = {"robot_ip": fake.ip, **PATIENT}
+            cls.arguments, cls.fake = {"robot_ip": fake.ip, **PATIENT}, fake
             yield fake
+
+    def commands_heard(self, operator):
+        heard = self.fake.ask()
+        return len(heard["servo"]) + len(heard["stops"])

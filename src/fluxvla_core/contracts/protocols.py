@@ -78,7 +78,12 @@ class Operator(Protocol):
         """
 
     def stop(self) -> None:
-        """Come to a safe stop and hold: in any state, from any thread, any number of times."""
+        """Come to a safe stop and hold: in any state, from any thread, any number of times.
+
+        A later stop, ``close``'s among them, sends the arm nothing unless ``send_action`` succeeded
+        since: it may have been moved, and would be thrown back. An arm that somebody else commands
+        is sent nothing at all. A speed, a mobile base's, is set to zero by every stop.
+        """
 
     def close(self) -> None:
         """Give everything back; any number of times."""

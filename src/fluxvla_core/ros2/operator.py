@@ -86,7 +86,9 @@ class RosOperator(ABC):
         self._connection: Connection | None = None
         self._specs: tuple[StreamSpec, ...] = ()
         self._publishers: dict[str, Any] = {}
+        # What holds the arm, and whether it was sent by ``send_action`` since the last stop.
         self._last: Array | None = None
+        self._moving = False
         self._fault: FluxError | None = None
 
     # What a subclass says.
@@ -139,7 +141,7 @@ class RosOperator(ABC):
         with self._opening:
             if self._connection is not None:
                 return
-            self._fault, self._last = None, None
+            self._fault, self._last, self._moving = None, None, False
             connection = Connection(f"fluxvla_{self.embodiment.name}", self.domain_id)
             try:
                 self._subscribe_all(connection)
@@ -234,21 +236,23 @@ class RosOperator(ABC):
                 raise self._fault
             self.admit()
             self.publish_action(checked)
-            self._last = checked
+            self._last, self._moving = checked, True
 
     def stop(self) -> None:
         """Hold: repeat the last command, or where a joint is if it was kept from following.
 
-        Any state, any thread, any number of times. An arm that was never commanded is left alone.
-        What fails is logged, not raised: the caller is ending a motion for another reason.
+        Any state, any thread, any number of times. An arm that was not commanded since the last
+        stop, or that another node commands, is left alone: it may be elsewhere by now. What fails
+        is logged, not raised: the caller is ending a motion for another reason.
         """
         with self._lock:
             if self._connection is None:
                 return
             steps = [self.on_stop]
-            if self._last is not None:
+            if self._moving and self._last is not None:
                 self._last = target = self._hold_target(self._last)
                 steps.insert(0, lambda: self.publish_action(target))
+            self._moving = False
             for step in steps:
                 try:
                     step()
@@ -287,7 +291,7 @@ class RosOperator(ABC):
 
     @property
     def last_action(self) -> Array | None:
-        """``(dim,)`` the last command that was sent since connecting, or None."""
+        """``(dim,)`` the command that holds the arm; None before any, or if another node's does."""
         return None if self._last is None else self._last.copy()
 
     def kept(self, name: str) -> tuple[Received, ...]:
@@ -334,10 +338,16 @@ class RosOperator(ABC):
 
     def _watch_commanders(self, connection: Connection, topics: Sequence[str]) -> None:
         others = discovery.commanders(connection.node, topics, connection.name)
-        error = discovery.contested(others) if others else None
-        if error is not None and self._fault is None:
+        if not others:
+            self._fault = None
+            return
+        error = discovery.contested(others)
+        if self._fault is None:
             log.error("%s", error.what)
-        self._fault = Faulted(error.what, cause=error.cause, next=error.next) if error else None
+        with self._lock:
+            # The arm has the other's command now: no stop may send it back to ours.
+            self._fault = Faulted(error.what, cause=error.cause, next=error.next)
+            self._last = None
 
     def _connected(self) -> Connection:
         if self._connection is None:

@@ -31,6 +31,8 @@ from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
+# How long nothing may come before nothing more is taken to come.
+_QUIET_S = 0.3
 _IMPORT_PROBE = """
 import importlib, json, sys, threading
 importlib.import_module(sys.argv[1])
@@ -81,6 +83,21 @@ class OperatorConformance:
         where = dict(zip(operator.embodiment.state_names, operator.get_frame().state, strict=True))
         target = [np.clip(where.get(j.name, j.lower), j.lower, j.upper) for j in joints]
         return np.array(target, dtype=np.float64)
+
+    def commands_heard(self, operator: Any) -> int | None:
+        """How many commands the arm, or its stand-in, has received; override it where one counts.
+
+        None, where nobody does: then a stop that throws an arm back goes unnoticed here.
+        """
+        return None
+
+    def settled(self, operator: Any) -> int | None:
+        """``commands_heard`` once no more come."""
+        while (heard := self.commands_heard(operator)) is not None:
+            time.sleep(_QUIET_S)
+            if self.commands_heard(operator) == heard:
+                break
+        return heard
 
     def test_is_complete(self, operator: Any) -> None:
         assert missing_operator_methods(operator) == []
@@ -184,6 +201,19 @@ class OperatorConformance:
         operator.stop()
         operator.close()
         operator.stop()
+
+    def test_a_later_stop_sends_the_arm_nothing(self, connected: Any) -> None:
+        before = self.settled(connected)
+        if before is None:
+            pytest.skip("nobody counts commands: override commands_heard")
+        connected.send_action(self.hold(connected))
+        connected.stop()
+        stopped = self.settled(connected)
+        assert stopped is not None
+        assert stopped > before, "commands_heard does not count commands"
+        connected.stop()
+        connected.close()
+        assert self.settled(connected) == stopped, "it would throw back an arm that was moved"
 
     def test_stop_works_from_another_thread(self, connected: Any) -> None:
         failures: list[BaseException] = []

@@ -62,6 +62,7 @@ class SimOperator:
         self._lock = threading.RLock()
         self._scene: Any = None
         self._target: npt.NDArray[np.float64] = np.zeros(self.embodiment.dim)
+        self._moving = False  # commanded since the last stop
         self._facts = self.world.begin()
 
     @property
@@ -89,7 +90,7 @@ class SimOperator:
         """
         with self._lock:
             self._connected().reset(seed)
-            self._target = self._measured()
+            self._target, self._moving = self._measured(), False
             self._facts = self.world.begin()
 
     def begin_episode(self, instruction: str, episode: int) -> None:
@@ -150,15 +151,18 @@ class SimOperator:
         with self._lock:
             self._connected()
             self._catch_up()
-            self._target = target
+            self._target, self._moving = target, True
             if not self.realtime:
                 self._step()
 
     def stop(self) -> None:
-        """Hold where the robot is; any state, any thread, any number of times."""
+        """Hold where the robot is; any state, any thread, any number of times.
+
+        A later one changes nothing: an arm that droops would sink further with each.
+        """
         with self._lock:
-            if self._scene is not None:
-                self._target = self._measured()
+            if self._scene is not None and self._moving:
+                self._target, self._moving = self._measured(), False
 
     def close(self) -> None:
         """Free the scene; any number of times."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import sys
@@ -159,5 +160,8 @@ class Demo:
             self._say(f"  {line}")
         entries = self.journal.entries.items()
         times = ", ".join(f"{name} {clock(entry.seconds)}" for name, entry in entries)
+        activate = Path(sys.prefix) / "bin" / "activate"
+        if activate.is_file():
+            self._say(f"To go on by hand:  source {os.path.relpath(activate)}  and then: fluxvla --help")
         self._say(f"Time: {clock(self.elapsed_s())} in all ({times})")
         sys.stdout.flush()

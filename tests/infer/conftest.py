@@ -14,6 +14,7 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.infer.base_runner import BaseInferenceRunner
+from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
@@ -89,6 +90,31 @@ class Arm:
             if isinstance(fault, BaseException):
                 raise fault
             fault()
+
+
+class Rover(Arm):
+    """The arm on a base, whose camera measures distances, in millimetres and with holes.
+
+    What it sees and how fast it is follows from how often it was commanded.
+    """
+
+    def get_frame(self) -> RobotFrame:
+        frame = super().get_frame()
+        stamps = {**frame.stamps, "front_depth": frame.stamps["front"] - 0.001}
+        depths = {"front": self.depth(len(self.sent))}
+        base = np.array(self.speeds(len(self.sent)))
+        return RobotFrame(frame.state, frame.images, stamps, depths, base)
+
+    @staticmethod
+    def depth(count: int) -> np.ndarray:
+        millimetres = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80 + count
+        metres = millimetres.astype(np.float32) * np.float32(1e-3)
+        metres[count % 24] = np.nan
+        return metres
+
+    @staticmethod
+    def speeds(count: int) -> list[float]:
+        return [0.01 * count, -0.002 * count]
 
 
 class Waver:
@@ -218,6 +244,11 @@ def make_bench() -> type[Bench]:
 @pytest.fixture
 def make_arm() -> type[Arm]:
     return Arm
+
+
+@pytest.fixture
+def make_rover() -> type[Rover]:
+    return Rover
 
 
 @pytest.fixture

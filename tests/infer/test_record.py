@@ -92,6 +92,40 @@ def test_what_is_read_back_is_what_happened(bench):
     assert summary == found.summary()
 
 
+def test_depth_and_base_are_recorded_and_read_back(bench, make_rover):
+    from rosbags.highlevel import AnyReader
+
+    bench.arm = make_rover()
+    found = recorded(bench, max_publish_step=30)
+
+    seen = found.of("observation")
+    for event in seen:
+        index = found.pictures["front"].newest(event["stamps"]["front"])
+        count = int(found.pictures["front"].read(index)[0, 0, 0])
+        assert event["base"] == make_rover.speeds(count)
+        index = found.depths["front"].newest(event["stamps"]["front_depth"])
+        np.testing.assert_array_equal(found.depths["front"].read(index), make_rover.depth(count))
+    assert event["base"][0] > 0
+    topics = connections(found.path)
+    assert topics["/fluxvla/base"] == ("nav_msgs/msg/Odometry", len(seen))
+    assert topics["/fluxvla/camera/front/depth"] == ("sensor_msgs/msg/Image", len(seen) - 1)
+    with AnyReader([found.path]) as reader:
+        last = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
+    image, odometry = last["/fluxvla/camera/front/depth"], last["/fluxvla/base"]
+    assert (image.encoding, image.step, image.header.frame_id) == ("16UC1", 64, "front")
+    assert odometry.twist.twist.linear.x == seen[-1]["base"][0]
+    assert odometry.pose.covariance[0] < 0, "where it is was not read"
+
+
+def test_without_a_bag_the_base_is_in_the_lines(bench, make_rover):
+    bench.arm = make_rover()
+    bench.run(max_publish_step=30)
+
+    seen = open_recording(bench.work_dir / "inference").of("observation")
+    assert seen[0]["base"] == [0.0, 0.0]
+    assert seen[-1]["base"][0] > 0
+
+
 def test_lines_and_bag_hold_the_same_events(bench, tmp_path, make_arm):
     found = recorded(bench, max_publish_step=20)
     bench.arm = make_arm()

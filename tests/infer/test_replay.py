@@ -86,6 +86,27 @@ def test_the_recorded_robot_gives_a_policy_what_it_saw(bench, make_arm):
     assert any("ends here" in line for line in bench.notes.lines)
 
 
+def test_depth_and_base_are_shown_and_recorded_again(bench, make_rover):
+    bench.arm = make_rover()
+    bench.run(record=str(bench.work_dir / "rec"), max_publish_step=30)
+    path = str(bench.work_dir / "rec" / "001-1")
+    operator = ReplayOperator(path)
+    bench.run(record=str(bench.work_dir / "rec"), operator=operator)
+
+    first, second = open_recording(path), open_recording(bench.work_dir / "rec" / "002-1")
+    shown, again = first.of("observation"), second.of("observation")
+    assert [event["base"] for event in again] == [event["base"] for event in shown]
+    assert len(second.depths["front"]) == len(first.depths["front"]) == 2
+    for index in range(len(second.depths["front"])):
+        before, after = (found.depths["front"].read(index) for found in (first, second))
+        np.testing.assert_array_equal(before, after)
+    operator.connect()
+    frame = operator.get_frame()
+    np.testing.assert_array_equal(frame.depths["front"], make_rover.depth(0))
+    assert frame.base.tolist() == make_rover.speeds(0)
+    assert frame.stamps["front"] - frame.stamps["front_depth"] == pytest.approx(0.001, abs=1e-6)
+
+
 def test_the_recorded_actions_give_the_recorded_commands(bench, path, make_arm):
     bench.arm = make_arm()
     bench.arm.get_state = lambda: bench.arm.state

@@ -91,6 +91,28 @@ def test_a_picture_that_nobody_looked_at_loses_a_little_until_somebody_does(tmp_
     assert (found.read(2) == noise).all()
 
 
+@pytest.mark.parametrize(
+    ("metres", "kept"),
+    [(0.0014, 0.001), (65.535, 65.535), (65.536, None), (-1, None), (np.inf, None), (None, None)],
+)
+def test_depth_is_whole_millimetres_or_nothing(
+    tmp_path: Path, metres: float | None, kept: float | None
+) -> None:
+    given = np.full((4, 6), np.nan if metres is None else metres, np.float32)
+    bag = Bag(tmp_path / "b", NAMES)
+    bag.add({**START, "embodiment": SPEC.to_dict()})
+    for _ in range(2):
+        bag.depth(CAMERA, 5.0, given)
+    bag.close()
+
+    found = open_recording(tmp_path / "b")
+    assert len(found.depths[CAMERA]) == 1
+    assert found.pictures == {}
+    read = found.depths[CAMERA].read(0)
+    assert read.dtype == np.float32
+    assert np.isnan(read).all() if kept is None else read == pytest.approx(np.float32(kept))
+
+
 def test_without_opencv_every_picture_is_exact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,8 @@ from fluxvla_core.infer.plan import Plan
 from fluxvla_core.infer.tasks import Task
 from fluxvla_core.record import tally
 from fluxvla_core.record.trace import EpisodeTrace, Recording
+from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2.streams import depth_stream
 
 Array = npt.NDArray[np.float64]
 
@@ -88,7 +90,8 @@ class EpisodeRecord:
         stamps = dict(frame.stamps) if frame is not None else dict.fromkeys((STATE, *images), now)
         for camera, image in pictures.items():
             self._trace.picture(camera, stamps.get(camera, now), image)
-        self.event(tally.OBSERVATION, state=state, stamps=stamps, ms=_milliseconds(seconds))
+        base = self._beside(frame, stamps) if isinstance(frame, RobotFrame) else {}
+        self.event(tally.OBSERVATION, state=state, stamps=stamps, **base, ms=_milliseconds(seconds))
 
     def refused(self, what: str, **values: Any) -> None:
         """Something was not let through; ``values`` may be anything."""
@@ -148,6 +151,13 @@ class EpisodeRecord:
                 f"{' and '.join(lost)} were not recorded: the disk or the processor did not keep up"
             )
         return summary
+
+    def _beside(self, frame: RobotFrame, stamps: Mapping[str, float]) -> dict[str, Any]:
+        """Record what a frame has besides state and pictures; what of it belongs into an event."""
+        for camera, metres in frame.depths.items():
+            stamp = stamps.get(depth_stream(camera), stamps[STATE])
+            self._trace.depth(camera, stamp, metres)
+        return {} if frame.base is None else {"base": frame.base}
 
     def _film(self) -> None:
         """A frame for each video: fresh from a simulation, else the last one that was seen."""

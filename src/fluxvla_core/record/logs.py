@@ -41,6 +41,9 @@ class Log(Protocol):
         One that need not be ``exact`` may lose a little: a camera's whole stream is large.
         """
 
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        """Append one ``(H, W)`` depth picture that arrived at ``stamp``."""
+
     def flush(self) -> None:
         """Give what is there to the system: a process that is killed then loses none of it."""
 
@@ -68,6 +71,9 @@ class JsonLines:
     def picture(
         self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
     ) -> None:
+        return
+
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
         return
 
     def flush(self) -> None:
@@ -124,12 +130,15 @@ class Bag:
         ns = self._ns(stamp)
         kind = ros.IMAGE if exact or not self._has_jpeg else ros.JPEG
         topic = ros.camera_topic(camera, kind)
-        written = self._written.setdefault(topic, deque(maxlen=_REMEMBERED))
-        if ns in written or ns in self._written.get(ros.camera_topic(camera), ()):
+        if ns in self._written.get(ros.camera_topic(camera), ()) or not self._is_new(topic, ns):
             return
-        written.append(ns)
         pack = self._packer.picture if kind == ros.IMAGE else self._packer.jpeg
         self._write(topic, kind, ns, pack(camera, image, ns))
+
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        ns, topic = self._ns(stamp), ros.depth_topic(camera)
+        if self._is_new(topic, ns):
+            self._write(topic, ros.IMAGE, ns, self._packer.depth(camera, metres, ns))
 
     def flush(self) -> None:
         storage = self._writer.storage
@@ -139,6 +148,14 @@ class Bag:
 
     def close(self) -> None:
         self._writer.close()
+
+    def _is_new(self, topic: str, ns: int) -> bool:
+        """Whether nothing of this time was written yet; from now on it was."""
+        written = self._written.setdefault(topic, deque(maxlen=_REMEMBERED))
+        if ns in written:
+            return False
+        written.append(ns)
+        return True
 
     def _write(self, topic: str, kind: str, ns: int, data: memoryview) -> None:
         if topic not in self._channels:

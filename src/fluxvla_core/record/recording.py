@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,13 +35,19 @@ class Pictures:
     """One camera's pictures in the order of their times; each is read when it is asked for.
 
     ``times`` are seconds on the loop's clock, when each arrived.
+
+    Args:
+        file: where they are.
+        unpack: makes an array of a message and its type.
     """
 
-    def __init__(self, file: McapFile, unpacker: ros.Unpacker) -> None:
+    def __init__(
+        self, file: McapFile, unpack: Callable[[memoryview, str], npt.NDArray[Any]]
+    ) -> None:
         self.times: list[float] = []
         self._places: list[tuple[Place, str]] = []
         self._file = file
-        self._unpacker = unpacker
+        self._unpack = unpack
 
     def __len__(self) -> int:
         return len(self.times)
@@ -61,10 +67,10 @@ class Pictures:
         index = bisect_right(self.times, time + _ROUNDING_S) - 1
         return index if index >= 0 else None
 
-    def read(self, index: int) -> npt.NDArray[np.uint8]:
-        """``(H, W, 3)`` uint8 RGB, a fresh array."""
+    def read(self, index: int) -> npt.NDArray[Any]:
+        """``(H, W, 3)`` uint8 RGB, or ``(H, W)`` float32 metres of depth; a fresh array."""
         place, kind = self._places[index]
-        return self._unpacker.picture(self._file.read(place), kind)
+        return self._unpack(self._file.read(place), kind)
 
 
 class Recorded:
@@ -75,13 +81,19 @@ class Recorded:
         events: in the order in which they happened.
         pictures: camera -> its pictures.
         whole: whether the record was finished.
+        depths: camera -> its depth pictures, NaN where nothing was measured.
 
     Raises:
         DataError: the record does not say what it is of.
     """
 
     def __init__(
-        self, path: Path, events: Sequence[Event], pictures: Mapping[str, Pictures], whole: bool
+        self,
+        path: Path,
+        events: Sequence[Event],
+        pictures: Mapping[str, Pictures],
+        whole: bool,
+        depths: Mapping[str, Pictures] | None = None,
     ) -> None:
         if not events or events[0].get("event") != tally.START:
             raise DataError(
@@ -92,6 +104,7 @@ class Recorded:
         self.path = path
         self.events = events
         self.pictures = pictures
+        self.depths = depths or {}
         self.whole = whole
         self.start = events[0]
         if self.start.get("format") != tally.FORMAT:
@@ -258,14 +271,25 @@ def _read(path: Path) -> Recorded:
         return Recorded(path, events, {}, whole)
     bag = read_bag(file)
     cameras = Recorded(path, bag.events, {}, bag.whole).embodiment.camera_names
-    by_topic = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
+    colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
+    pictures = _sorted(bag, colours, bag.unpacker.picture)
+    depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
+    return Recorded(path, bag.events, pictures, bag.whole, depths)
+
+
+def _sorted(
+    bag: BagContent,
+    by_topic: Mapping[str, str],
+    unpack: Callable[[memoryview, str], npt.NDArray[Any]],
+) -> dict[str, Pictures]:
+    """Camera -> its pictures on those of its topics that are named."""
     found: dict[str, Pictures] = {}
     for topic, kind, ns, place in bag.pictures:
         camera = by_topic.get(topic)
         if camera is not None:
-            kept = found.setdefault(camera, Pictures(bag.file, bag.unpacker))
+            kept = found.setdefault(camera, Pictures(bag.file, unpack))
             kept.add((ns - bag.offset) / 1e9, place, kind)
-    return Recorded(path, bag.events, found, bag.whole)
+    return found
 
 
 def age_at(event: Event, stream: str) -> float:

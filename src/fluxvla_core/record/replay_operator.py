@@ -13,13 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.contracts.protocols import Clock
 from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
 from fluxvla_core.errors import DataError, NotReady
 from fluxvla_core.record import tally
-from fluxvla_core.record.recording import Event, Recorded, age_at, open_recording
+from fluxvla_core.record.recording import Event, Pictures, Recorded, age_at, open_recording
+from fluxvla_core.record.ros_messages import BASE
 from fluxvla_core.ros2.actions import checked_action
+from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2.streams import depth_stream
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -96,8 +99,8 @@ class ReplayOperator:
                 f"not of {instruction!r}"
             )
 
-    def get_frame(self) -> Frame:
-        """What had arrived by now; pictures in fresh arrays.
+    def get_frame(self) -> RobotFrame:
+        """What had arrived by now; pictures in fresh arrays, depth and base where recorded.
 
         Raises:
             NotReady: not connected, or nothing had arrived yet.
@@ -107,14 +110,18 @@ class ReplayOperator:
         stamps = {STATE: shown - age_at(seen, STATE)}
         images = {}
         for camera, pictures in self.recorded.pictures.items():
-            index = pictures.newest(now)
-            if index is None:
-                raise NotReady(f"the recording has no picture of {camera} before {now:.3f} s")
+            index = _index(pictures, camera, now)
             images[camera] = pictures.read(index)
             # Where only what was looked at was recorded, nobody knows how old it was since.
             age = now - pictures.times[index] if self.recorded.native else age_at(seen, camera)
             stamps[camera] = shown - max(0.0, age)
-        return Frame(state=self._state(now), images=images, stamps=stamps)
+        depths = {}
+        for camera, pictures in self.recorded.depths.items():
+            stream = depth_stream(camera)
+            depths[camera] = pictures.read(_index(pictures, stream, now))
+            stamps[stream] = shown - age_at(seen, stream)
+        base = None if seen.get(BASE) is None else np.array(seen[BASE], dtype=np.float64)
+        return RobotFrame(self._state(now), images, stamps, depths, base)
 
     def get_state(self) -> Array:
         """``(state_dim,)`` of now.
@@ -194,6 +201,13 @@ class ReplayOperator:
     def _state(self, now: float) -> Array:
         times, states = self._states
         return np.array(states[max(0, _newest(times, now))])
+
+
+def _index(pictures: Pictures, stream: str, now: float) -> int:
+    index = pictures.newest(now)
+    if index is None:
+        raise NotReady(f"the recording has no picture of {stream} before {now:.3f} s")
+    return index
 
 
 def _newest(times: Array, now: float) -> int:

@@ -1,10 +1,11 @@
 """An event of an episode as ROS 2 messages, and back.
 
 What ROS has a type for is a message of that type, so that any ROS tool plots it: joint vectors are
-``sensor_msgs/JointState``, a policy's chunk is a ``trajectory_msgs/JointTrajectory``, pictures are
-``sensor_msgs/Image``, or ``CompressedImage`` where nobody looked at them. The rest of the event is
-JSON in a ``std_msgs/String``, which comes after those messages and completes the event. No value is
-written twice.
+``sensor_msgs/JointState``, a base's speed is a ``nav_msgs/Odometry``, a policy's chunk is a
+``trajectory_msgs/JointTrajectory``, pictures are ``sensor_msgs/Image``, or ``CompressedImage``
+where nobody looked at them; depth is ``16UC1``. The rest of the event is JSON in a
+``std_msgs/String``, which comes after those messages and completes the event. No value is written
+twice.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import DataError, RunFailed
+from fluxvla_core.ros2.images import to_depth
 
 ROOT = "/fluxvla"
 EVENTS = f"{ROOT}/events"
@@ -29,17 +31,22 @@ VECTORS: Mapping[str, str] = {
     "command": f"{ROOT}/command",
 }
 """Field of an event -> topic of its ``JointState``."""
+BASES = f"{ROOT}/base"
+BASE = "base"
 CHUNKS = f"{ROOT}/chunk"
 KEYFRAMES = "keyframes"
 
 STRING = "std_msgs/msg/String"
 JOINT_STATE = "sensor_msgs/msg/JointState"
+ODOMETRY = "nav_msgs/msg/Odometry"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 IMAGE = "sensor_msgs/msg/Image"
 JPEG = "sensor_msgs/msg/CompressedImage"
 PICTURES = (IMAGE, JPEG)
 
 _QUALITY = 90
+_MILLIMETRES = 1000.0
+_FARTHEST = 65535
 _FIELDS = {topic: field for field, topic in VECTORS.items()}
 
 
@@ -64,6 +71,11 @@ def camera_topic(camera: str, kind: str = IMAGE) -> str:
     """The topic of a camera's pictures; ``frame_id`` has the camera's true name."""
     topic = CAMERAS + (re.sub(r"[^0-9A-Za-z_]", "_", camera) or "_")
     return topic if kind == IMAGE else f"{topic}/compressed"
+
+
+def depth_topic(camera: str) -> str:
+    """The topic of a camera's depth pictures."""
+    return f"{camera_topic(camera)}/depth"
 
 
 def has_jpeg() -> bool:
@@ -110,6 +122,8 @@ class Packer:
             del rest[field]
             of = names["state" if field == "state" else "action"]
             yield topic, JOINT_STATE, self._joints(values, of, stamps["t"])
+        if rest.get(BASE) is not None:
+            yield BASES, ODOMETRY, self._odometry(rest.pop(BASE), stamps["t"])
         if rest.get(KEYFRAMES) is not None:
             chunk = np.asarray(rest.pop(KEYFRAMES), dtype=np.float64)
             message = self._trajectory(
@@ -131,6 +145,26 @@ class Packer:
             is_bigendian=0,
             step=3 * width,
             data=np.ascontiguousarray(image).reshape(-1),
+        )
+        packed: memoryview = self._store.serialize_cdr(message, IMAGE)
+        return packed
+
+    def depth(self, camera: str, metres: npt.NDArray[np.float32], ns: int) -> memoryview:
+        """The CDR of an ``Image`` of ``(H, W)`` distances: whole millimetres, 0 for nothing.
+
+        NaN is nothing, as is what is farther than the 65.535 m that the encoding reaches.
+        """
+        height, width = metres.shape
+        far = np.rint(np.nan_to_num(metres, posinf=0.0, neginf=0.0) * _MILLIMETRES)
+        millimetres = np.where((far > 0) & (far <= _FARTHEST), far, 0).astype("<u2")
+        message = self._store.types[IMAGE](
+            header=self._header(ns, camera),
+            height=height,
+            width=width,
+            encoding="16UC1",
+            is_bigendian=0,
+            step=2 * width,
+            data=millimetres.view(np.uint8).reshape(-1),
         )
         packed: memoryview = self._store.serialize_cdr(message, IMAGE)
         return packed
@@ -159,6 +193,28 @@ class Packer:
             effort=empty,
         )
         packed: memoryview = self._store.serialize_cdr(message, JOINT_STATE)
+        return packed
+
+    def _odometry(self, speeds: Any, ns: int) -> memoryview:
+        types, unknown = self._store.types, np.zeros(36)
+        # Only speeds were read; a negative variance says that the pose is none.
+        unknown[0] = -1.0
+        forward, turning = map(float, speeds)
+        vector = types["geometry_msgs/msg/Vector3"]
+        pose = types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+            orientation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        )
+        twist = types["geometry_msgs/msg/Twist"](
+            linear=vector(forward, 0.0, 0.0), angular=vector(0.0, 0.0, turning)
+        )
+        message = types[ODOMETRY](
+            header=self._header(ns, "odom"),
+            child_frame_id="base_link",
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](pose, unknown),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)),
+        )
+        packed: memoryview = self._store.serialize_cdr(message, ODOMETRY)
         return packed
 
     def _trajectory(
@@ -210,6 +266,9 @@ class Unpacker:
         if kind == TRAJECTORY:
             points = self._read(data, kind).points
             self._parts[KEYFRAMES] = [point.positions.tolist() for point in points]
+        elif kind == ODOMETRY:
+            twist = self._read(data, kind).twist.twist
+            self._parts[BASE] = [twist.linear.x, twist.angular.z]
         elif topic in _FIELDS:
             self._parts[_FIELDS[topic]] = self._read(data, kind).position.tolist()
         elif topic == EVENTS:
@@ -241,6 +300,12 @@ class Unpacker:
         if bgr is None:
             raise DataError(f"a recorded picture of {message.header.frame_id} is no JPEG")
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def depth(self, data: memoryview, kind: str = IMAGE) -> npt.NDArray[np.float32]:
+        """``(H, W)`` float32 metres, NaN where nothing was measured; a fresh array."""
+        message = self._read(data, kind)
+        # As what a camera sends is read, so that the same numbers come back.
+        return to_depth(message, message.height, message.width, "a recording")
 
     def _read(self, data: memoryview, kind: str) -> Any:
         return self._store.deserialize_cdr(data, kind)

@@ -143,6 +143,11 @@ class EpisodeTrace:
         if self._recording is not None:
             self._put_image("pictures", (camera, stamp, image))
 
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        """Record an ``(H, W)`` depth picture that arrived at ``stamp``; once is enough."""
+        if self._recording is not None:
+            self._put_image("pictures", (camera, stamp, metres))
+
     def close(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Finish every file; ``summary`` and what was dropped become ``episode.json``.
 
@@ -209,6 +214,8 @@ class EpisodeTrace:
         with priority.ordinary():
             if stamp is None:
                 self._film(camera, image)
+            elif image.ndim == 2:
+                self._log.depth(camera, stamp, image)
             else:
                 self._log.picture(camera, stamp, image)
 
@@ -250,7 +257,7 @@ class EpisodeTrace:
                 for _ in range(poll.frames_until(stamp, self.video_fps)):
                     self._film(camera, image)
 
-    def _put_image(self, what: str, item: tuple[str, float | None, Picture]) -> None:
+    def _put_image(self, what: str, item: tuple[str, float | None, npt.NDArray[Any]]) -> None:
         if self._takes("bytes", item[2].nbytes, _WAITING_BYTES):
             self._items.put(item)
         else:

@@ -57,6 +57,11 @@ class StreamSpec:
         return f"{self.name} ({self.topic})"
 
 
+def depth_stream(camera: str) -> str:
+    """What the stream of a camera's distances is called."""
+    return f"{camera}_depth"
+
+
 def camera_stream(
     camera: Camera, topic: str, expected_hz: float | None = None, depth: bool = False
 ) -> StreamSpec:
@@ -67,7 +72,7 @@ def camera_stream(
     """
     packed = topic.rstrip("/").rpartition("/")[2] in ("compressed", "compressedDepth")
     return StreamSpec(
-        name=f"{camera.name}_depth" if depth else camera.name,
+        name=depth_stream(camera.name) if depth else camera.name,
         topic=topic,
         message=COMPRESSED_IMAGE if packed else IMAGE,
         kind=DEPTH if depth else CAMERA,

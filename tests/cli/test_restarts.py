@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,16 @@ def test_a_killed_rank_costs_nothing_but_time(tiny: None, whole: Path) -> None:
     assert "warning: restart 1: a process ended without a word" in out
     assert "resuming from cut/checkpoints/step-000000003 (step 3)" in out
     assert differing(whole, Path("cut")) == []
+
+
+def test_a_restart_before_the_first_save_begins_where_the_run_did(tiny: None, whole: Path) -> None:
+    shutil.copytree(whole, "whole")
+    place = "whole/checkpoints/step-000000006"
+    words = ("--set", f"runner.resume_from+={place}", "--set", "runner.collator.batch+=1")
+    code, out, err = start("cut", "--nproc", "2", "--max-restarts", "1", *words)
+    assert (code, err) == (0, "")
+    told = out.partition("warning: restart 1:")
+    assert all(f"resuming from {place} (step 6)" in part for part in (told[0], told[2]))
 
 
 def test_an_error_is_told_at_the_restart_and_again_when_there_is_none_left(tiny: None) -> None:

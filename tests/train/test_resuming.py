@@ -83,6 +83,15 @@ def test_resume_from_in_the_config_and_the_command_line_before_it(tmp_path):
     assert said.lines[-1] == f"resuming from {here}2 (step 2)"
 
 
+def test_auto_goes_on_from_the_configs_checkpoint_until_the_work_dir_has_one(tmp_path):
+    run(tmp_path / "first", max_steps=2)
+    place = str(tmp_path / "first/checkpoints/step-000000002")
+    for steps, found in ((3, place), (4, f"{tmp_path}/next/checkpoints/step-000000003")):
+        said = Said()
+        run(tmp_path / "next", "auto", reporter=said, resume_from=place, max_steps=steps)
+        assert said.lines[0] == f"resuming from {found} (step {steps - 1})"
+
+
 def test_a_damaged_newest_one_is_named_and_passed_over_by_auto_and_refused_by_path(tmp_path):
     run(tmp_path / "whole", save_iter_interval=2, max_keep_ckpts=0)
     run(tmp_path / "hurt", save_iter_interval=2, max_keep_ckpts=0)

@@ -74,7 +74,8 @@ class BaseTrainRunner(TrainRun):
         early_stop_patience: end after so many validations in a row without a better one.
         seed: initial weights, order of samples, and everything drawn, also by datasets that set
             no ``seed`` of their own.
-        resume_from: ``auto`` or a checkpoint's path; the command line's ``--resume`` goes first.
+        resume_from: ``auto`` or a checkpoint's path; the command line's ``--resume`` goes first,
+            but ``auto`` and restarts begin at that path while the work dir has no checkpoint.
         log_iter_interval: fetch losses, and look for NaN, every so many steps; every step is
             logged all the same.
         device: ``auto`` (a GPU if there is one), ``cpu``, ``cuda``.

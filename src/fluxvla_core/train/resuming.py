@@ -52,7 +52,9 @@ def take_over(world: World, context: RunContext) -> Claim | None:
     return claims[0] if claims else None
 
 
-def choose(world: World, context: RunContext, resume: str | None) -> Checkpoint | None:
+def choose(
+    world: World, context: RunContext, resume: str | None, first: str | None = None
+) -> Checkpoint | None:
     """The verified checkpoint to go on from, None to start afresh; the same on every rank.
 
     Also clears what killed saves left in the work dir, which :func:`take_over` made this run's.
@@ -60,32 +62,30 @@ def choose(world: World, context: RunContext, resume: str | None) -> Checkpoint 
     Args:
         resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
             path (refused if damaged), or None (refused if there are checkpoints already).
+        first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
+            first save goes on from where the run did.
 
     Raises:
         CheckpointError: the one at the path is missing or damaged.
         UsageError: the work dir has checkpoints of another run.
     """
-    found = on_first(world, lambda: _choose(context, resume))
+    found = on_first(world, lambda: _choose(context, resume, first))
     return Checkpoint.open(found) if found else None
 
 
-def _choose(context: RunContext, resume: str | None) -> str:
+def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
     clear_leftovers(context.work_dir)
     reporter = context.reporter
     if resume is None:
         _refuse_existing(context.work_dir)
         return ""
-    if resume == AUTO:
-        checkpoint, refused = newest_whole(context.work_dir)
-        if checkpoint is None and refused:
-            raise refused[0]
-        for error in refused:
-            reporter.warn(f"not resuming from a damaged checkpoint: {error.where}: {error.what}")
-        if checkpoint is None:
+    checkpoint = _newest(context) if resume == AUTO else None
+    if checkpoint is None:
+        place = first if resume == AUTO else resume
+        if place is None or place == AUTO:
             reporter.info(f"no checkpoint in {context.work_dir} yet: training starts afresh")
             return ""
-    else:
-        checkpoint = Checkpoint.open(resume)
+        checkpoint = Checkpoint.open(place)
         checkpoint.verify()
     if checkpoint.path.resolve().parent.parent == context.work_dir.resolve():
         for moved in set_aside_later(context.work_dir, checkpoint.step):
@@ -94,6 +94,17 @@ def _choose(context: RunContext, resume: str | None) -> str:
         _refuse_existing(context.work_dir)
     reporter.info(f"resuming from {checkpoint.path} (step {checkpoint.step})")
     return str(checkpoint.path)
+
+
+def _newest(context: RunContext) -> Checkpoint | None:
+    checkpoint, refused = newest_whole(context.work_dir)
+    if checkpoint is None and refused:
+        raise refused[0]
+    for error in refused:
+        context.reporter.warn(
+            f"not resuming from a damaged checkpoint: {error.where}: {error.what}"
+        )
+    return checkpoint
 
 
 def _refuse_existing(work_dir: Path) -> None:

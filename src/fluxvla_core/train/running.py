@@ -179,8 +179,9 @@ class TrainRun:
             return
         self._world = distributed.start(self.options.device, self.needs_process_group)
         self._claim = take_over(self._world, self.context)
-        wanted = self.context.resume or self.options.resume_from
-        self._checkpoint = choose(self._world, self.context, wanted)
+        configured = self.options.resume_from
+        wanted = self.context.resume or configured
+        self._checkpoint = choose(self._world, self.context, wanted, first=configured)
 
     def _plan(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
         from fluxvla_core.train.batches import StepPlan

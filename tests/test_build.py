@@ -59,6 +59,44 @@ def test_wrong_arguments_name_the_class_and_the_place(registry):
     assert str(error.value).startswith("my.py:7: head: ")
 
 
+class Counting:
+    def __init__(
+        self, episodes: int = 5, seed: int | None = None, tasks: dict[str, str] | None = None
+    ):
+        if episodes < 0 or seed == 13:
+            raise ValueError("as a constructor raises it")
+        self.names = tasks and sorted(tasks)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"episodes": "5"}, "'episodes' must be int, got '5'"),
+        ({"tasks": 5}, "'tasks' must be dict[str, str] | None, got 5"),
+        ({"episodes": [1], "seed": 2.5}, "'seed' must be int | None, got 2.5"),
+    ],
+)
+def test_a_constructor_that_fails_at_a_value_of_another_type(registry, values, told):
+    registry.register_module()(Counting)
+    table = {"type": "Counting", **values}
+    origins = {f"eval.head.{key}": f"config.py:{n}" for n, key in enumerate(values, 3)}
+    context = RunContext(config={"eval": {"head": table}}, origins=origins)
+    with pytest.raises(ConfigError) as found:
+        build_from_cfg(table, registry, context)
+    assert told in str(found.value)
+    for key, place in origins.items():
+        assert f"{place}: {key}: Counting" in str(found.value)
+
+
+def test_any_other_failure_of_a_constructor_is_its_own(registry):
+    registry.register_module()(Counting)
+    with pytest.raises(ValueError, match="as a constructor raises it"):
+        build_from_cfg({"type": "Counting", "episodes": -1, "tasks": {"a": "b"}}, registry)
+    with pytest.raises(ValueError, match="as a constructor raises it") as found:
+        build_from_cfg({"type": "Counting", "seed": 13}, registry)
+    assert found.value.__cause__ is None
+
+
 def test_a_table_without_type_is_refused(registry):
     with pytest.raises(ConfigError, match=r"fluxvla\.heads needs type = '<class name>', got None"):
         build_from_cfg({"rate": 1}, registry)

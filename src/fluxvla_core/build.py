@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.config import keys
 from fluxvla_core.config.check import INJECTED
+from fluxvla_core.config.values import misfits
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 
 
@@ -32,7 +34,8 @@ class RunContext:
         config_file: the file that was named on the command line.
         task: ``--task``: an id from the config or an instruction in words.
         task_file: ``--tasks``: a file with one of these a line.
-        nproc: ``--nproc``: how many processes work on this.
+        nproc: ``--nproc``: how many processes work on this. Refused where a runner neither trains
+            nor has ``workers``, which it overrides.
         reporter: where progress goes.
     """
 
@@ -65,7 +68,8 @@ def build_from_cfg(
         defaults: arguments used where the table does not set them.
 
     Raises:
-        ConfigError: no ``type``, an injected parameter is set, or the arguments do not fit.
+        ConfigError: no ``type``, an injected parameter is set, the arguments do not fit, or the
+            constructor fails at values of other types than it is annotated with.
         PluginError: the class cannot be had.
     """
     if not isinstance(cfg, Mapping):
@@ -99,7 +103,13 @@ def build_from_cfg(
             where=_section_origin(cfg, context),
             next=f"fluxvla plugins show {name}",
         ) from error
-    return cls(**arguments)
+    try:
+        return cls(**arguments)
+    except (AttributeError, TypeError, ValueError) as error:
+        explained = _explained(cls, cfg, context)
+        if explained is None:
+            raise
+        raise explained from error
 
 
 def parameters(cls: type) -> set[str]:
@@ -116,12 +126,39 @@ def parameters(cls: type) -> set[str]:
     return names - {"self"}
 
 
-def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
-    if context is None:
+def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) -> ConfigError | None:
+    """The values that a constructor is likely to have failed at, if any."""
+    wrong = misfits(cls, {key: value for key, value in cfg.items() if key != "type"})
+    if not wrong:
         return None
-    for section, table in context.config.items():
-        if table is cfg:
-            return context.where(section)
+    table = _key_of(cfg, context.config) if context is not None else None
+    problems = [
+        Problem(
+            context.origins.get(keys.child(table, one.name), "") if context and table else "",
+            keys.child(table or "", one.name),
+            f"{cls.__name__}: {one}",
+        )
+        for one in wrong
+    ]
+    return ConfigError.from_problems(tuple(problems), next=f"fluxvla plugins show {cls.__name__}")
+
+
+def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
+    key = _key_of(cfg, context.config) if context is not None else None
+    return context.where(key) if context is not None and key else None
+
+
+def _key_of(cfg: Any, tree: Any, key: str = "") -> str | None:
+    """The key under which this very table stands."""
+    items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
+    for name, value in items:
+        inner = keys.child(key, name)
+        if value is cfg:
+            return inner
+        if isinstance(value, Mapping | list | tuple):
+            found = _key_of(cfg, value, inner)
+            if found:
+                return found
     return None
 
 

@@ -177,6 +177,18 @@ def test_a_robot_that_is_slowed_down_in_the_middle_keeps_its_limits_and_stays_wi
     assert pushes(rig.robot) <= ONE.joints[0].acceleration
 
 
+@pytest.mark.parametrize("speed", [None, lambda: 1.0])
+def test_targets_may_be_played_at_a_share_of_the_speed(speed):
+    rig = Rig()
+    rig.path = CommandPath(
+        rig.execute, rig.path.rate, rig.limiter, rig.latch, (), rig.sent.append, speed
+    )
+    rig.path.play([[1.0]] * 30, most=0.25)
+
+    pace = np.abs(np.diff(rig.robot)) * 50
+    assert pace.max() == pytest.approx(0.25 * ONE.joints[0].velocity, rel=1e-3)
+
+
 def test_a_loop_without_beats_is_reported_afterwards():
     def unpaced(actions, rate):
         rig.robot.extend(float(a[0]) for a in actions)

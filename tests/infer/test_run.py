@@ -94,6 +94,24 @@ def test_the_arm_goes_to_the_start_pose_first(bench):
     bench.assert_within_limits()
 
 
+def test_an_arm_that_is_let_go_on_its_way_to_the_start_pose_stays_slow(bench, make_arm):
+    class Slowed(make_arm):
+        @property
+        def speed_scaling(self):
+            return 0.05 if len(self.sent) < 100 else 1.0
+
+    bench.arm = Slowed()
+    bench.run(prepare_pose=[-0.9, 1.5, 0.9])
+
+    ramp = [r["command"] for r in bench.trace() if r.get("phase") == "ramp"]
+    assert len(ramp) > 150
+    assert ramp[-1] == [-0.9, 1.5, 0.9]
+    pace = np.abs(np.diff(ramp, axis=0)).max(axis=0) * 50
+    fastest = np.array([joint.velocity for joint in bench.arm.embodiment.joints])
+    assert (pace <= 0.25 * fastest).all()
+    bench.assert_within_limits()
+
+
 def test_an_episode_is_recorded_line_by_line(bench):
     bench.run()
 

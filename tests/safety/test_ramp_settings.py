@@ -38,11 +38,12 @@ def test_it_is_as_fast_as_its_slowest_joint_may_go():
     assert speed[:, 1].max() <= 0.25
 
 
-def test_the_limiter_passes_it_unchanged():
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_the_limiter_passes_it_unchanged(share):
     made = limiter(0.0, 1.0)
-    rows = ramp(made, [2.0, 0.0], 1.0)
+    rows = ramp(made, [2.0, 0.0], share)
 
-    commands, clamps = made.run(rows)
+    commands, clamps = made.run(rows, share)
 
     np.testing.assert_allclose(commands, rows, atol=1e-12)
     assert not any(clamps)

@@ -75,8 +75,14 @@ class CommandPath:
         self._played = 0
         rate.on_beat = self._beat
 
-    def play(self, targets: npt.ArrayLike, filtered: bool = True) -> None:
-        """Send one command for each row of ``(N, D)`` targets; ``filtered`` through the filters.
+    def play(self, targets: npt.ArrayLike, filtered: bool = True, most: float = 1.0) -> None:
+        """Send one command for each row of ``(N, D)`` targets.
+
+        Args:
+            targets: where to go.
+            filtered: through the filters.
+            most: share of the velocity limits, in (0, 1], that no command goes beyond, however much
+                the robot allows.
 
         Raises:
             SafetyStop: the latch is tripped, or a target is not finite or of another shape.
@@ -85,10 +91,11 @@ class CommandPath:
         wanted = np.asarray(targets, dtype=np.float64)
         shaped = np.array([self._filtered(row) for row in wanted]) if filtered else wanted
         if self._speed is None:
-            self._play(wanted, shaped, 1.0)
+            self._play(wanted, shaped, most)
             return
         for row in range(len(wanted)):
-            self._play(wanted[row : row + 1], shaped[row : row + 1], self._speed())
+            share = min(self._speed(), most)
+            self._play(wanted[row : row + 1], shaped[row : row + 1], share)
 
     def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
         before = self.limiter.snapshot()

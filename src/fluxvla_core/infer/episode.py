@@ -165,14 +165,7 @@ class Episode:
         self._limiter.start(self._where(reading.state))
         plan.policy.reset(self._seed)
         if plan.start_pose is not None:
-            self._phase = "ramp"
-            targets = ramp(self._limiter, plan.start_pose, plan.settings.ramp_scale)
-            seconds = len(targets) / plan.rate_hz
-            plan.context.reporter.info(f"moving to the start pose, {seconds:.1f} s")
-            self._path.play(targets, filtered=False)
-            # An arm that a person slowed down is not there yet.
-            while np.abs(self._limiter.last - plan.start_pose).max() > _THERE:
-                self._path.play([plan.start_pose], filtered=False)
+            self._go(np.asarray(plan.start_pose, dtype=np.float64))
         for each in plan.filters:
             reset = getattr(each, "reset", None)
             if reset is not None:
@@ -180,6 +173,18 @@ class Episode:
         self._rate.reset()
         self._tracking.reset()
         self._phase = "ready"
+
+    def _go(self, pose: Array) -> None:
+        """Move to the ``(D,)`` start pose, never faster than ``safety.ramp_scale``."""
+        plan = self._plan
+        self._phase, most = "ramp", plan.settings.ramp_scale
+        targets = ramp(self._limiter, pose, most)
+        seconds = len(targets) / plan.rate_hz
+        plan.context.reporter.info(f"moving to the start pose, {seconds:.1f} s")
+        self._path.play(targets, filtered=False, most=most)
+        # An arm that a person slowed down is not there yet; let go, it does not make up for it.
+        while np.abs(self._limiter.last - pose).max() > _THERE:
+            self._path.play([pose], filtered=False, most=most)
 
     def _loop(self) -> Loop:
         plan = self._plan

@@ -1,9 +1,32 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and folders that can be written in."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
+
+from fluxvla_core.errors import UsageError
+
+
+def prepare_folder(path: Path, what: str, next: str) -> None:
+    """Make the folder and try to write in it, before any work is done for it.
+
+    Args:
+        what: goes there, for the message.
+        next: the way on.
+
+    Raises:
+        UsageError: it cannot be made or written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path) as file:
+            file.write(b"x")
+    except OSError as error:
+        raise UsageError(
+            f"cannot write to the {what}: {error.strerror or error}", where=str(path), next=next
+        ) from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.cli import plan as plan_module
+from fluxvla_core import atomic
 from fluxvla_core.cli.plan import default_work_dir
 from tests.conftest import Install
 
@@ -251,7 +251,7 @@ def test_a_work_dir_that_cannot_be_written(
     def refuse(**kwargs: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(plan_module.tempfile, "TemporaryFile", refuse)
+    monkeypatch.setattr(atomic.tempfile, "TemporaryFile", refuse)
     ended = run("--config", "c.py", "--section", "runner")
     assert ended.code == 2
     assert "work_dirs/c: cannot write to the work dir: Permission denied" in ended.err
@@ -305,6 +305,22 @@ def test_options_that_do_not_fit_the_section(run: Fluxvla) -> None:
     assert ended.code == 2
     assert "--resume gone: there is no such checkpoint" in ended.err
     assert "--resume auto takes the newest one" in ended.err
+
+
+def test_several_processes_for_a_runner_that_is_one(run: Fluxvla, write: Write) -> None:
+    words = ("--config", "c.py", "--section", "eval")
+    write("toy.py", Path("toy.py").read_text().replace("workers=None, ", ""))
+    ended = run(*words, "--nproc", "2")
+    assert ended.code == 2
+    assert ended.err == (
+        "--nproc is for processes that train or evaluate together, and section 'eval' runs in "
+        "one\n  next: leave it out\n"
+    )
+    assert not Path("work_dirs").exists()
+    assert run(*words, "--nproc", "1").code == 0
+    text = Path("toy.py").read_text().replace("seeds=1, context=None", "context=None, **kwargs")
+    write("toy.py", text)
+    assert run(*words, "--nproc", "2").code == 0, "whatever it does with it"
 
 
 # -- endings ---------------------------------------------------------------------------------

@@ -214,8 +214,18 @@ def test_there_is_no_such_folder(tmp_path: Path) -> None:
 
 def test_it_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(RunFailed, match="the report cannot be written"):
+    with pytest.raises(UsageError, match="cannot write to the report's folder") as found:
         build_report(tmp_path, tmp_path / "file" / "r.html")
+    assert f"{tmp_path}/file" in str(found.value)
+
+
+def test_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, text: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fluxvla_core.atomic.write_text", full)
+    with pytest.raises(RunFailed, match=r"the report cannot be written: .*No space left"):
+        build_report(tmp_path)
 
 
 def test_jinja2_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -153,6 +153,13 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
         export(source, tmp_path / "out")
 
 
+def test_a_place_that_cannot_be_written_in(tmp_path):
+    source = saved(tmp_path / "run")
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot write to the folder to export to"):
+        export(source, tmp_path / "file" / "policy")
+
+
 def test_a_damaged_checkpoint_is_not_exported(tmp_path):
     source = saved(tmp_path / "run")
     (source / "policy.json").write_text("{}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -107,24 +106,6 @@ def default_work_dir(file: Path) -> Path:
         return Path("work_dirs") / file.stem
     folder = file.parent
     return folder.parent.parent if folder.parent.name == "checkpoints" else folder
-
-
-def prepare_work_dir(path: Path) -> None:
-    """Make the folder and try to write in it.
-
-    Raises:
-        UsageError: it cannot be made or written.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path) as file:
-            file.write(b"x")
-    except OSError as error:
-        raise UsageError(
-            f"cannot write to the work dir: {error.strerror or error}",
-            where=str(path),
-            next="name another one: --work-dir DIR",
-        ) from error
 
 
 def refuse_overwriting(work_dir: Path, resume: str | None) -> None:

@@ -12,9 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.cli import following, ranks
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, natural, positive
-from fluxvla_core.cli.plan import Plan, make_plan, prepare_work_dir, refuse_overwriting
+from fluxvla_core.cli.plan import Plan, make_plan, refuse_overwriting
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.plugins.files import load_plugin_files
@@ -39,7 +40,13 @@ class Run:
         parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
         parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
         parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
-        parser.once("--nproc", type=positive, default=1, metavar="N", help="processes (default 1)")
+        parser.once(
+            "--nproc",
+            type=positive,
+            default=1,
+            metavar="N",
+            help="processes that train, or workers that evaluate (default 1)",
+        )
         parser.once(
             "--max-restarts",
             type=natural,
@@ -84,7 +91,7 @@ class Run:
             print(_outline(plan, args.log_format))
             return 0
         if ranks.rank() == 0 and not ranks.launched():
-            prepare_work_dir(plan.work_dir)
+            prepare_folder(plan.work_dir, "work dir", "name another one: --work-dir DIR")
             if plan.trains:
                 asked = ranks.resume(args.resume, plan.work_dir)
                 configured = plan.config.tree[plan.section].get("resume_from")
@@ -123,11 +130,25 @@ def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
             "--grace is for the processes that --nproc or --max-restarts starts",
             next="leave it out: this one saves when it is stopped, however long that takes",
         )
+    if args.nproc > 1 and not _divides(plan):
+        raise UsageError(
+            "--nproc is for processes that train or evaluate together, and section "
+            f"{plan.section!r} runs in one",
+            next="leave it out",
+        )
     if args.resume not in (None, "auto") and not Path(args.resume).exists():
         raise UsageError(
             f"--resume {args.resume}: there is no such checkpoint",
             next="--resume auto takes the newest one of the work dir",
         )
+
+
+def _divides(plan: Plan) -> bool:
+    """Whether the section's runner trains or has ``workers``, or may have, for all one can read."""
+    (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
+    if plan.trains or signature is None or signature.open:
+        return True
+    return "workers" in signature.names
 
 
 def _launches(args: argparse.Namespace) -> bool:

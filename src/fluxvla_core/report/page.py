@@ -43,16 +43,16 @@ def build_report(work_dir: Path | str, out: Path | str | None = None, title: str
         The file that was written.
 
     Raises:
-        UsageError: there is no such folder.
-        RunFailed: ``jinja2`` is missing, or nothing can be written.
+        UsageError: there is no such folder, or the page's cannot be written in.
+        RunFailed: ``jinja2`` is missing, or the disk is full.
     """
     folder = Path(work_dir)
     target = Path(out) if out is not None else folder / "report.html"
     if not folder.is_dir():
         raise UsageError("there is no such work dir to report on", where=str(folder))
+    atomic.prepare_folder(target.parent, "report's folder", "name another file: --out FILE")
     html = render(read_facts(folder), target.parent, title)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         atomic.write_text(target, html)
     except OSError as error:
         raise RunFailed(f"the report cannot be written: {error}", where=str(target)) from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
@@ -34,7 +35,7 @@ def export(source: str | Path, target: str | Path) -> Path:
         CheckpointError: ``source`` is missing, damaged, or of another model.
         ConfigError, PluginError: the model cannot be built here.
         RunFailed: it could not be written; nothing is left then.
-        UsageError: there is something at ``target``.
+        UsageError: there is something at ``target``, or nothing can be written there.
     """
     target = Path(target)
     if target.exists() and not (target.is_dir() and not any(target.iterdir())):
@@ -42,6 +43,7 @@ def export(source: str | Path, target: str | Path) -> Path:
             f"there is something at {target} already", next="name a folder that does not exist yet"
         )
     checkpoint = Checkpoint.open(source)
+    prepare_folder(target.parent, "folder to export to", "name another place for the export")
     checkpoint.verify()
     config = checkpoint.json(ckpt.CONFIG)
     tree = {k: v for k, v in config["config"].items() if k not in TRAINING_ONLY}
@@ -58,7 +60,6 @@ def export(source: str | Path, target: str | Path) -> Path:
     load_for_inference(model, checkpoint)
     if target.exists():
         target.rmdir()
-    target.parent.mkdir(parents=True, exist_ok=True)
     with CheckpointWriter(target.parent, checkpoint.step, checkpoint.epoch, final=target) as writer:
         TensorFile.whole(ckpt.MODEL, model_tensors(model), True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})

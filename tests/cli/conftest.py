@@ -85,7 +85,7 @@ class ToyTrainRunner:
 
 @RUNNERS.register_module()
 class ToyEvalRunner:
-    def __init__(self, operator=None, seeds=1, context=None):
+    def __init__(self, operator=None, seeds=1, workers=None, context=None):
         self.context = context
 
     def run_setup(self):

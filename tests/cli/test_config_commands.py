@@ -89,6 +89,21 @@ def test_check_without_the_section_fails(fluxvla: Fluxvla, write: Write) -> None
     assert "runner.type: no fluxvla.runners plugin named 'FarTrainRunner'" in ended.err
 
 
+@pytest.mark.parametrize("command", [("run", "--config"), ("config", "check")])
+def test_check_and_run_name_a_section_alike(
+    fluxvla: Fluxvla, write: Write, command: tuple[str, ...]
+) -> None:
+    write("d.py", "eval = dict(type='EvalRunner')\nx = dict(a=1)\n")
+    ended = fluxvla(*command, "d.py", "--section", "evl")
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err == (
+        "d.py: no section 'evl'; did you mean 'eval'?\n  next: sections there: eval (EvalRunner)\n"
+    )
+    ended = fluxvla(*command, "d.py", "--section", "x")
+    assert ended.code == 2
+    assert "d.py: section 'x' cannot be run: it is no table whose type is a runner" in ended.err
+
+
 def test_a_config_without_sections(fluxvla: Fluxvla, write: Write) -> None:
     write("d.py", "x = 1\n")
     assert fluxvla("config", "check", "d.py").out == "d.py: no problems; sections: none\n"

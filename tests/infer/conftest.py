@@ -217,11 +217,14 @@ class Bench:
         frame = ("start", "observation", "end")
         return [row for row in map(json.loads, lines) if row["event"] not in frame]
 
-    def assert_within_limits(self, start: tuple[float, ...] = HOME) -> None:
-        """Whatever was sent kept every limit, from positions alone."""
-        if not self.arm.sent:
+    def assert_within_limits(
+        self, start: tuple[float, ...] = HOME, sent: list[np.ndarray] | None = None
+    ) -> None:
+        """Whatever was sent, or this part of it, kept every limit, from positions alone."""
+        sent = self.arm.sent if sent is None else sent
+        if not sent:
             return
-        path = np.vstack([start, start, *self.arm.sent])
+        path = np.vstack([start, start, *sent])
         speed = np.diff(path, axis=0) * self.arm.embodiment.rate_hz
         push = np.diff(speed, axis=0) * self.arm.embodiment.rate_hz
         for index, joint in enumerate(self.arm.embodiment.joints):

@@ -317,6 +317,25 @@ def real(make_arm):
 
 
 @pytest.fixture
+def telling(real):
+    """Knows its command, too."""
+
+    class Telling(type(real)):
+        @property
+        def last_action(self):
+            return self.sent[-1] if self.sent else None
+
+    return Telling(realtime=True)
+
+
+@pytest.fixture
+def unstoppable(real):
+    """Has no ``stop`` of its own: nothing but the loop ever commands it."""
+    real.stop = None
+    return real
+
+
+@pytest.fixture
 def gripping(make_waver):
     """Closes the jaw."""
 
@@ -357,22 +376,42 @@ def test_the_next_task_begins_at_the_command_that_holds_the_arm(bench, real, gri
     bench.assert_within_limits()
 
 
-def test_after_a_stop_it_begins_where_the_arm_is_and_goes_on_gripping(bench, real, gripping, asked):
-    bench.arm, bench.policy = real, gripping
+@pytest.mark.parametrize("kind", ["real", "telling"])
+def test_after_a_stop_a_moved_arm_begins_where_it_is_and_goes_on_gripping(
+    bench, gripping, asked, request, kind
+):
+    bench.arm, bench.policy = request.getfixturevalue(kind), gripping
     before = []
 
     def move():
-        before.append(len(real.sent))
-        real.state[0] = 0.9
+        bench.arm.state[0] += 0.25
+        before.extend((len(bench.arm.sent), bench.arm.state[0]))
 
     asked(Acts({"rearm": move}, "1", "rearm", "2"))
     bench.policy.faults[3] = nan
 
     bench.run(task=None, max_publish_step=60)
 
-    first = bench.arm.sent[before[0]]
-    assert first[0] == pytest.approx(0.9, abs=0.01)
-    assert first[2] == pytest.approx(bench.arm.sent[before[0] - 1][2], abs=0.04)
+    count, where = before
+    earlier, later = bench.arm.sent[:count], bench.arm.sent[count:]
+    assert len(later) > 0
+    bench.assert_within_limits(sent=earlier)
+    bench.assert_within_limits((where, *earlier[-1][1:]), later)
+
+
+@pytest.mark.parametrize("kind", ["telling", "unstoppable"])
+def test_after_a_stop_an_arm_that_stayed_begins_at_the_command_that_holds_it(
+    bench, gripping, asked, request, kind
+):
+    """Not where it droops to: that would be a jump of the command."""
+    bench.arm, bench.policy = request.getfixturevalue(kind), gripping
+    asked(Slow("1", "rearm", "2"))
+    bench.policy.faults[3] = nan
+
+    assert bench.run(task=None, max_publish_step=60)["episodes"] == 1
+    ended = len([row for row in bench.trace("001-1") if row["event"] == "command"])
+    assert len(bench.arm.sent) > ended > 10
+    bench.assert_within_limits()
 
 
 def switched_off(arm):

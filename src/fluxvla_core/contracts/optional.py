@@ -49,12 +49,16 @@ class StampsState(Protocol):
 class TellsLastAction(Protocol):
     """An operator that knows what holds its arm, also after a stop: episodes begin from there.
 
-    An arm lags behind what holds it, and a gripper presses: neither is to be let go.
+    An arm lags behind what holds it, and a gripper presses: neither is to be let go. After a stop,
+    a joint further from it than ``safety.trips.HOLD_REACH`` was moved, and begins where it is.
     """
 
     @property
     def last_action(self) -> npt.NDArray[np.float64] | None:
-        """``(dim,)`` the command that the arm has, None if it has none."""
+        """``(dim,)`` the command that the arm has: the last one, or what ``stop`` made of it.
+
+        None if it has none, or one of somebody else's.
+        """
 
 
 class ScalesSpeed(Protocol):

@@ -209,8 +209,9 @@ class Episode:
     def _where(self, state: Array) -> Array:
         """``(D,)`` the command to go on from: the one that holds the arm, else where it is.
 
-        A joint that is far from its command was moved, or the arm was stopped; a gripper always is,
-        because of what it holds.
+        An arm droops; to begin where it droops to would be a jump of its command. A joint that is
+        far from its command was moved, or nobody knows what its stop commanded: that one begins
+        where it is. A gripper is always far, because of what it holds.
         """
         measured = self._plan.robot.state()
         if measured is not None:
@@ -221,6 +222,8 @@ class Episode:
         kept = self._grippers
         if self._held:
             kept = kept | self._tracking.follows(commanded, state)
+        elif self._plan.robot.tells_hold:
+            kept = kept | self._tracking.stayed(commanded, state)
         return np.where(kept, commanded, state[self._columns])
 
     def _observe(self) -> Seen:

@@ -123,6 +123,12 @@ class Robot:
         # Who begins episodes may put the arm elsewhere.
         return None if hasattr(self.operator, "begin_episode") else before
 
+    @property
+    def tells_hold(self) -> bool:
+        """Whether ``commanded`` holds after a stop too: without ``last_action`` an operator's own
+        ``stop`` may have commanded anything."""
+        return _has(self.operator, "last_action") or not self.can_stop
+
     def success(self) -> bool | None:
         """Whether the task is done as of now, where the operator can tell (``task_success``)."""
         tell = getattr(self.operator, "task_success", None)

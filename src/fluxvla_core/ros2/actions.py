@@ -6,12 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import Rejected
+from fluxvla_core.safety.trips import HOLD_REACH
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
-# A joint further than this from its last command (rad, or m) is held where it is: it was blocked,
-# and pushing on would not be a stop.
-HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015}
 
 
 def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
@@ -39,6 +37,7 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
 def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Array) -> Array:
     """The command that holds an arm: the last one, but for joints that were kept from following.
 
+    Such a joint (``HOLD_REACH``) is held where it is: pushing on would be no stop.
     Grippers keep their last command always: what they hold is why they are behind it. A joint may
     have gone on since it was measured; where it can be at its last command by now it is not sent
     back to where it was. One that did not move then is not taken to have moved since.

@@ -19,6 +19,9 @@ Array = npt.NDArray[np.float64]
 PRISMATIC_SHARE = 0.1
 # How much further beyond its limits a gripper may be wanted: pressing is how policies hold things.
 GRIPPER_EXCESS = 4.0
+# A joint further than this from its last command (rad, or m) was blocked, or moved since: it is
+# held where it is, and goes on from there.
+HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015, "gripper": np.inf}
 # Commands that are kept to hold a state against; an older one is too old to say anything.
 _REMEMBERED = 256
 
@@ -91,6 +94,8 @@ class TrackingWatch:
             "gripper": np.inf,
         }
         self._allowed: Array = np.array([allowed[j.kind] for j in embodiment.joints])
+        reach = np.array([HOLD_REACH[j.kind] for j in embodiment.joints])
+        self._reach: Array = np.minimum(self._allowed, reach)
         self._time = settings.tracking_time_s
         self._since: Array = np.full(len(self._names), np.inf)
         self._sent: deque[tuple[float, Array]] = deque(maxlen=_REMEMBERED)
@@ -106,6 +111,10 @@ class TrackingWatch:
     def follows(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which joints, ``(dim,)``, are as near to ``command`` as they must be."""
         return self._error(command, state) <= self._allowed
+
+    def stayed(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which joints, ``(dim,)``, are where ``command`` left them in a stop, droop and all."""
+        return self._error(command, state) <= self._reach
 
     def check(self, state: npt.ArrayLike, measured: float) -> None:
         """Compare where the arm was with the command that it had then.

@@ -83,7 +83,7 @@ def test_only_the_adapter_is_trained_and_saved(tmp_path, base):
     trained = {n for n, p in runner.model.named_parameters() if p.requires_grad}
     assert {n.rpartition("/")[0] for n in found.tensors("optimizer.safetensors")} == trained
     assert all(".lora_" in n or "modules_to_save" in n for n in trained)
-    assert found.json("trainer.json")["left_out"]["sources"] == {"": str(base)}
+    assert found.json("trainer.json")["left_out"]["sources"] == {"": str(latest(base).path)}
     assert len(folders(tmp_path)) == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "checkpoints",
@@ -181,6 +181,51 @@ def test_another_base_is_refused(tmp_path, base):
     shutil.rmtree(moved)
     with pytest.raises(CheckpointError, match="there is no checkpoint at"):
         load_for_inference(TinyVLA(), latest(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("place", ["base", "base/checkpoints/best"])
+def test_the_bases_own_run_may_go_on(tmp_path, base, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(base, "base")
+    best = Path("base/checkpoints/best")
+    best.symlink_to("step-000000002")
+    run("run", init_from=place, lora=LORA, max_steps=2)
+    run("base", "auto", max_steps=3)
+    best.unlink()
+    best.symlink_to("step-000000003")
+    run("run", "auto", init_from=place, lora=LORA, max_steps=4)
+    monkeypatch.chdir("/")
+    alone, acts = TinyVLA(), TinyVLA()
+    load_for_inference(acts, latest(tmp_path / "run"))
+    load_for_inference(alone, Checkpoint.open(export(tmp_path / "run", tmp_path / "policy")))
+    assert latest(tmp_path / "run").step == 4
+    assert all(map(torch.equal, acts.parameters(), alone.parameters()))
+
+
+def test_a_base_is_found_again_where_all_folders_have_moved_or_where_it_is_said_to_be(
+    tmp_path, base, monkeypatch
+):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    shutil.copytree(base, "base")
+    run("run", init_from="base", lora=LORA, max_steps=2)
+    monkeypatch.chdir((tmp_path / "here").rename(tmp_path / "there"))
+    load_for_inference(TinyVLA(), latest("run"))
+    run("run", "auto", init_from="base", lora=LORA, max_steps=3)
+    Path("base").rename("foundation")
+    run("run", "auto", init_from="foundation", lora=LORA, max_steps=4)
+    found = latest("run").json("trainer.json")["left_out"]["sources"]
+    assert found == {"": f"{tmp_path}/there/foundation/checkpoints/step-000000002"}
+
+
+def test_without_an_adapter_a_run_that_goes_on_needs_no_base(tmp_path, base):
+    moved = tmp_path / "base"
+    shutil.copytree(base, moved)
+    run(tmp_path / "whole", init_from=str(moved))
+    run(tmp_path / "cut", init_from=str(moved), max_steps=3)
+    shutil.rmtree(moved)
+    run(tmp_path / "cut", "auto", init_from=str(moved))
+    assert checkpoint_differences(*(folders(tmp_path / d)[-1] for d in ("whole", "cut"))) == []
 
 
 def test_a_base_that_comes_from_nowhere_is_saved(tmp_path):

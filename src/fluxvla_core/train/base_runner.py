@@ -65,7 +65,8 @@ class BaseTrainRunner(TrainRun):
         mixed_precision_dtype: ``bf16``.
         enable_gradient_checkpointing: recompute the model's ``fsdp_units`` in the backward pass.
         compile_blocks: ``torch.compile`` each of the model's ``fsdp_units``.
-        init_from: weights to start from: a checkpoint's folder, a work dir, a safetensors file.
+        init_from: weights to start from: a checkpoint's folder, a work dir, a safetensors file;
+            a run that goes on has its own, or its adapter's base, instead.
         lora: train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
             ``alpha``, ``dropout``, ``modules_to_save``.
         ema_decay: keep averaged weights too, and act with those; None does not.
@@ -193,7 +194,7 @@ class BaseTrainRunner(TrainRun):
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
         from fluxvla_core.train import flops, forward, lora
         from fluxvla_core.train.state import seed_all
-        from fluxvla_core.train.weights import start_from
+        from fluxvla_core.train.weights import base_of, start_from
 
         self._prepare()
         if "model" not in self.cfg:
@@ -204,12 +205,14 @@ class BaseTrainRunner(TrainRun):
             )
         seed_all(self.options.seed)
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
-        options = self.options
-        if options.init_from is not None:
-            start_from(vla, options.init_from)
+        options, before = self.options, self._checkpoint
+        # A run that goes on finds all weights in its checkpoint, but for an adapter's base.
+        place = base_of(before, options.init_from) if before is not None else options.init_from
+        if place is not None:
+            found = start_from(vla, place)
+            if self.lora is not None:
+                vla.__dict__["frozen_source"] = str(found)
         if self.lora is not None:
-            if options.init_from is not None:
-                vla.__dict__["frozen_source"] = options.init_from
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
         self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:

@@ -135,7 +135,7 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     options = lora.LoraOptions.of_checkpoint(checkpoint)
     trained = {name: p.requires_grad for name, p in model.named_parameters()}
     if options is not None:
-        base = saved.get("sources", {}).get("")
+        base = base_of(checkpoint)
         if base is not None:
             start_from(model, base)
             model.__dict__["frozen_source"] = base
@@ -152,27 +152,52 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
             parameter.requires_grad_(trained[name])
 
 
-def start_from(model: nn.Module, place: str | Path) -> None:
+def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
+    """Where the weights are that a checkpoint's adapter stands beside; None if it needs no others.
+
+    They are where they were found, or else, as folders are moved together, at the place that was
+    asked for. A sum tells if they are others by now.
+
+    Args:
+        init_from: the place that is asked for now, which goes first when it is a new one.
+    """
+    if not checkpoint.has(lora.CONFIG):
+        return None
+    asked = checkpoint.json(lora.CONFIG)["base_model_name_or_path"]
+    found = checkpoint.json(TRAINER)["left_out"].get("sources", {}).get("")
+    if asked is None or found is None:
+        return None
+    if init_from not in (None, asked):
+        return init_from
+    return next((place for place in (found, asked) if Path(place).exists()), str(found))
+
+
+def start_from(model: nn.Module, place: str | Path) -> Path:
     """Give a freshly built ``model`` the weights of another training, or of an export.
 
     Args:
         place: a checkpoint's folder, a work dir (its newest one), or a safetensors file.
 
+    Returns:
+        The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
+        ``best``, changes while that run goes on.
+
     Raises:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.
     """
-    path = Path(place)
+    path = Path(place).resolve()
     if path.suffix != ".safetensors":
         checkpoint = Checkpoint.open(path)
         checkpoint.verify()
         load_for_inference(model, checkpoint)
-        return
+        return checkpoint.path
     if not path.is_file():
         raise CheckpointError(f"there are no weights at {path}")
     tensors = read_tensors(path)
     brings = left_out(model).names - set(tensors)
     check_names(tensors, model_tensors(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)
+    return path
 
 
 def _inside(name: str, prefix: str) -> bool:

@@ -270,16 +270,20 @@ def test_a_signal_during_a_stop_ends_a_run_that_would_have_gone_on(bench, asked)
     assert len(bench.policy.asked) == 1
 
 
-def test_a_signal_while_the_record_is_finished_waits_until_it_is_complete(bench, monkeypatch):
+@pytest.mark.parametrize("times", [1, 2])
+def test_signals_while_the_record_is_finished_wait_until_it_is_complete(bench, monkeypatch, times):
     from fluxvla_core.infer.episode_record import EpisodeRecord
 
     close = EpisodeRecord.close
 
     def interrupted(self, *arguments, **named):
-        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGINT)
         return close(self, *arguments, **named)
 
     monkeypatch.setattr(EpisodeRecord, "close", interrupted)
+    # However long the first has been waiting by then.
+    monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 0.0)
 
     with pytest.raises(KeyboardInterrupt):
         bench.run(max_publish_step=5)

@@ -41,8 +41,8 @@ class Interrupts:
     While ``deferred`` is set, the first signal waits for ``check``, which the loop calls at every
     beat, so that no command is cut in half. Otherwise, and for another signal where no beat came
     for ``IMPATIENT_S`` after the first, ``Interrupted`` is raised on the spot. Once the stop has
-    begun (``stopping``), further signals are only counted: nothing may keep the robot from being
-    stopped.
+    begun, or the record of an episode is being finished (``stopping``), further signals are only
+    counted: nothing may keep the robot from being stopped, or the record from being whole.
     """
 
     def __init__(self) -> None:
@@ -79,10 +79,10 @@ class Interrupts:
             raise Interrupted(number)
 
     def resume(self) -> None:
-        """A stop is over and the run goes on: signals count again.
+        """What ``stopping`` was set for is over and the run goes on: signals count again.
 
         Raises:
-            Interrupted: one came during the stop.
+            Interrupted: one came meanwhile.
         """
         self.stopping = False
         if self.signals:

@@ -100,7 +100,8 @@ class Episode:
 
         Raises:
             Exception: what ended it before its time; the robot is stopped by then.
-            Interrupted: a signal ended it; the robot is stopped by then.
+            Interrupted: a signal ended it, and the robot is stopped by then; or one came while
+                its record was finished.
         """
         plan = self._plan
         outcome, problem = "failed", None
@@ -112,6 +113,8 @@ class Episode:
             outcome = self._loop().run()
             self._phase = "hold"
             self._path.brake(self._most_braking())
+            # Signals that come now wait until the record is complete, however many.
+            plan.interrupts.stopping = True
         except Interrupted as error:
             outcome, problem = "interrupted", f"stopped by {error.name}"
             self._stop("interrupt", problem)
@@ -121,11 +124,11 @@ class Episode:
             self._stop(self._rule(error), problem)
             raise
         finally:
-            # A signal that comes now waits until the record is complete.
             summary = self._close(outcome, problem)
             plan.hooks.call("episode_finished", reason=problem or outcome)
             self._phase = "over"
             plan.interrupts.deferred = False
+        plan.interrupts.resume()
         return summary
 
     def hold(self) -> None:

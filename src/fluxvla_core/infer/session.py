@@ -74,7 +74,6 @@ class Session:
             except (SafetyStop, PolicyFailed, NotReady) as error:
                 self._stopped(error)
                 continue
-            self._interrupts.check()
             result = {"episodes": result["episodes"] + 1, **{key: summary[key] for key in _KEPT}}
         if self._failure is not None and self._latch.tripped:
             raise self._failure

@@ -107,6 +107,25 @@ def test_what_is_evaluated_later_leaves_the_trainings_records_alone(run: Fluxvla
     assert Path("work_dirs/c/eval/environment.json").exists()
 
 
+def test_the_resolved_config_of_what_was_evaluated_later_runs_in_the_same_work_dir(
+    run: Fluxvla,
+) -> None:
+    run("--config", "c.py", "--section", "runner")
+    run("--config", "c.py", "--section", "eval")
+    evaluated = Path("work_dirs/c/eval.txt")
+    evaluated.unlink()
+    resolved = Path("work_dirs/c/eval/config.resolved.json")
+    before = resolved.read_text()
+    ended = run("--config", str(resolved), "--section", "eval")
+    assert ended.code == 0, ended.err
+    assert evaluated.exists()
+    assert resolved.read_text() == before
+    assert sorted(path.name for path in resolved.parent.iterdir()) == [
+        "config.resolved.json",
+        "environment.json",
+    ]
+
+
 def test_json_lines(run: Fluxvla) -> None:
     ended = run("--config", "c.py", "--section", "runner", "--log-format", "json")
     records = [json.loads(line) for line in ended.out.splitlines()]
@@ -433,8 +452,12 @@ def test_plugin_files_that_cannot_be_used(
         ("y.toml", "work_dirs/y"),
         ("out/run/config.resolved.json", "out/run"),
         ("out/run/checkpoints/step-000000001/config.resolved.json", "out/run"),
+        ("out/eval/config.resolved.json", "out/eval"),
+        ("trained/eval/config.resolved.json", "trained"),
+        ("trained/other/config.resolved.json", "trained/other"),
         ("other.json", "work_dirs/other"),
     ],
 )
-def test_default_work_dirs(file: str, folder: str) -> None:
-    assert default_work_dir(Path(file)) == Path(folder)
+def test_default_work_dirs(write: Write, file: str, folder: str) -> None:
+    write("trained/config.resolved.json", "{}")
+    assert default_work_dir(Path(file), ["eval", "inference"]) == Path(folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,10 +43,12 @@ def make_plan(
     if file is None:
         raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
     config = apply_overrides(load_config(file), overrides)
-    name = choose_section(config, examine(config, section), section)
+    examined = examine(config, section)
+    name = choose_section(config, examined, section)
     config = _with_settings(config, name, settings or {})
     checked = check_config(config, name)
-    place = Path(work_dir) if work_dir is not None else default_work_dir(Path(file))
+    others = [one for one in examined.sections if one not in examined.trains]
+    place = Path(work_dir) if work_dir is not None else default_work_dir(Path(file), others)
     return Plan(config, name, name in checked.trains, place, checked.uses)
 
 
@@ -100,12 +102,20 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
     )
 
 
-def default_work_dir(file: Path) -> Path:
-    """``work_dirs/<name of the config>``; for a run's resolved config, that run's own folder."""
+def default_work_dir(file: Path, sections: Collection[str] = ()) -> Path:
+    """``work_dirs/<name of the config>``; for a run's resolved config, that run's own work dir.
+
+    Args:
+        sections: those that do not train. In the work dir of a training each leaves its resolved
+            config in a folder of its name.
+    """
     if file.name != CONFIG_FILE:
         return Path("work_dirs") / file.stem
     folder = file.parent
-    return folder.parent.parent if folder.parent.name == "checkpoints" else folder
+    if folder.parent.name == "checkpoints":
+        return folder.parent.parent
+    of_section = folder.name in sections and (folder.parent / CONFIG_FILE).is_file()
+    return folder.parent if of_section else folder
 
 
 def refuse_overwriting(work_dir: Path, resume: str | None) -> None:

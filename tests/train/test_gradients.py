@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.data.order import epoch_order
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.testing.training import (
@@ -51,11 +53,23 @@ def config(kind, batch=4, steep=3, **settings):
     return tree
 
 
-def begin(tree, work_dir):
+class Seen(TinyDataset):
+    """Notes which samples it was asked for."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def get_sample(self, index, epoch):
+        self.asked.append(index)
+        return super().get_sample(index, epoch)
+
+
+def begin(tree, work_dir, dataset):
     context = RunContext(config=tree, section="runner", work_dir=work_dir)
     runner = build_runner_from_cfg(tree["runner"], context)
     runner.run_setup(37)
-    runner.run(TinyDataset())
+    runner.run(dataset)
 
 
 @pytest.mark.parametrize(
@@ -67,11 +81,12 @@ def begin(tree, work_dir):
     ],
 )
 def test_a_gradient_that_is_not_finite_spoils_no_checkpoint(tmp_path, kind, settings):
-    with (
-        unflushed(),
-        pytest.raises(RunFailed, match="the gradient norm is nan at step 3, with loss"),
-    ):
-        begin(config(kind, **settings), tmp_path)
+    dataset = Seen()
+    with unflushed(), pytest.raises(RunFailed) as caught:
+        begin(config(kind, **settings), tmp_path, dataset)
+    first, second = caught.value.what.splitlines()
+    assert first.startswith("the gradient norm is nan at step 3, with loss")
+    assert second == f"    rank 0: samples {dataset.asked[8:12]}"
     assert [p.name for p in folders(tmp_path)] == ["step-000000001", "step-000000002"]
 
 
@@ -94,6 +109,7 @@ def test_strategies_tell_the_norm_without_clipping(tmp_path):
     with unflushed():
         one = config("OneProcessRunner", 4, -1, max_grad_norm=1e9)
         train({"config": one, "work_dir": str(tmp_path / "one")})
+    third = sorted(epoch_order(37, 42, 0)[8:12])
     kinds = ("DDPTrainRunner", "FSDPTrainRunner")
     assert run_ranks(2, two_ranks, tmp_path, kinds) == [0, 0]
     for kind in kinds:
@@ -102,3 +118,6 @@ def test_strategies_tell_the_norm_without_clipping(tmp_path):
         for rank in range(2):
             said = (tmp_path / f"{kind}-{rank}").read_text()
             assert said.startswith("the gradient norm is nan at step 3, with loss")
+            listed = re.findall(r"^    rank (\d): samples \[(\d+), (\d+)\]$", said, re.MULTILINE)
+            assert [rank for rank, *_ in listed] == ["0", "1"]
+            assert sorted(int(i) for _, *ids in listed for i in ids) == third

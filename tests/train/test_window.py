@@ -73,11 +73,16 @@ def test_ids_may_be_a_list_or_missing():
             window.fetch()
 
 
-def test_a_gradient_that_is_not_finite_is_told_from_a_loss():
+def test_a_gradient_that_is_not_finite_names_all_batches_of_its_step():
     window = Window(ONE)
-    add(window, 4, 0.5, norm=float("inf"))
-    with pytest.raises(RunFailed, match=r"the gradient norm is inf at step 4, with loss 0\.5"):
+    add(window, 3, 0.5)
+    add(window, 4, 0.5, 0.5, 0.5, norm=float("inf"), ids=[torch.tensor([7, 9]), [4], None])
+    with pytest.raises(RunFailed) as caught:
         window.fetch()
+    assert caught.value.what == (
+        "the gradient norm is inf at step 4, with loss 0.5\n"
+        "    rank 0: samples [7, 9], samples [4], a batch without sample_ids"
+    )
 
 
 def two_ranks(folder):

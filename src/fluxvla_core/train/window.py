@@ -112,7 +112,7 @@ class Window:
         mean = total(self.world, torch.stack([losses, norms.double(), times, waits]).clone())
         mean /= self.world.size
         if not bool(torch.isfinite(mean[:2]).all()):
-            raise self._not_finite(steps, losses, mean)
+            raise self._not_finite(steps, mean)
         shares = self._by_dataset(steps)
         return [
             StepRecord(
@@ -151,25 +151,33 @@ class Window:
             for row, count in zip(means.tolist(), counts.tolist(), strict=True)
         ]
 
-    def _not_finite(self, steps: list[_Pending], losses: Tensor, mean: Tensor) -> RunFailed:
+    def _not_finite(self, steps: list[_Pending], mean: Tensor) -> RunFailed:
         bad = int((~torch.isfinite(mean[:2])).any(dim=0).nonzero()[0])
         step, loss, norm = steps[bad], mean[0, bad].item(), mean[1, bad].item()
-        named = ""
-        if not math.isfinite(losses[bad].item()):
-            for value, ids in zip(step.losses, step.ids, strict=True):
-                if not math.isfinite(value.item()):
-                    listed = ids.tolist() if isinstance(ids, Tensor) else ids
-                    which = "a batch without sample_ids" if ids is None else f"samples {listed}"
-                    named = f"rank {self.world.rank}: loss {value.item()} on {which}"
-                    break
-        lines = [text for text in texts(self.world, named) if text]
         if math.isfinite(loss):
+            # The norm is of all batches of all ranks: any of them may be the one.
             what = f"the gradient norm is {norm} at step {step.step}, with loss {loss:.6g}"
+            named = f"rank {self.world.rank}: {', '.join(map(_which, step.ids))}"
         else:
             what = f"the loss is {loss} at step {step.step}"
+            named = next(
+                (
+                    f"rank {self.world.rank}: loss {value.item()} on {_which(ids)}"
+                    for value, ids in zip(step.losses, step.ids, strict=True)
+                    if not math.isfinite(value.item())
+                ),
+                "",
+            )
+        lines = [text for text in texts(self.world, named) if text]
         return RunFailed(
             "\n".join([what, *(f"    {line}" for line in lines)]),
             cause="a learning rate that is too high, or samples with wrong or huge values",
             next="look at those samples, or lower the learning rate, and resume from the last "
             "checkpoint, which was saved before this",
         )
+
+
+def _which(ids: Any) -> str:
+    if ids is None:
+        return "a batch without sample_ids"
+    return f"samples {ids.tolist() if isinstance(ids, Tensor) else ids}"

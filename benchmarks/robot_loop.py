@@ -44,7 +44,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fluxvla_aloha.embodiment import START_POSE, aloha_spec
+from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC
 from fluxvla_aloha.runner import AlohaInferenceRunner
@@ -59,6 +59,7 @@ from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 
 RATE_HZ, HORIZON, EXECUTED = 50.0, 200, 25
+START_POSE = start_pose("viperx300")
 LATE_S = 0.002
 GOALS = {"late_share": 0.001, "jitter_p99_ms": 1.0, "copies": 1.05, "jitter": 5.0, "memory": 10.0}
 QUEUE = 2000
@@ -176,7 +177,7 @@ def figures(sent: list[float], late: list[float], policy: TenMillion) -> dict[st
 
 def fluxvla(seconds: float, prompt: float, record: bool = False) -> dict[str, Any]:
     # A starved machine may silence everybody for a while; that is not measured here.
-    robot = AlohaOperator(max_age_s=10.0, max_skew_s=5.0, connect_timeout_s=60.0)
+    robot = AlohaOperator(arms="viperx300", max_age_s=10.0, max_skew_s=5.0, connect_timeout_s=60.0)
     policy, sent = warm_policy(), []
     copies = copies_per_frame(robot)
     publish = robot.publish_action

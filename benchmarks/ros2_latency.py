@@ -120,7 +120,7 @@ def bare(seconds: float) -> dict[str, Any]:
 
 def operator(seconds: float) -> dict[str, Any]:
     # A busy machine may stall everybody for a while; that is not measured here.
-    robot = AlohaOperator(max_age_s=5.0, max_skew_s=1.0)
+    robot = AlohaOperator(arms="viperx300", max_age_s=5.0, max_skew_s=1.0)
     robot.connect()
     # Receipts are monotonic, stamps are not.
     offset = time.time() - time.monotonic()

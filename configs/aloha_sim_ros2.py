@@ -17,7 +17,7 @@ How often it succeeds, over as many cube positions, in real time:
 On a machine that cannot simulate and think in real time, ``--real-time-factor 0.5`` there and
 ``--set inference.operator.real_time_factor=0.5`` here slow both down alike. On a real robot
 ``operator.type`` is ``AlohaOperator``, which has neither this nor ``seed``; ``preset`` has the
-topics of AgileX and of Interbotix.
+topics of AgileX and of Interbotix, ``arms`` the limits.
 """
 
 _base_ = "aloha_sim_transfer.py"
@@ -29,6 +29,7 @@ inference = dict(
         _delete_=True,
         type="AlohaSimROSOperator",
         preset="cobot_magic",
+        arms="viperx300",
         camera_names=("top",),
         height=144,
         width=192,

@@ -102,5 +102,12 @@ inference = dict(
     task_descriptions=TASKS,
     execute_horizon=5,
     max_publish_step=300,
-    operator=dict(type="AlohaSimOperator", camera_names=("top",), height=144, width=192, seed=7),
+    operator=dict(
+        type="AlohaSimOperator",
+        arms="viperx300",
+        camera_names=("top",),
+        height=144,
+        width=192,
+        seed=7,
+    ),
 )

@@ -1,4 +1,4 @@
-"""ALOHA's numbers: order, polarity, and the limits against the simulator's own model."""
+"""ALOHA's numbers: order, polarity, limits of each kind of arms, and the simulator's own model."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from importlib import util
 from pathlib import Path
 
 import pytest
-from fluxvla_aloha.embodiment import ARM_RANGES, GRIPPERS, START_POSE, aloha_spec
+from fluxvla_aloha.arms import ARMS, VIPERX300
+from fluxvla_aloha.embodiment import GRIPPERS, aloha_spec, start_pose
 
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.errors import ConfigError, SpecMismatch
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, check_match
 
 
 def test_fourteen_joints_left_before_right():
@@ -29,8 +31,9 @@ def test_fourteen_joints_left_before_right():
     assert names[7:] == tuple(n.replace("left", "right") for n in names[:7])
 
 
-def test_grippers_say_which_end_is_open():
-    joints = aloha_spec().joints
+@pytest.mark.parametrize("arms", ARMS)
+def test_grippers_say_which_end_is_open(arms):
+    joints = aloha_spec(arms=arms).joints
     grippers = [joints[i] for i in GRIPPERS]
 
     assert [g.kind for g in grippers] == ["gripper", "gripper"]
@@ -38,9 +41,38 @@ def test_grippers_say_which_end_is_open():
     assert {j.kind for i, j in enumerate(joints) if i not in GRIPPERS} == {"revolute"}
 
 
-def test_the_start_pose_is_within_limits():
-    for joint, value in zip(aloha_spec().joints, START_POSE, strict=True):
+@pytest.mark.parametrize("arms", ARMS)
+def test_the_start_pose_is_within_limits(arms):
+    for joint, value in zip(aloha_spec(arms=arms).joints, start_pose(arms), strict=True):
         assert joint.lower <= value <= joint.upper, joint.name
+
+
+@pytest.mark.parametrize(
+    ("arms", "shoulder", "elbow", "wrist", "speed", "acceleration"),
+    [
+        ("arx_x5", (0.0, 3.14), (0.0, 3.14), (-1.57, 1.57), 5.0, 5.0),
+        ("piper", (0.0, 3.14), (-2.967, 0.0), (-1.22, 1.22), 3.0, 5.0),
+    ],
+)
+def test_limits_are_those_of_the_sources(arms, shoulder, elbow, wrist, speed, acceleration):
+    for side in (0, 7):
+        _, second, third, _, fifth, _, _ = aloha_spec(arms=arms).joints[side : side + 7]
+        found = [(joint.lower, joint.upper) for joint in (second, third, fifth)]
+        assert found == [shoulder, elbow, wrist]
+        assert (second.velocity, second.acceleration) == (speed, acceleration)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("viperx300", "arx_x5"), ("arx_x5", "piper"), ("piper", "viperx300")]
+)
+def test_a_policy_for_other_arms_does_not_fit(one, other):
+    with pytest.raises(SpecMismatch, match="joints and their order"):
+        check_match(aloha_spec(arms=one), aloha_spec(arms=other), "policy", "robot")
+
+
+def test_unknown_arms_are_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="unknown arms 'x5'; known are viperx300, arx_x5, piper"):
+        aloha_spec(arms="x5")
 
 
 def test_cameras_and_rate_can_be_given():
@@ -66,6 +98,6 @@ def test_ranges_are_those_of_the_simulated_arm():
         if joint.get("range")
     }
 
-    for name, (lower, upper) in ARM_RANGES.items():
-        assert ranges[name] == pytest.approx([lower, upper], abs=1e-4), name
-    assert math.isclose(ARM_RANGES["waist"][1], math.pi, abs_tol=1e-4)
+    for joint in VIPERX300.joints[:-1]:
+        assert ranges[joint.name] == pytest.approx([joint.lower, joint.upper], abs=1e-4), joint.name
+    assert math.isclose(VIPERX300.joints[0].upper, math.pi, abs_tol=1e-4)

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fluxvla_aloha.arms import ARMS
 from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
-from fluxvla_aloha.embodiment import START_POSE, aloha_spec
+from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.operator import AlohaOperator, fill_command
 from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
 
-from fluxvla_core.build import build_operator_from_cfg
+from fluxvla_core.build import RunContext, build_operator_from_cfg
 from fluxvla_core.errors import ConfigError, LoadFailed, NotReady, Rejected
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, ODOMETRY, TWIST
@@ -21,8 +22,9 @@ from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
 
 __all__ = ["drivers", "lasting_drivers", "ros_domain"]
 
+START_POSE = start_pose("viperx300")
 SMALL = {"height": 48, "width": 64}
-QUICK = {**SMALL, "rate_window_s": 0.0, "connect_timeout_s": 8.0}
+QUICK = {"arms": "viperx300", **SMALL, "rate_window_s": 0.0, "connect_timeout_s": 8.0}
 SPECIFICATION = {
     # The operator of the specification's Aloha config, word for word.
     "type": "AlohaOperator",
@@ -46,15 +48,16 @@ def raw(pose, closed, opened):
     return [*pose[:6], closed + pose[6] * (opened - closed)]
 
 
-def robot(preset=COBOT_MAGIC, depth=False, base=False, **messages):
+def robot(preset=COBOT_MAGIC, depth=False, base=False, pose=START_POSE, ends=None, **messages):
     """Streams and sinks of an ALOHA's drivers, for ``Driver``."""
+    ends = ends or (preset.gripper_closed, preset.gripper_open)
     streams = [
         {
             "topic": state,
             "message": JOINT_STATE,
             "hz": 100,
             "names": list(preset.joints),
-            "positions": raw(START_POSE[:7], preset.gripper_closed, preset.gripper_open),
+            "positions": raw(pose[:7], *ends),
             "follows": command,
         }
         for state, command in zip(preset.states, preset.commands, strict=True)
@@ -168,19 +171,29 @@ class TestConfig:
             ({"joint_names": ("a", "b")}, "joint_names are 7 names of one arm"),
             ({"gripper_closed": 1.0, "gripper_open": 1.0}, "must be different finite numbers"),
             ({"base_max_linear": -1}, "base_max_linear must be positive, got -1"),
+            ({"arms": "x5"}, "unknown arms 'x5'; known are viperx300, arx_x5, piper"),
+            ({"arms": "piper", "embodiment": aloha_spec().to_dict()}, "both say which arms"),
         ],
     )
     def test_values_out_of_range_are_named(self, arguments, what):
         with pytest.raises(ConfigError, match=what):
             AlohaOperator(**arguments)
 
+    @pytest.mark.parametrize("arms", ARMS)
+    def test_arms_that_are_named_have_limits_of_their_own(self, arms):
+        assert AlohaOperator(arms=arms).embodiment == aloha_spec(arms=arms)
+
+    def test_interbotix_sells_one_kind_of_arms(self):
+        assert AlohaOperator(preset="interbotix").embodiment == aloha_spec(arms="viperx300")
+        assert AlohaOperator(preset="interbotix", arms="piper").embodiment.name == "aloha_piper"
+
     def test_other_arms_bring_their_own_limits(self):
         other = aloha_spec().to_dict()
-        other["name"] = "piper"
+        other["name"] = "sawyer"
         other["joints"][0]["upper"] = 2.0
         operator = AlohaOperator(embodiment=other, **SMALL)
 
-        assert operator.embodiment.name == "piper"
+        assert operator.embodiment.name == "sawyer"
         assert operator.embodiment.joints[0].upper == 2.0
         assert operator.embodiment.cameras[0].height == 48
 
@@ -190,6 +203,27 @@ class TestConfig:
 
         with pytest.raises(ConfigError, match="commands two arms of six joints and a gripper"):
             AlohaOperator(embodiment=other)
+
+
+class TestArmsThatNobodyNamed:
+    """A cobot_magic has ARX X5 or PiPER arms behind the same topics."""
+
+    def test_nothing_is_connected(self):
+        context = RunContext(section="go", origins={"go.operator": "robot.py:7"})
+        operator = build_operator_from_cfg(SPECIFICATION, context)
+
+        with pytest.raises(ConfigError, match="which arms this ALOHA has is not known") as caught:
+            operator.connect()
+        assert caught.value.where == "robot.py:7: go.operator"
+        assert "known are viperx300, arx_x5, piper" in caught.value.what
+        assert "set arms='arx_x5' or arms='piper'" in caught.value.next
+
+    @pytest.mark.parametrize("named", [{"arms": "piper"}, {"embodiment": aloha_spec().to_dict()}])
+    def test_once_they_are_named_it_goes_on(self, ros_domain, named):
+        operator = AlohaOperator(**{**QUICK, "arms": None, "connect_timeout_s": 0.1, **named})
+
+        with pytest.raises(NotReady, match="nobody publishes"):
+            operator.connect()
 
 
 class TestMessages:
@@ -281,6 +315,18 @@ class TestCobotMagic:
             wanted = raw(action[7 * index : 7 * index + 7], *ends)
             np.testing.assert_allclose(heard["position"], wanted)
         wait_for(lambda: np.allclose(operator.get_state(), action, atol=1e-9))
+
+    def test_pipers_tell_their_grippers_in_metres(self, connect, drivers):
+        driver = drivers(*robot(pose=start_pose("piper"), ends=(0.0, 0.07)))
+        operator = connect(arms="piper")
+        np.testing.assert_allclose(operator.get_frame().state, start_pose("piper"))
+        action = np.array(start_pose("piper"))
+        action[6], action[13] = 0.0, 0.5
+        operator.send_action(action)
+        wait_for(lambda: all(driver.on(topic) for topic in COBOT_MAGIC.commands))
+
+        heard = [driver.on(topic)[0]["position"][6] for topic in COBOT_MAGIC.commands]
+        np.testing.assert_allclose(heard, [0.0, 0.035])
 
     def test_the_base_stops_by_itself_and_with_every_stop(self, connect, drivers):
         driver = drivers(*robot(base=True))

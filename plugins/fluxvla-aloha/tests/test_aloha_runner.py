@@ -16,6 +16,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import RUNNERS
 
 SPEC = embodiment.aloha_spec(cameras=())
+START_POSE = embodiment.start_pose("viperx300")
 
 
 class Still:
@@ -26,7 +27,7 @@ class Still:
 
     def __init__(self):
         self.clock = SimulatedClock()
-        self.pose = np.array(embodiment.START_POSE)
+        self.pose = np.array(START_POSE)
 
     def connect(self):
         return
@@ -106,9 +107,9 @@ def test_it_goes_to_the_start_pose_if_asked_for(tmp_path):
     operator = Still()
     operator.pose = np.zeros(14)
 
-    run(tmp_path, operator, Closing(1.0), prepare_pose=embodiment.START_POSE)
+    run(tmp_path, operator, Closing(1.0), prepare_pose=START_POSE)
 
-    np.testing.assert_allclose(operator.pose, embodiment.START_POSE, atol=1e-6)
+    np.testing.assert_allclose(operator.pose, START_POSE, atol=1e-6)
 
 
 class Replay:

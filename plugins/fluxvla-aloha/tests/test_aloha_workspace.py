@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fluxvla_aloha.embodiment import START_POSE, aloha_spec
+from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.workspace import AlohaWorkspaceBox
 
 from fluxvla_core.build import build_action_filter_from_cfg
@@ -27,7 +27,7 @@ def test_at_zero_the_arm_is_stretched_forward():
 def test_a_config_builds_one_for_each_arm_and_the_other_arm_is_left_alone(arm, first):
     box = build_action_filter_from_cfg({"type": "AlohaWorkspaceBox", "arm": arm, **BOX})
     box.bind(aloha_spec())
-    pose = np.array(START_POSE)
+    pose = np.array(start_pose("viperx300"))
     box.reset(pose)
     down = pose.copy()
     down[[1, 8]] += 1.0
@@ -38,6 +38,14 @@ def test_a_config_builds_one_for_each_arm_and_the_other_arm_is_left_alone(arm, f
     assert box.chain.position(down[first : first + 6])[2] < BOX["lower"][2]
     others = [column for column in range(14) if not first <= column < first + 6]
     np.testing.assert_array_equal(given[others], down[others])
+
+
+@pytest.mark.parametrize("arms", ["arx_x5", "piper"])
+def test_another_kind_of_arm_is_refused(arms):
+    box = AlohaWorkspaceBox("left", *BOX.values())
+
+    with pytest.raises(ConfigError, match="left_waist"):
+        box.bind(aloha_spec(arms=arms))
 
 
 def test_an_arm_that_is_not_there_is_refused():

@@ -15,6 +15,7 @@ from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.operators import AlohaSimOperator, URSimOperator
+from fluxvla_sim.ros2.operators import AlohaSimROSOperator
 from fluxvla_sim.ur.expert import URExpert
 
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
@@ -47,6 +48,14 @@ def aloha():
     operator.connect()
     yield operator
     operator.close()
+
+
+@pytest.mark.parametrize("kind", [AlohaSimOperator, AlohaSimROSOperator])
+def test_the_simulated_arms_are_known_and_no_others(kind):
+    for operator in (kind(), kind(arms="viperx300")):
+        assert operator.embodiment.joints == aloha_spec(arms="viperx300").joints
+    with pytest.raises(ConfigError, match="has ViperX 300 arms, the config says arms='piper'"):
+        kind(arms="piper")
 
 
 def test_a_command_is_one_control_period(aloha):

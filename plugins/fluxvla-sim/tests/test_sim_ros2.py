@@ -32,7 +32,7 @@ __all__ = ["ros_domain"]
 SMALL = ["--height", "48", "--width", "64", "--camera-hz", "20"]
 # Machines that run tests stall for seconds; where silence is not what is tested, it is forgiven.
 PATIENT = {"height": 48, "width": 64, "connect_timeout_s": 30.0, "max_age_s": 20.0}
-ALOHA = {"camera_names": ("top",), **PATIENT}
+ALOHA = {"arms": "viperx300", "camera_names": ("top",), **PATIENT}
 UR = {"camera_names": ("front",), **PATIENT}
 SILENT_S = 2.0
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_aloha.arms import ARMS
 from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
 from fluxvla_aloha.embodiment import CAMERAS, GRIPPERS, RATE_HZ, aloha_spec
 from fluxvla_aloha.presets import PRESETS
@@ -26,6 +27,9 @@ from fluxvla_core.ros2.streams import (
     camera_stream,
 )
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+
+if TYPE_CHECKING:
+    from fluxvla_core.build import RunContext
 
 Array = npt.NDArray[np.float64]
 SIDES = ("left", "right")
@@ -59,10 +63,14 @@ class AlohaOperator(RosOperator):
             with a field ``cmd`` as Interbotix has, or a std_msgs array or number.
         base_max_linear, base_max_angular: largest speeds of the base, in m/s and rad/s.
         camera_rate_hz: pictures a second that should come; None: as many as are sent.
-        embodiment: in place of ViperX 300 arms, the spec of others (as ``EmbodimentSpec.to_dict``
-            gives it), with seven joints an arm, left first, gripper last.
+        arms: ``viperx300``, ``arx_x5`` or ``piper``: whose limits are kept. The preset
+            ``interbotix`` has the first; with ``cobot_magic`` nobody but you can tell, and without
+            them :meth:`connect` refuses.
+        embodiment: in place of ``arms``, the spec of others (as ``EmbodimentSpec.to_dict`` gives
+            it), with seven joints an arm, left first, gripper last.
         domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
             ``fluxvla_core.ros2.operator.RosOperator``.
+        context: what the run knows (injected).
 
     Raises:
         ConfigError: an unknown preset, or a value out of its range.
@@ -99,6 +107,7 @@ class AlohaOperator(RosOperator):
         base_max_linear: float = 0.3,
         base_max_angular: float = 0.5,
         camera_rate_hz: float | None = None,
+        arms: str | None = None,
         embodiment: Mapping[str, Any] | None = None,
         domain_id: int | None = None,
         connect_timeout_s: float = 10.0,
@@ -106,6 +115,7 @@ class AlohaOperator(RosOperator):
         max_skew_s: float = 0.1,
         sync_on: str = "stamp",
         rate_window_s: float = 1.0,
+        context: RunContext | None = None,
     ) -> None:
         super().__init__(
             domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s
@@ -116,7 +126,10 @@ class AlohaOperator(RosOperator):
         if len(camera_names) > len(CAMERAS):
             raise ConfigError(f"an ALOHA has {len(CAMERAS)} cameras, got {list(camera_names)}")
         cameras = tuple(Camera(name, height, width) for name in camera_names)
-        self.embodiment = _spec(embodiment, cameras, publish_rate)
+        kind = arms or known.arms
+        self._are_known = kind is not None or embodiment is not None
+        self._place = context and context.where(f"{context.section}.operator")
+        self.embodiment = _spec(embodiment, arms, kind, cameras, publish_rate)
         self._images = _given(known.images, img_front_topic, img_left_topic, img_right_topic)
         self._depths = _given(
             known.depths, img_front_depth_topic, img_left_depth_topic, img_right_depth_topic
@@ -136,8 +149,10 @@ class AlohaOperator(RosOperator):
         self._names = tuple(joint_names or known.joints)
         if len(self._names) != _ARM:
             raise ConfigError(f"joint_names are {_ARM} names of one arm, got {list(self._names)}")
-        self._gripper_closed = known.gripper_closed if gripper_closed is None else gripper_closed
-        self._gripper_open = known.gripper_open if gripper_open is None else gripper_open
+        own_ends = None if kind is None else ARMS[kind].gripper_ends
+        closed, opened = own_ends or (known.gripper_closed, known.gripper_open)
+        self._gripper_closed = closed if gripper_closed is None else gripper_closed
+        self._gripper_open = opened if gripper_open is None else gripper_open
         if not 0 < abs(self._gripper_open - self._gripper_closed) < float("inf"):
             raise ConfigError("gripper_closed and gripper_open must be different finite numbers")
         self._arm_message = arm_message or known.arm_message
@@ -149,6 +164,24 @@ class AlohaOperator(RosOperator):
             base_max_linear,
             base_max_angular,
         )
+
+    def connect(self) -> None:
+        """As ``RosOperator`` does it, once it is known which arms are there.
+
+        Raises:
+            ConfigError: nobody said so; nothing is opened.
+        """
+        if not self._are_known:
+            raise ConfigError(
+                "which arms this ALOHA has is not known, and so not within which limits they may "
+                f"move; known are {', '.join(ARMS)}",
+                where=self._place,
+                cause="cobot_magic is sold with ARX X5 and with AgileX PiPER arms, behind the same "
+                "topics",
+                next="look at the arms, then set arms='arx_x5' or arms='piper' in the operator's "
+                "table; others are described with embodiment=dict(…)",
+            )
+        super().connect()
 
     def streams(self) -> Sequence[StreamSpec]:
         found = [
@@ -266,10 +299,17 @@ def _given(preset: Sequence[str], *topics: str | None) -> tuple[str, ...]:
 
 
 def _spec(
-    given: Mapping[str, Any] | None, cameras: tuple[Camera, ...], rate_hz: float
+    given: Mapping[str, Any] | None,
+    arms: str | None,
+    kind: str | None,
+    cameras: tuple[Camera, ...],
+    rate_hz: float,
 ) -> EmbodimentSpec:
+    if given is not None and arms is not None:
+        raise ConfigError("arms and embodiment both say which arms there are; give one of them")
     try:
-        usual = aloha_spec(cameras, rate_hz)
+        # Where nobody said which, nothing moves; a spec there must be.
+        usual = aloha_spec(cameras, rate_hz, kind or "viperx300")
     except ValueError as error:
         raise ConfigError(f"AlohaOperator: {error}") from error
     if given is None:

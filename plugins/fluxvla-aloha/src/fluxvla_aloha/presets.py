@@ -1,7 +1,9 @@
 """Topics and messages of the ALOHAs that are sold: AgileX cobot_magic and Interbotix ALOHA.
 
-Both have the same arms and three cameras; they differ in the names of topics and joints, in the
-raw value of a gripper's ends, and in the messages that command an arm.
+Both have two arms and three cameras. They differ in the names of topics and joints, in the raw
+value of a gripper's ends, in the messages that command an arm, and in the arms: Interbotix takes
+its own ViperX 300; cobot_magic came with ARX X5 (``arx5v.launch`` in its readme) and comes with
+AgileX PiPER arms, and nothing in its messages tells which.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ class Preset:
         joints: names of one arm's six joints and its gripper in joint states.
         gripper_closed, gripper_open: a gripper's raw values at its ends.
         arm_message, gripper_message: types of the commands.
+        arms: name of its arms in ``fluxvla_aloha.arms``; None where it comes with different ones.
     """
 
     images: tuple[str, str, str]
@@ -38,6 +41,7 @@ class Preset:
     gripper_open: float
     arm_message: str = JOINT_STATE
     gripper_message: str = JOINT_STATE
+    arms: str | None = None
 
 
 COBOT_MAGIC = Preset(
@@ -96,6 +100,7 @@ INTERBOTIX = Preset(
     gripper_open=1.6214,
     arm_message="interbotix_xs_msgs.msg:JointGroupCommand",
     gripper_message="interbotix_xs_msgs.msg:JointSingleCommand",
+    arms="viperx300",
 )
 
 PRESETS: Mapping[str, Preset] = {"cobot_magic": COBOT_MAGIC, "interbotix": INTERBOTIX}

@@ -11,8 +11,9 @@ from fluxvla_core.infer.base_runner import BaseInferenceRunner
 class AlohaInferenceRunner(BaseInferenceRunner):
     """Runs a policy on an ALOHA, or on any operator whose embodiment the policy was trained for.
 
-    Everything is ``BaseInferenceRunner``'s: ``prepare_pose`` (``fluxvla_aloha.embodiment`` has
-    ``START_POSE``), ``execute_horizon``, ``gripper_threshold`` and the rest.
+    Everything is ``BaseInferenceRunner``'s: ``prepare_pose`` (``start_pose`` of
+    ``fluxvla_aloha.embodiment`` has one for each kind of arms), ``execute_horizon``,
+    ``gripper_threshold`` and the rest.
     """
 
     api: ClassVar[str] = "1.0"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar
 
-from fluxvla_aloha.embodiment import ARM_RANGES
+from fluxvla_aloha.arms import VIPERX300
 from fluxvla_core.control.workspace import WorkspaceBox
 from fluxvla_core.errors import ConfigError
 
@@ -47,5 +47,5 @@ class AlohaWorkspaceBox(WorkspaceBox):
     ) -> None:
         if arm not in ("left", "right"):
             raise ConfigError(f"AlohaWorkspaceBox: arm is 'left' or 'right', got {arm!r}")
-        names = [f"{arm}_{name}" for name in ARM_RANGES]
+        names = [f"{arm}_{joint.name}" for joint in VIPERX300.joints[:-1]]
         super().__init__(lower, upper, names, links=LINKS, tool=tool)

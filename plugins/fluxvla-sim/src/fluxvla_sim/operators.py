@@ -36,6 +36,22 @@ def sim_cameras(
     return tuple(Camera(name, height, width) for name in names)
 
 
+def check_arms(arms: str) -> None:
+    """Refuse arms that the simulated ALOHA does not have.
+
+    Args:
+        arms: as ``AlohaOperator`` takes it.
+
+    Raises:
+        ConfigError: they are no ViperX 300.
+    """
+    if arms != "viperx300":
+        raise ConfigError(
+            f"the simulated ALOHA has ViperX 300 arms, the config says arms={arms!r}",
+            next="set arms='viperx300'",
+        )
+
+
 class AlohaSimOperator(SimOperator):
     """gym-aloha's scenes: two ViperX 300 S arms, 50 Hz.
 
@@ -47,9 +63,10 @@ class AlohaSimOperator(SimOperator):
         height, width: of every picture, in pixels.
         realtime: follow the wall clock instead of simulated time.
         render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
+        arms: ``viperx300``, as a real ALOHA's config says it.
 
     Raises:
-        ConfigError: an unknown task, camera or way to render.
+        ConfigError: an unknown task, camera or way to render, or other arms.
     """
 
     def __init__(
@@ -61,7 +78,9 @@ class AlohaSimOperator(SimOperator):
         width: int = 640,
         realtime: bool = False,
         render: str = "cheap",
+        arms: str = "viperx300",
     ) -> None:
+        check_arms(arms)
         check_render(render)
         cameras = sim_cameras(ALOHA, camera_names, height, width)
         super().__init__(ALOHA, task, cameras, seed, realtime, render)

@@ -26,6 +26,7 @@ from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.ros2.operator import RosOperator
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.streams import CAMERA, SIDE, STATE, CommandSpec, StreamSpec
+from fluxvla_sim.operators import check_arms
 from fluxvla_sim.ros2.clock import SlowedClock
 
 log = logging.getLogger("fluxvla.sim")
@@ -220,7 +221,20 @@ class InSimulation(RosOperator):
 
 
 class AlohaSimROSOperator(InSimulation, AlohaOperator):
-    """``AlohaOperator`` on ``fluxvla sim aloha --ros2``."""
+    """``AlohaOperator`` on ``fluxvla sim aloha --ros2``.
+
+    Args:
+        arms: ``viperx300``, as a real ALOHA's config says it.
+        **kwargs: as ``InSimulation`` and ``AlohaOperator`` take them.
+
+    Raises:
+        ConfigError: other arms, or a value that is impossible.
+    """
+
+    def __init__(self, arms: str = "viperx300", **kwargs: Any) -> None:
+        check_arms(arms)
+        # One of the two says which arms there are.
+        super().__init__(arms=None if kwargs.get("embodiment") else arms, **kwargs)
 
 
 class URSimROSOperator(InSimulation, UROperator):

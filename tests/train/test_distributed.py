@@ -102,7 +102,7 @@ def test_devices_that_are_not_there_are_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setenv("LOCAL_RANK", "1")
-    with pytest.raises(ConfigError, match="process 2 .* no GPU of its own: torch sees 1") as found:
+    with pytest.raises(ConfigError, match=r"process 2 .* no GPU of its own: torch sees 1") as found:
         start("auto")
     assert "--nproc 1, or device='cpu'" in str(found.value)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -139,6 +140,40 @@ def test_an_arm_that_fails_while_it_is_held_stops_the_run(bench, make_arm, asked
         bench.run(task=None, max_publish_step=10)
     assert bench.arm.calls[-2:] == ["stop", "close"]
     assert bench.episode("001-1")["outcome"] == "max_steps"
+
+
+def test_what_stops_an_arm_between_two_tasks_is_recorded_with_the_one_before(
+    bench, make_arm, asked
+):
+    bench.arm = make_arm(realtime=True)
+    asked(Slow("1", "2", polls=1000))
+    bench.arm.faults = {"send_action": OSError("cable pulled"), "after": 25}
+    stop = bench.arm.stop
+    bench.arm.stop = lambda: (stop(), 1 / 0)
+
+    with pytest.raises(Faulted, match="cable pulled"):
+        bench.run(task=None, max_publish_step=10)
+    (line,) = (bench.work_dir / "inference" / "001-1" / "held.jsonl").read_text().splitlines()
+    found = json.loads(line)
+    assert found["rule"] == "operator"
+    assert found["what"] == "Arm.send_action raised OSError: cable pulled"
+    assert found["failure"] == "Arm.stop raised ZeroDivisionError: division by zero"
+    assert time.time() - found["time"] < 600
+    assert bench.episode("001-1")["trips"] == []
+
+
+def test_a_trip_that_cannot_be_recorded_is_said_and_stops_all_the_same(
+    bench, make_arm, asked, monkeypatch
+):
+    monkeypatch.setattr("fluxvla_core.record.held.LINES", "there/is/no/such/folder")
+    bench.arm = make_arm(realtime=True)
+    asked(Slow("1", "2", polls=1000))
+    bench.arm.faults = {"send_action": OSError("cable pulled"), "after": 25}
+
+    with pytest.raises(Faulted, match="cable pulled"):
+        bench.run(task=None, max_publish_step=10)
+    assert any("a trip could not be recorded" in line for line in bench.notes.lines)
+    assert bench.arm.calls[-2:] == ["stop", "close"]
 
 
 def test_after_a_stop_nothing_moves_until_the_word_is_said(bench, make_arm, asked):

@@ -49,6 +49,15 @@ def test_a_complete_work_dir(complete: Path) -> None:
     assert facts.dataset["total_episodes"] == 240
 
 
+def test_what_stopped_the_arm_after_an_episode_is_among_its_notes(complete: Path) -> None:
+    (folder,) = (complete / "inference").iterdir()
+    trip = {"time": 1.0, "rule": "tracking", "what": "waist is away", "at": 2.0, "failure": None}
+    (folder / "held.jsonl").write_text(json.dumps(trip) + "\n")
+
+    (episode,) = read_facts(complete).episodes
+    assert episode.notes["trips while it was held"] == "tracking: waist is away"
+
+
 def test_an_empty_work_dir(tmp_path: Path) -> None:
     facts = read_facts(tmp_path)
     assert facts.training is None

@@ -7,6 +7,7 @@ obeys, and the operator's own ``stop`` is called where something went wrong.
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from fluxvla_core.infer.episode_record import EpisodeRecord
 from fluxvla_core.infer.plan import Answer, Plan, PolicyFailed
 from fluxvla_core.infer.reading import Reader, Reading
 from fluxvla_core.infer.tasks import Task
+from fluxvla_core.record.held import note_trip
 from fluxvla_core.record.replay_policy import ENDED, RecordingEnded
 from fluxvla_core.safety.limits import Limiter
 from fluxvla_core.safety.ramp import ramp
@@ -134,7 +136,8 @@ class Episode:
     def hold(self) -> None:
         """Send the last command once more, at the next beat: after an episode that ended well.
 
-        What goes wrong meanwhile trips the latch, and the robot is stopped.
+        What goes wrong meanwhile trips the latch, and the robot is stopped; it is noted beside the
+        record, which is complete.
 
         Raises:
             SafetyStop: the latch was tripped, or the arm does not stay.
@@ -144,11 +147,7 @@ class Episode:
         try:
             self._path.hold()
         except FluxError as error:
-            if self._plan.latch.tripped is None:
-                self._plan.latch.trip(self._rule(error), error)
-            failure = self._plan.robot.stop()
-            if failure:
-                self._plan.context.reporter.warn(failure)
+            self._stop_held(error)
             raise
         if self._rate.beats == beats:
             # A runner's own sending that has no beat of the rate's.
@@ -364,6 +363,18 @@ class Episode:
             plan.context.reporter.warn(failure)
         seconds = plan.robot.clock.now() - began
         self._record.event("stop", rule=rule, problem=problem, seconds=seconds, failure=failure)
+
+    def _stop_held(self, error: FluxError) -> None:
+        plan = self._plan
+        if plan.latch.tripped is None:
+            plan.latch.trip(self._rule(error), error)
+        failure = plan.robot.stop()
+        if failure:
+            plan.context.reporter.warn(failure)
+        try:
+            note_trip(self._folder, **asdict(plan.latch.trips[-1]), failure=failure)
+        except RunFailed as problem:
+            plan.context.reporter.warn(str(problem))
 
     def _most_braking(self) -> int:
         limiter = self._limiter

@@ -10,6 +10,7 @@ from typing import Any
 
 from fluxvla_core.errors import FluxError
 from fluxvla_core.record import tally
+from fluxvla_core.record.held import LINES as HELD
 from fluxvla_core.record.logs import LINES
 from fluxvla_core.record.recording import bag_of, is_recording, read_bag
 from fluxvla_core.record.trace import SUMMARY
@@ -57,7 +58,10 @@ def _episode(reader: Reader, folder: Path) -> Episode:
         phases=phases(events, first),
         chunks=[number(e.get("t")) - first for e in events if e.get("event") == tally.CHUNK],
         stops=stops(events, first),
-        notes=_notes(summary, start),
+        notes={
+            **_notes(summary, start),
+            "trips while it was held": _trips(reader.lines(folder / HELD)),
+        },
     )
 
 
@@ -87,7 +91,7 @@ def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
         "seed": summary.get("seed"),
         "beats that were skipped": summary.get("skipped_beats"),
         "beats without a chunk, held": summary.get("held_beats"),
-        "trips": "; ".join(_trip(row) for row in summary.get("trips", [])),
+        "trips": _trips(summary.get("trips", [])),
         "clamped commands": clamp_counts(summary.get("clamps")),
         "not recorded": ", ".join(f"{count} {what}" for what, count in dropped.items()),
     }
@@ -179,6 +183,10 @@ def clamp_counts(clamps: Any) -> str:
 def _entry(values: Any, column: int) -> float:
     known = isinstance(values, list) and column < len(values)
     return number(values[column]) if known else float("nan")
+
+
+def _trips(rows: Sequence[Any]) -> str:
+    return "; ".join(map(_trip, rows))
 
 
 def _trip(row: Any) -> str:

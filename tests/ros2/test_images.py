@@ -173,6 +173,42 @@ class TestCompressed:
 
         np.testing.assert_allclose(images.to_depth(sent, 1, 2), [[np.nan, 1.5]], rtol=1e-6)
 
+    @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "mono8"])
+    @pytest.mark.parametrize(("form", "off"), [("png", 0), ("jpeg", 4)])
+    def test_colours_come_back(self, encoding, form, off):
+        pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+        rgb = np.full((48, 64, 3), (200, 100, 50), np.uint8)
+        sent = {"bgr8": rgb[..., ::-1], "mono8": rgb[..., 0]}.get(encoding, rgb)
+        sent = np.dstack([sent, sent[..., 0]]) if encoding == "rgba8" else sent
+        wanted = rgb[..., :1] if encoding == "mono8" else rgb
+        message = images.fill_compressed(SimpleNamespace(), sent, encoding, form)
+
+        assert message.format == f"{encoding}; {form} compressed bgr8"
+        assert type(message.data) is array.array, "others are converted byte by byte"
+        assert len(message.data) < rgb.size
+        got = images.to_rgb(message, 48, 64)
+        assert np.abs(got.astype(int) - wanted).max() <= off
+
+    def test_depth_comes_back(self):
+        pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+        depth = np.array([[0, 1500]], np.uint16)
+        message = images.fill_compressed(SimpleNamespace(), depth, "16UC1", "png")
+
+        np.testing.assert_allclose(images.to_depth(message, 1, 2), [[np.nan, 1.5]], rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("pixels", "encoding", "form", "what"),
+        [
+            (colours(), "rgb8", "gif", "unknown form 'gif'; there are jpeg, png"),
+            (colours(), "bgra8", "png", r"bgra8 needs uint8 of shape \(4, 6, 4\)"),
+            (np.ones((2, 2), np.uint16), "16UC1", "jpeg", "jpeg cannot hold 16UC1; png can"),
+            (np.ones((2, 2), np.float32), "32FC1", "png", "png cannot hold 32FC1; png can"),
+        ],
+    )
+    def test_what_cannot_be_packed_is_refused(self, pixels, encoding, form, what):
+        with pytest.raises(ValueError, match=what):
+            images.fill_compressed(SimpleNamespace(), pixels, encoding, form)
+
     def test_a_compressed_picture_has_a_size_too(self):
         with pytest.raises(BadMessage, match="sends 6x4 pictures, the embodiment says 6x8"):
             images.to_rgb(self.packed(colours(), ".png", "png"), 8, 6)
@@ -202,3 +238,5 @@ class TestCompressed:
             images.to_rgb(sent, 4, 6)
 
         assert caught.value.next.startswith("pip install opencv-python-headless")
+        with pytest.raises(LoadFailed, match="compressed pictures are to be sent, and OpenCV"):
+            images.fill_compressed(SimpleNamespace(), colours(), "rgb8")

@@ -36,10 +36,27 @@ def test_missing_topics_are_named_with_those_that_exist(operators, drivers):
 
 def test_another_type_is_named(operators, drivers):
     packed = "sensor_msgs.msg:CompressedImage"
-    drivers([STATE, {**PICTURES, "message": packed, "format": "jpg"}], [COMMANDS])
+    drivers([STATE, {**PICTURES, "message": packed, "format": "jpeg"}], [COMMANDS])
     error = refusal_of(operators)
 
     assert error.what.startswith("cam (/cam/image) is published as sensor_msgs/msg/CompressedImage")
+
+
+@pytest.mark.parametrize(("form", "off"), [("jpeg", 4), ("png", 0)])
+def test_compressed_pictures_are_read(operators, drivers, monkeypatch, form, off):
+    topic = "/cam/image/compressed"
+    monkeypatch.setattr(
+        Arm,
+        "streams",
+        lambda _: [StreamSpec("arm", "/arm/state", JOINT_STATE), camera_stream(CAM, topic)],
+    )
+    packed = "sensor_msgs.msg:CompressedImage"
+    drivers([STATE, {**PICTURES, "topic": topic, "message": packed, "format": form}], [COMMANDS])
+    operator = operators()
+    operator.connect()
+
+    seen = operator.get_frame().images["cam"]
+    assert np.abs(seen.astype(int) - [10, 20, 30]).max() <= off
 
 
 def test_a_publisher_that_never_sends_is_named(operators, drivers):

@@ -34,6 +34,8 @@ _DEPTH: Mapping[str, type[np.generic]] = {
     "32FC1": np.float32,
 }
 _MILLIMETRE = np.float32(1e-3)
+# What OpenCV makes, by the name that a CompressedImage's format has for it.
+_PACKED = ("jpeg", "png")
 # image_transport's compressedDepth puts its parameters (one enum, two floats) before the PNG.
 _DEPTH_HEADER = 12
 
@@ -142,6 +144,59 @@ def fill(message: Any, pixels: npt.NDArray[Any], encoding: str) -> Any:
     Raises:
         ValueError: the array does not fit the encoding.
     """
+    channels = _check_array(pixels, encoding)
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(pixels).data.cast("B"))
+    message.height, message.width = pixels.shape[:2]
+    message.encoding = encoding
+    message.step = pixels.shape[1] * channels * pixels.dtype.itemsize
+    message.is_bigendian = 0 if np.little_endian else 1
+    message.data = data
+    return message
+
+
+def fill_compressed(
+    message: Any, pixels: npt.NDArray[Any], encoding: str, form: str = "jpeg"
+) -> Any:
+    """Put pixels, as :func:`fill` takes them, into a ``CompressedImage``; returns the message.
+
+    ``header`` is left alone.
+
+    Args:
+        form: ``jpeg``, which loses a little, or ``png``, which does not; millimetres (``16UC1``)
+            are only ever ``png``.
+
+    Raises:
+        ValueError: the array does not fit the encoding, or the form cannot hold it.
+        LoadFailed: OpenCV is not installed.
+    """
+    channels = _check_array(pixels, encoding)
+    if form not in _PACKED:
+        raise ValueError(f"unknown form {form!r}; there are {', '.join(_PACKED)}")
+    if encoding in _COLOUR:
+        shaped = pixels.reshape(*pixels.shape[:2], channels)
+        # OpenCV has blue first.
+        pixels = shaped[..., _COLOUR[encoding][1][::-1]]
+        message.format = f"{encoding}; {form} compressed bgr8"
+    elif pixels.dtype == np.uint16 and form == "png":
+        message.format = "16UC1; png compressed"
+    else:
+        raise ValueError(f"{form} cannot hold {encoding}; png can hold 16UC1")
+    cv2 = _opencv("compressed pictures are to be sent", "send them uncompressed")
+    done, packed = cv2.imencode(f".{form}", np.ascontiguousarray(pixels))
+    if not done:
+        raise ValueError(f"OpenCV makes no {form} of {encoding} {pixels.shape}")
+    message.data = array.array("B", packed.tobytes())
+    return message
+
+
+def is_compressed(message: Any) -> bool:
+    """Whether the message is a ``CompressedImage`` (those say ``format``, not ``encoding``)."""
+    return hasattr(message, "format") and not hasattr(message, "encoding")
+
+
+def _check_array(pixels: npt.NDArray[Any], encoding: str) -> int:
+    """How many channels an encoding has; raises ValueError if the array does not fit it."""
     if encoding not in _COLOUR and encoding not in _DEPTH:
         raise ValueError(f"unknown encoding {encoding!r}")
     channels = _COLOUR[encoding][0] if encoding in _COLOUR else 1
@@ -151,19 +206,7 @@ def fill(message: Any, pixels: npt.NDArray[Any], encoding: str) -> Any:
         raise ValueError(
             f"{encoding} needs {dtype} of shape {wanted}, got {pixels.dtype} {pixels.shape}"
         )
-    data = array.array("B")
-    data.frombytes(np.ascontiguousarray(pixels).data.cast("B"))
-    message.height, message.width = pixels.shape[:2]
-    message.encoding = encoding
-    message.step = pixels.shape[1] * channels * dtype.itemsize
-    message.is_bigendian = 0 if np.little_endian else 1
-    message.data = data
-    return message
-
-
-def is_compressed(message: Any) -> bool:
-    """Whether the message is a ``CompressedImage`` (those say ``format``, not ``encoding``)."""
-    return hasattr(message, "format") and not hasattr(message, "encoding")
+    return channels
 
 
 def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) -> None:
@@ -176,13 +219,7 @@ def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) 
 
 
 def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
-    try:
-        import cv2
-    except ImportError as error:
-        raise LoadFailed(
-            f"{source} sends compressed pictures, and OpenCV is not installed ({error})",
-            next="pip install opencv-python-headless, or name the uncompressed topic",
-        ) from error
+    cv2 = _opencv(f"{source} sends compressed pictures", "name the uncompressed topic")
     data = np.frombuffer(message.data, np.uint8)
     if colour:
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
@@ -202,3 +239,14 @@ def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
         f"{source} sends a compressed picture ({message.format!r}, {data.size} bytes) "
         "that cannot be decoded"
     )
+
+
+def _opencv(why: str, instead: str) -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise LoadFailed(
+            f"{why}, and OpenCV is not installed ({error})",
+            next=f"pip install opencv-python-headless, or {instead}",
+        ) from error
+    return cv2

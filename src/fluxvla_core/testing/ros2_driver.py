@@ -36,7 +36,7 @@ class Driver:
     Args:
         streams: what it publishes. Each has ``topic``, ``message`` (type), ``hz``, and, by type:
             ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
-            (Image), ``format`` (CompressedImage, a JPEG or PNG of the same), ``data`` (std_msgs),
+            (Image), ``format`` (CompressedImage: ``jpeg`` or ``png``), ``data`` (std_msgs),
             ``follows`` (a sink's topic: the last command there is where its joints are, in the
             order of ``command_names`` if it has none);
             ``best_effort`` and ``latched`` say how; ``stamped: false`` leaves stamps at zero.
@@ -180,17 +180,9 @@ def _fill_picture(message: Any, spec: dict[str, Any]) -> None:
     size = spec.get("height", 48), spec.get("width", 64)
     cached = spec.get("cached")
     if cached is None or cached[0] != (size, encoding):
-        pixels = picture(*size, encoding)
-        if "format" in spec:
-            import cv2
-
-            done, packed = cv2.imencode(f".{spec['format']}", pixels[..., ::-1])
-            assert done
-            pixels = packed
-        cached = spec["cached"] = ((size, encoding), pixels)
+        cached = spec["cached"] = ((size, encoding), picture(*size, encoding))
     if "format" in spec:
-        message.format = spec["format"]
-        message.data = cached[1].tobytes()
+        images.fill_compressed(message, cached[1], encoding, spec["format"])
     else:
         images.fill(message, cached[1], encoding)
 

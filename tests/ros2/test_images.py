@@ -73,6 +73,14 @@ def test_millimetres_become_metres_and_nothing_becomes_nan(order):
     np.testing.assert_allclose(got, [[np.nan, 1.5], [65.535, 0.001]], rtol=1e-6)
 
 
+def test_every_millimetre_is_there_and_back():
+    sent = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+
+    metres = images.to_depth(message(sent, "16UC1"), 256, 256)
+
+    np.testing.assert_array_equal(images.to_millimetres(metres), sent)
+
+
 def test_metres_stay_metres():
     sent = np.array([[0.5, np.nan]], np.float32)
 

@@ -21,7 +21,7 @@ from fluxvla_sim.ur.scene import HOME as UR_HOME
 from fluxvla_ur.operator import UROperator
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, NotReady
+from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.trouble import Stale
@@ -82,10 +82,11 @@ def connect(ros_domain):
 
 @pytest.fixture
 def topics(ros_domain):
-    """The simulation's own topics: ``facts()`` and ``tell(topic, value)``."""
+    """The simulation's own topics: ``facts()``, ``tell(topic, value)``; ``listen`` to any."""
     connection = Connection("test")
     text = message_class("std_msgs.msg:String")
     kinds = {"/sim/reset": message_class("std_msgs.msg:Int64"), "/sim/fault": text}
+    kinds["/sim/speed_scaling"] = message_class("std_msgs.msg:Float64")
     stream = connection.subscribe("facts", "/sim/facts", text, 1)
     publishers = {topic: connection.publisher(topic, cls) for topic, cls in kinds.items()}
 
@@ -97,7 +98,17 @@ def topics(ros_domain):
         wait_for(stream.newest)
         return json.loads(stream.newest().message.data)
 
-    yield SimpleNamespace(tell=tell, facts=facts)
+    def listen(topic, kind, kept=400):
+        # Not a stream of ours: that leaves out what comes twice or late.
+        heard = deque(maxlen=kept)
+
+        def keep(message):
+            heard.append(message)
+
+        connection.node.create_subscription(message_class(kind), topic, keep, kept)
+        return heard
+
+    yield SimpleNamespace(tell=tell, facts=facts, listen=listen)
     connection.close()
 
 
@@ -108,6 +119,12 @@ def drive(operator, target, arrived, steps=100, hz=50.0):
         operator.send_action(start + share * (target - start))
         time.sleep(1.0 / hz)
     wait_for(lambda: arrived(operator.get_state()))
+
+
+def stamps(messages):
+    """Seconds, oldest first."""
+    found = [message.header.stamp for message in list(messages)]
+    return [stamp.sec + stamp.nanosec * 1e-9 for stamp in found]
 
 
 def says(operator, what=""):
@@ -139,6 +156,41 @@ class TestAloha:
         topics.tell("/sim/reset", 3)
         wait_for(lambda: np.allclose(operator.get_state(), HOME, atol=0.02))
         wait_for(lambda: topics.facts()["steps"] == 0)
+
+    def test_it_has_depth_and_a_base_which_a_stop_stops(
+        self, simulate, connect, topics, monkeypatch
+    ):
+        # It would end a speed too, a quarter of a second after it was asked for.
+        monkeypatch.setattr(AlohaOperator, "_tick", lambda operator: None)
+        simulate("aloha", "--ros2", "--cameras", "top")
+        speeds = topics.listen("/cmd_vel", "geometry_msgs.msg:Twist")
+        operator = connect(AlohaOperator, use_depth_image=True, use_robot_base=True, **ALOHA)
+        frame = operator.get_frame()
+        assert 0.4 < np.nanmin(frame.depths["top"]) < np.nanmax(frame.depths["top"]) < 0.9
+        assert frame.base.tolist() == [0.0, 0.0]
+
+        def drives():
+            operator.drive(0.2, -0.1)
+            time.sleep(0.02)
+            return np.allclose(operator.get_frame().base, [0.2, -0.1])
+
+        wait_for(drives)
+        wait_for(lambda: drives() and operator.newest("base").message.pose.pose.position.x > 0.05)
+        operator.stop()
+        wait_for(lambda: speeds and speeds[-1].linear.x == speeds[-1].angular.z == 0.0)
+        wait_for(lambda: operator.get_frame().base.tolist() == [0.0, 0.0])
+
+    def test_states_come_as_often_and_as_late_as_they_are_to(self, simulate, topics):
+        simulate("aloha", "--ros2", "--cameras", "top", "--state-hz", "200",
+                 "--latency", "left arm=3")  # fmt: skip
+        kind = "sensor_msgs.msg:JointState"
+        left, right = (topics.listen(f"/puppet/joint_{side}", kind) for side in ("left", "right"))
+        wait_for(lambda: min(len(left), len(right)) == left.maxlen, 60.0)
+        delayed, prompt = stamps(left), stamps(right)
+        assert prompt[-1] - delayed[-1] > 2.5
+        # A machine that stalls says fewer; 50 Hz would be 20 ms.
+        assert 0.004 < np.mean(np.diff(prompt)) < 0.015
+        assert (np.diff(delayed) > 0).all()
 
     def test_a_stream_that_is_made_ill_is_named_and_may_get_well(self, simulate, connect, topics):
         simulate("aloha", "--ros2", "--cameras", "top")
@@ -249,6 +301,21 @@ class TestUR5e:
         drive(operator, target, lambda state: (abs(state - target) < allowed).all())
         assert topics.facts()["tasks"]["lift_cube"]["success"] is False
 
+    def test_its_speed_slider_is_moved_and_its_cameras_have_depth(self, simulate, connect, topics):
+        simulate("ur5e", "--ros2", "--cameras", "front", "--speed-scaling", "40")
+        operator = connect(UROperator, publish_rate=50.0, use_depth_image=True, **UR)
+        frame = operator.get_frame()
+        assert 0.3 < np.nanmin(frame.depths["front"]) < np.nanmax(frame.depths["front"]) < 2.0
+        assert operator.speed_scaling == 0.4
+        operator.send_action(UR_HOME)
+        topics.tell("/sim/speed_scaling", 0.0)
+        wait_for(lambda: operator.speed_scaling == 0.0)
+        with pytest.raises(Faulted, match="paused"):
+            operator.send_action(UR_HOME)
+        topics.tell("/sim/speed_scaling", 100.0)
+        wait_for(lambda: operator.speed_scaling == 1.0)
+        operator.send_action(UR_HOME)
+
 
 @pytest.mark.realtime
 class TestInSimulation:
@@ -302,18 +369,10 @@ class TestInSimulation:
 @pytest.mark.realtime
 def test_every_fault_reaches_whoever_listens(simulate, topics):
     simulate("aloha", "--ros2", "--cameras", "top")
-    connection = Connection("listener")
-    kind = message_class("sensor_msgs.msg:JointState")
-    kept = deque(maxlen=12)
-    # Not a stream of ours: that leaves out what comes twice or late.
-    connection.node.create_subscription(kind, "/puppet/joint_left", lambda m: kept.append(m), 12)
-
-    def stamps():
-        found = [message.header.stamp for message in list(kept)]
-        return [stamp.sec + stamp.nanosec * 1e-9 for stamp in found]
+    kept = topics.listen("/puppet/joint_left", "sensor_msgs.msg:JointState", 12)
 
     def late():
-        return time.time() - stamps()[-1]
+        return time.time() - stamps(kept)[-1]
 
     def silent():
         kept.clear()
@@ -324,20 +383,17 @@ def test_every_fault_reaches_whoever_listens(simulate, topics):
         return lambda: len(kept) == 12 and check()
 
     shows = {
-        "freeze": full(lambda: len(set(stamps())) == 1),
+        "freeze": full(lambda: len(set(stamps(kept))) == 1),
         "drop": silent,
         "delay:3": full(lambda: late() > 2.5),
         "nan": full(lambda: np.isnan(kept[-1].position).all()),
-        "duplicate": full(lambda: len(set(stamps())) <= 7),
-        "out_of_order": full(lambda: (np.diff(stamps()) < 0).sum() >= 5),
+        "duplicate": full(lambda: len(set(stamps(kept))) <= 7),
+        "out_of_order": full(lambda: (np.diff(stamps(kept)) < 0).sum() >= 5),
         "clock:-100": full(lambda: late() > 90),
     }
-    try:
-        wait_for(lambda: kept)
-        for fault, check in shows.items():
-            topics.tell("/sim/fault", f"left arm={fault}")
-            wait_for(check)
-        topics.tell("/sim/fault", "left arm=well")
-        wait_for(full(lambda: late() < 2.0 and (np.diff(stamps()) > 0).all()))
-    finally:
-        connection.close()
+    wait_for(lambda: kept)
+    for fault, check in shows.items():
+        topics.tell("/sim/fault", f"left arm={fault}")
+        wait_for(check)
+    topics.tell("/sim/fault", "left arm=well")
+    wait_for(full(lambda: late() < 2.0 and (np.diff(stamps(kept)) > 0).all()))

@@ -12,11 +12,13 @@ from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
 from fluxvla_sim.aloha.world import CUBE
+from fluxvla_sim.ros2.base import Base
 from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
 from fluxvla_sim.ros2.clock import SlowedClock
-from fluxvla_sim.ros2.command import timed_fault
 from fluxvla_sim.ros2.judge import Judge
+from fluxvla_sim.ros2.node import NodeSettings
 from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
+from fluxvla_sim.ros2.streams import stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.control.clock import in_lockstep
@@ -123,6 +125,13 @@ def test_a_slowed_clock_is_slower():
     assert not in_lockstep(clock)
 
 
+def trajectory(controller, goal, seconds=0, nanosec=0):
+    after = SimpleNamespace(sec=seconds, nanosec=nanosec)
+    point = SimpleNamespace(positions=[goal] * 6, time_from_start=after)
+    message = SimpleNamespace(joint_names=list(JOINTS), points=[point])
+    return f"/{controller}/joint_trajectory", message
+
+
 class TestBodies:
     def test_aloha_commands_are_taken_by_name_with_raw_grippers(self):
         body = AlohaBody(COBOT_MAGIC)
@@ -149,13 +158,35 @@ class TestBodies:
     def test_trajectories_take_their_time(self):
         body = URBody("scaled_joint_trajectory_controller")
         body.reset(np.zeros(7))
-        point = SimpleNamespace(
-            positions=[1.0] * 6, time_from_start=SimpleNamespace(sec=0, nanosec=500_000_000)
-        )
-        message = SimpleNamespace(joint_names=list(JOINTS), points=[point])
-        body.hear("/scaled_joint_trajectory_controller/joint_trajectory", message, 10.0)
+        body.hear(*trajectory("scaled_joint_trajectory_controller", 1.0, nanosec=5 * 10**8), 10.0)
 
         assert [body.target(t)[0] for t in (10.0, 10.25, 10.5, 11.0)] == [0.0, 0.5, 1.0, 1.0]
+
+    def test_a_speed_slider_slows_down_what_is_left_of_a_trajectory(self):
+        body = URBody("scaled_joint_trajectory_controller", speed_scaling=50.0)
+        body.reset(np.zeros(7))
+        body.hear(*trajectory("scaled_joint_trajectory_controller", 1.0, seconds=1), 10.0)
+
+        assert [body.target(t)[0] for t in (10.0, 11.0)] == [0.0, 0.5]
+        body.hear("/sim/speed_scaling", SimpleNamespace(data=0.0), 11.0)
+        assert body.target(20.0)[0] == 0.5
+        body.hear("/sim/speed_scaling", SimpleNamespace(data=100.0), 20.0)
+        assert [body.target(t)[0] for t in (20.0, 20.25, 20.5, 30.0)] == [0.5, 0.75, 1.0, 1.0]
+
+    def test_a_speed_slider_means_nothing_to_other_controllers(self):
+        body = URBody("joint_trajectory_controller", speed_scaling=10.0)
+        body.reset(np.zeros(7))
+        body.hear(*trajectory("joint_trajectory_controller", 1.0, seconds=1), 10.0)
+
+        assert body.target(10.5)[0] == 0.5
+
+    @pytest.mark.parametrize("percent", [-1.0, 101.0, float("nan")])
+    def test_a_speed_slider_has_ends(self, percent):
+        body = URBody()
+        with pytest.raises(BadMessage, match="/sim/speed_scaling: a speed slider goes from 0 to"):
+            body.hear("/sim/speed_scaling", SimpleNamespace(data=percent), 0.0)
+        with pytest.raises(ConfigError, match="a speed slider goes from 0 to 100 %"):
+            URBody(speed_scaling=percent)
 
     @pytest.mark.parametrize(
         ("message", "what"),
@@ -171,10 +202,93 @@ class TestBodies:
             command_values(message, ("a", "b"), "/c")
 
 
+@pytest.fixture
+def base(ros_domain):
+    return Base()
+
+
+def speed(forward, turning):
+    return SimpleNamespace(linear=SimpleNamespace(x=forward), angular=SimpleNamespace(z=turning))
+
+
+class TestBase:
+    """Driven at times that the test makes up."""
+
+    def told(self, base, now):
+        message = base.say(now)
+        pose, twist = message.pose.pose, message.twist.twist
+        heading = 2 * np.arctan2(pose.orientation.z, pose.orientation.w)
+        where = pose.position.x, pose.position.y, heading
+        return np.round(where, 6).tolist(), (twist.linear.x, twist.angular.z)
+
+    def test_it_drives_while_it_is_asked_to(self, base):
+        for now in np.arange(5.0, 7.0, 0.1):
+            base.hear(speed(0.3, 0.0), "/cmd_vel", now)
+        assert self.told(base, 7.0) == ([0.6, 0.0, 0.0], (0.3, 0.0))
+        base.hear(speed(0.0, 0.0), "/cmd_vel", 7.0)
+        assert self.told(base, 9.0) == ([0.6, 0.0, 0.0], (0.0, 0.0))
+
+    def test_a_speed_that_is_not_asked_for_again_ends(self, base):
+        base.hear(speed(0.2, 0.0), "/cmd_vel", 5.0)
+        assert self.told(base, 5.4) == ([0.08, 0.0, 0.0], (0.2, 0.0))
+        assert self.told(base, 60.0) == ([0.1, 0.0, 0.0], (0.0, 0.0))
+
+    def test_it_turns_on_a_circle(self, base):
+        for now in np.arange(0.0, np.pi, 0.01):
+            base.hear(speed(1.0, 1.0), "/cmd_vel", now)
+        (x, y, heading), _ = self.told(base, np.pi)
+        assert (x, y) == pytest.approx((0.0, 2.0), abs=1e-3)
+        assert abs(heading) == pytest.approx(np.pi, abs=1e-3)
+
+    def test_an_episode_begins_where_odometry_does(self, base):
+        body = AlohaBody(COBOT_MAGIC)
+        body.hear("/cmd_vel", speed(0.3, 0.1), 1.0)
+        assert body.say(HOME, 1.4)["base"].twist.twist.linear.x == 0.3
+        body.reset(HOME)
+        assert self.told(body._base, 1.5) == ([0.0, 0.0, 0.0], (0.0, 0.0))
+
+    @pytest.mark.parametrize("value", [float("nan"), float("inf")])
+    def test_a_speed_that_is_no_number_is_not_taken(self, base, value):
+        with pytest.raises(BadMessage, match="/cmd_vel: a speed is not finite"):
+            base.hear(speed(0.0, value), "/cmd_vel", 0.0)
+        assert self.told(base, 0.1)[1] == (0.0, 0.0)
+
+
+class TestRates:
+    @pytest.mark.parametrize(
+        ("state_hz", "parts"), [(1, 1), (50, 1), (60, 2), (100, 2), (125, 5), (250, 5), (500, 10)]
+    )
+    def test_physics_is_stepped_as_often_as_states_are_said(self, state_hz, parts):
+        assert NodeSettings("x", state_hz=state_hz).parts == parts
+
+    @pytest.mark.parametrize("state_hz", [0.5, 7, 25, 30, 50, 60, 100, 130, 500])
+    def test_as_many_states_are_said_as_there_are_to_be(self, state_hz):
+        settings = NodeSettings("x", state_hz=state_hz)
+        by = [settings.states_by(part) for part in range(int(20 * 50 * settings.parts) + 1)]
+        assert (by[0], by[-1]) == (0, 20 * state_hz)
+        assert set(np.diff(by)) <= {0, 1}, "two at once would bear one stamp"
+        # Never further from its own time than one step.
+        first = np.searchsorted(by, np.arange(1, by[-1] + 1)) / (50 * settings.parts)
+        late = first - np.arange(1, by[-1] + 1) / state_hz
+        assert -1e-6 < late.min() <= late.max() < 1 / (50 * settings.parts)
+
+    def test_a_latency_is_in_simulated_seconds(self):
+        settings = NodeSettings("x", real_time_factor=0.5, latencies={"top": 0.1})
+        assert (settings.latency_s("top"), settings.latency_s("base")) == (0.2, 0.0)
+
+
 class TestCommandLine:
     def test_faults_may_wait(self):
         assert timed_fault("top=delay:0.2@3.5") == (3.5, "top", Fault("delay", 0.2))
         assert timed_fault("top=drop") == (0.0, "top", Fault("drop"))
+
+    def test_a_latency_is_of_a_stream(self):
+        assert stream_latency("left arm=0.05") == ("left arm", 0.05)
+
+    @pytest.mark.parametrize("text", ["top", "top=", "=0.1", "top=soon", "top=-1", "top=inf"])
+    def test_a_latency_that_is_none_is_refused(self, text):
+        with pytest.raises(UsageError, match=f"'{text}' is no latency; write STREAM=SECONDS"):
+            stream_latency(text)
 
     def test_a_time_that_is_none_is_refused(self):
         with pytest.raises(UsageError, match="'soon' is no number of seconds"):
@@ -186,6 +300,12 @@ class TestCommandLine:
             (["aloha"], "a simulated robot is reached over ROS 2 here"),
             (["aloha", "--ros2", "--fault", "x=drop"], "the robot has no stream 'x'; it has left"),
             (["aloha", "--ros2", "--fault", "top=nan"], "top is a camera: a picture's numbers"),
+            (["aloha", "--ros2", "--fault", "top_depth=nan"], "top_depth is a camera: a picture's"),
+            (["aloha", "--ros2", "--fault", "base=nan"], "base is odometry: only joints and bare"),
+            (["aloha", "--ros2", "--latency", "x=1"], "the robot has no stream 'x'; it has left"),
+            (["aloha", "--ros2", "--state-hz", "501"], "states need a rate from 0 to 500 Hz"),
+            (["aloha", "--ros2", "--speed-scaling", "50"], "an ALOHA has no speed slider"),
+            (["ur5e", "--ros2", "--speed-scaling", "150"], "a speed slider goes from 0 to 100 %"),
             (["ur5e", "--ros2", "--fault", "gripper=clock:1"], "gripper is a bare number"),
             (["ur5e", "--ros2", "--fault", "program running=drop"], "said once, at the start"),
             (["aloha", "--ros2", "--task", "x"], "there is no task 'x'; there are transfer_cube"),

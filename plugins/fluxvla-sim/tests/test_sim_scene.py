@@ -13,8 +13,9 @@ from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, load_model, to_metres, to_n
 from fluxvla_sim.aloha.scene import AlohaScene
 from fluxvla_sim.aloha.tasks import Facts
 from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
-from fluxvla_sim.render import import_mujoco
-from fluxvla_sim.world import CONTROL_HZ, task_of
+from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.ur.world import CUBE as LIFT
+from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, task_of
 
 from fluxvla_core.errors import ConfigError, RunFailed
 
@@ -89,6 +90,54 @@ def test_reference_pictures_are_gym_alohas_byte_for_byte(stock, world, name):
     theirs = stock._env.physics.render(height=480, width=640, camera_id="top")
     np.testing.assert_array_equal(scene.render("top", 480, 640), theirs)
     scene.close()
+
+
+@pytest.mark.parametrize("world", [CUBE, LIFT], ids=["aloha", "ur5e"])
+@pytest.mark.parametrize("substeps", [1, 5])
+def test_a_period_in_parts_is_the_same_period(world, substeps):
+    whole, parts = world.open_scene("cheap"), world.open_scene("cheap")
+    whole.reset(2)
+    parts.reset(2)
+    for command in world.open_expert(whole.model).plan(world.tasks[0].name, whole.objects)[:100]:
+        whole.step(command)
+        for _ in range(SUBSTEPS // substeps):
+            parts.advance(command, substeps)
+        np.testing.assert_array_equal(whole.data.qpos, parts.data.qpos)
+        np.testing.assert_array_equal(whole.data.qvel, parts.data.qvel)
+
+
+@pytest.mark.parametrize(
+    ("world", "camera"), [(CUBE, "top"), (CUBE, "left_wrist"), (LIFT, "front"), (LIFT, "wrist")]
+)
+def test_depth_is_how_far_a_ray_goes(world, camera):
+    scene, height, width = world.open_scene("cheap"), 96, 128
+    scene.reset(3)
+    renderer = Renderer(scene.model)
+    picture, metres = renderer.render_with_depth(scene.data, camera, height, width)
+    np.testing.assert_array_equal(picture, renderer.render(scene.data, camera, height, width))
+    renderer.close()
+    assert metres.dtype == np.float32
+    points = [(row, column) for row in range(4, height, 13) for column in range(5, width, 17)]
+    off = [
+        metres[point] - along_the_axis(scene, camera, (height, width), point) for point in points
+    ]
+    assert np.isnan(metres).any(), "something is out of reach"
+    # A ray at an object's edge may pass by where the picture's pixel does not.
+    assert np.mean(np.abs(off) < 1e-3) + np.mean(np.isnan(off)) > 0.95
+    assert np.mean(np.abs(off) < 1e-3) > 0.3
+
+
+def along_the_axis(scene, camera, size, point):
+    """Metres along the camera's axis to what the pixel at ``point`` shows; NaN for nothing."""
+    model, data, index = scene.model, scene.data, scene.model.camera(camera).id
+    focal = size[0] / 2 / np.tan(np.radians(model.cam_fovy[index]) / 2)
+    row, column = point
+    way = np.array([(column + 0.5 - size[1] / 2) / focal, (size[0] / 2 - row - 0.5) / focal, -1.0])
+    ahead = data.cam_xmat[index].reshape(3, 3) @ way / np.linalg.norm(way)
+    geom = np.zeros(1, np.int32)
+    start = data.cam_xpos[index]
+    met = import_mujoco().mj_ray(model, data, start, ahead, None, 1, -1, geom)
+    return met / np.linalg.norm(way) if met >= 0 else np.nan
 
 
 def test_constants_are_gym_alohas():

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import DataError, RunFailed
-from fluxvla_core.ros2.images import to_depth
+from fluxvla_core.ros2.images import to_depth, to_millimetres
 
 ROOT = "/fluxvla"
 EVENTS = f"{ROOT}/events"
@@ -45,8 +45,6 @@ JPEG = "sensor_msgs/msg/CompressedImage"
 PICTURES = (IMAGE, JPEG)
 
 _QUALITY = 90
-_MILLIMETRES = 1000.0
-_FARTHEST = 65535
 _FIELDS = {topic: field for field, topic in VECTORS.items()}
 
 
@@ -155,8 +153,7 @@ class Packer:
         NaN is nothing, as is what is farther than the 65.535 m that the encoding reaches.
         """
         height, width = metres.shape
-        far = np.rint(np.nan_to_num(metres, posinf=0.0, neginf=0.0) * _MILLIMETRES)
-        millimetres = np.where((far > 0) & (far <= _FARTHEST), far, 0).astype("<u2")
+        millimetres = to_millimetres(metres).astype("<u2")
         message = self._store.types[IMAGE](
             header=self._header(ns, camera),
             height=height,

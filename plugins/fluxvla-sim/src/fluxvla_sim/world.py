@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 CONTROL_HZ = 50.0
 """Commands a second of every simulated robot: a control period is 20 ms."""
+SUBSTEPS = 10
+"""Steps of the physics in a control period."""
 
 
 class Scene(Protocol):
@@ -40,6 +42,9 @@ class Scene(Protocol):
 
     def step(self, action: Array) -> None:
         """Drive to the joint targets ``(D,)`` for one control period."""
+
+    def advance(self, action: Array, substeps: int) -> None:
+        """Drive to ``(D,)`` for so many steps of the physics; ``SUBSTEPS`` make a period."""
 
     @property
     def state(self) -> Array:

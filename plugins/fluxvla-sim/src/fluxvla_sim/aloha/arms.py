@@ -17,11 +17,11 @@ import numpy as np
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluate.drawing import set_render
 from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.world import SUBSTEPS
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-SUBSTEPS = 10
 DIM = 14
 ARMS = ("left", "right")
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
@@ -120,15 +120,19 @@ class TwoArms:
 
     def step(self, action: npt.NDArray[np.float64]) -> None:
         """Drive to the joint targets ``action`` ``(14,)`` for one control period (20 ms)."""
+        self.advance(action, SUBSTEPS)
+        self.steps += 1
+
+    def advance(self, action: npt.NDArray[np.float64], substeps: int) -> None:
+        """Drive to ``action`` for ``substeps`` steps of 2 ms."""
         mujoco, model, data = self._mujoco, self.model, self.data
         left, right = to_metres(action[6]), to_metres(action[13])
         data.ctrl[:] = [*action[:6], left, -left, *action[7:13], right, -right]
         # Positions and velocities are already up to date, so the first step is only its second
         # half, and one first half at the end brings them up to date again.
         mujoco.mj_step2(model, data)
-        mujoco.mj_step(model, data, SUBSTEPS - 1)
+        mujoco.mj_step(model, data, substeps - 1)
         mujoco.mj_step1(model, data)
-        self.steps += 1
 
     @property
     def state(self) -> npt.NDArray[np.float64]:

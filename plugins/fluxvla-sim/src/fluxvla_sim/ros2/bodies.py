@@ -12,10 +12,12 @@ from fluxvla_aloha.presets import Preset
 from fluxvla_ur.embodiment import JOINTS
 from fluxvla_ur.operator import BOOL, CONTROLLERS, TRAJECTORY
 
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.ros2 import joints
 from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import FLOAT64, JOINT_STATE
+from fluxvla_core.ros2.streams import FLOAT64, JOINT_STATE, ODOMETRY, TWIST
 from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_sim.ros2.base import Base
 
 Array = npt.NDArray[np.float64]
 
@@ -23,20 +25,23 @@ Array = npt.NDArray[np.float64]
 class Body(Protocol):
     """Between a scene's numbers and a robot's messages; knows no publisher and no time of its own.
 
-    ``states`` and ``latched`` are stream -> (topic, message type), ``cameras`` is the scene's
-    camera -> topic, ``commands`` is topic -> message type.
+    ``states`` and ``latched`` are stream -> (topic, message type), ``cameras`` and ``depths`` are
+    the scene's camera -> topic, ``commands`` is topic -> message type. So is ``knobs``, what a
+    person sets on the robot, which no driver has a topic for. ``now`` is in simulated seconds.
     """
 
     states: Mapping[str, tuple[str, str]]
     latched: Mapping[str, tuple[str, str]]
     cameras: Mapping[str, str]
+    depths: Mapping[str, str]
     commands: Mapping[str, str]
+    knobs: Mapping[str, str]
 
-    def say(self, state: Array) -> dict[str, Any]:
+    def say(self, state: Array, now: float) -> dict[str, Any]:
         """Stream -> message, of the scene's ``(D,)`` state; ``latched`` ones too."""
 
     def hear(self, topic: str, message: Any, now: float) -> None:
-        """Take a command.
+        """Take a command, or what a knob is set to.
 
         Raises:
             BadMessage: it is none: names are missing, or numbers are not finite.
@@ -50,7 +55,7 @@ class Body(Protocol):
 
 
 class AlohaBody:
-    """Two arms with grippers, as their drivers present them.
+    """Two arms with grippers on a mobile base, as their drivers present them.
 
     Args:
         preset: topics, names and raw gripper values.
@@ -65,13 +70,18 @@ class AlohaBody:
     ) -> None:
         self._preset = preset
         names = [f"{side} arm" for side in self._SIDES]
-        self.states = {n: (t, JOINT_STATE) for n, t in zip(names, preset.states, strict=True)}
+        self._arms = dict(zip(names, preset.states, strict=True))
+        self.states = {name: (topic, JOINT_STATE) for name, topic in self._arms.items()}
+        self.states["base"] = (preset.odometry, ODOMETRY)
         self.latched: Mapping[str, tuple[str, str]] = {}
+        self.knobs: Mapping[str, str] = {}
         scene = ("top", "left_wrist", "right_wrist")
         self.cameras = dict(zip(scene, preset.images, strict=True))
+        self.depths = dict(zip(scene, preset.depths, strict=True))
+        self._base = Base()
         # Topic -> the columns of the action that it commands.
         self._columns: dict[str, range] = {}
-        self.commands: dict[str, str] = {}
+        self.commands: dict[str, str] = {preset.velocity: TWIST}
         for index, topic in enumerate(preset.commands):
             first = self._ARM * index
             length = self._ARM - 1 if preset.gripper_commands else self._ARM
@@ -83,15 +93,18 @@ class AlohaBody:
                 self.commands[gripper] = gripper_message or preset.gripper_message
         self._target: Array = np.zeros(2 * self._ARM)
 
-    def say(self, state: Array) -> dict[str, Any]:
-        said = {}
-        for index, name in enumerate(self.states):
+    def say(self, state: Array, now: float) -> dict[str, Any]:
+        said = {"base": self._base.say(now)}
+        for index, name in enumerate(self._arms):
             arm = state[self._ARM * index : self._ARM * (index + 1)].copy()
             arm[-1] = self._raw(arm[-1])
             said[name] = joints.fill(message_class(JOINT_STATE)(), self._preset.joints, arm)
         return said
 
     def hear(self, topic: str, message: Any, now: float) -> None:
+        if topic == self._preset.velocity:
+            self._base.hear(message, topic, now)
+            return
         columns = self._columns[topic]
         names = [self._preset.joints[column % self._ARM] for column in columns]
         values = command_values(message, names, topic)
@@ -104,6 +117,7 @@ class AlohaBody:
 
     def reset(self, state: Array) -> None:
         self._target = np.array(state)
+        self._base.reset()
 
     def _raw(self, opening: float) -> float:
         closed, opened = self._preset.gripper_closed, self._preset.gripper_open
@@ -119,15 +133,28 @@ class URBody:
 
     Args:
         controller: the one that is active.
+        speed_scaling: the teach pendant's slider in percent, which ``/sim/speed_scaling`` moves.
+            The scaled controller slows its trajectories down by it; the others take no notice.
+
+    Raises:
+        ConfigError: the slider does not go there.
     """
 
     _ARM = len(JOINTS)
     _GRIPPER = "/gripper/command"
+    _SLIDER = "/sim/speed_scaling"
+    _SCALED = "scaled_joint_trajectory_controller"
     # Older drivers sort joints by name; whoever reads them by index is found out here.
     _NAMES = tuple(sorted(JOINTS))
 
-    def __init__(self, controller: str = "forward_position_controller") -> None:
+    def __init__(
+        self, controller: str = "forward_position_controller", speed_scaling: float = 100.0
+    ) -> None:
         self._topic, message = CONTROLLERS[controller]
+        self._scaled = controller == self._SCALED
+        if not 0 <= speed_scaling <= 100:
+            raise ConfigError(f"a speed slider goes from 0 to 100 %, got {speed_scaling:g}")
+        self._percent = speed_scaling
         self.states = {
             "arm": ("/joint_states", JOINT_STATE),
             "gripper": ("/gripper/position", FLOAT64),
@@ -140,23 +167,31 @@ class URBody:
             "front": "/front_camera/color/image_raw",
             "wrist": "/wrist_camera/color/image_raw",
         }
+        self.depths = {
+            "front": "/front_camera/depth/image_raw",
+            "wrist": "/wrist_camera/depth/image_raw",
+        }
         self.commands = {self._topic: message, self._GRIPPER: FLOAT64}
+        self.knobs = {self._SLIDER: FLOAT64}
         self.reset(np.zeros(self._ARM + 1))
 
-    def say(self, state: Array) -> dict[str, Any]:
+    def say(self, state: Array, now: float) -> dict[str, Any]:
         where = dict(zip(JOINTS, state, strict=False))
         arm = message_class(JOINT_STATE)()
         number = message_class(FLOAT64)
         return {
             "arm": joints.fill(arm, self._NAMES, [where[name] for name in self._NAMES]),
             "gripper": number(data=float(state[self._ARM])),
-            "speed scaling": number(data=100.0),
+            "speed scaling": number(data=self._percent),
             "program running": message_class(BOOL)(data=True),
         }
 
     def hear(self, topic: str, message: Any, now: float) -> None:
         if topic == self._GRIPPER:
             self._gripper = command_values(message, ("gripper",), topic)[0]
+            return
+        if topic == self._SLIDER:
+            self._slide(float(message.data), now)
             return
         arm = command_values(message, JOINTS, topic)
         seconds = 0.0
@@ -166,8 +201,19 @@ class URBody:
         self._from, self._to = self.target(now)[: self._ARM], arm
         self._since, self._seconds = now, seconds
 
+    def _slide(self, percent: float, now: float) -> None:
+        if not 0 <= percent <= 100:
+            raise BadMessage(f"{self._SLIDER}: a speed slider goes from 0 to 100 %, got {percent}")
+        # What is left of a trajectory goes on from here at the new speed.
+        here, left = self.target(now), self._seconds - self._passed(now)
+        self._from, self._since, self._seconds = here[: self._ARM], now, max(left, 0.0)
+        self._percent = percent
+
+    def _passed(self, now: float) -> float:
+        return (now - self._since) * (self._percent / 100 if self._scaled else 1.0)
+
     def target(self, now: float) -> Array:
-        share = 1.0 if self._seconds <= 0 else min((now - self._since) / self._seconds, 1.0)
+        share = 1.0 if self._seconds <= 0 else min(self._passed(now) / self._seconds, 1.0)
         return np.append(self._from + share * (self._to - self._from), self._gripper)
 
     def reset(self, state: Array) -> None:

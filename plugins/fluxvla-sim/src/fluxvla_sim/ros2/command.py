@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import UsageError
@@ -41,6 +40,22 @@ class SimCommand:
             metavar="HZ",
             help="of each camera that is listened to, in simulated time; default 30",
         )
+        parser.add_argument(
+            "--state-hz",
+            type=float,
+            default=50.0,
+            metavar="HZ",
+            help="of joint states and all else that is no picture, up to 500, in simulated time; "
+            "default 50",
+        )
+        parser.add_argument(
+            "--latency",
+            action="append",
+            default=[],
+            metavar="STREAM=SECONDS",
+            help="how long a stream's messages are under way, in simulated time; their stamps say "
+            "when they were made",
+        )
         parser.add_argument("--height", type=int, default=480, help="of the pictures")
         parser.add_argument("--width", type=int, default=640, help="of the pictures")
         parser.add_argument(
@@ -60,6 +75,13 @@ class SimCommand:
             help="UR: the controller that is active",
         )
         parser.add_argument(
+            "--speed-scaling",
+            type=float,
+            metavar="PERCENT",
+            help="UR: the teach pendant's speed slider, default 100; a number on "
+            "/sim/speed_scaling moves it",
+        )
+        parser.add_argument(
             "--best-effort", action="store_true", help="offer pictures as camera drivers do"
         )
         parser.add_argument(
@@ -69,8 +91,8 @@ class SimCommand:
             metavar="STREAM=MODE[:AMOUNT][@S]",
             help="make a stream ill, S seconds after the start (also at any time, as text on "
             f"/sim/fault; STREAM=well ends it). {_modes()}. Streams of aloha: 'left arm', 'right "
-            "arm', top, left_wrist, right_wrist; of ur5e: arm, gripper, 'speed scaling', front, "
-            "wrist",
+            "arm', base, top, left_wrist, right_wrist; of ur5e: arm, gripper, 'speed scaling', "
+            "front, wrist; a camera's distances: top_depth, …",
         )
         parser.add_argument("--domain-id", type=int, metavar="N", help="ROS domain")
         parser.add_argument("--seconds", type=float, metavar="S", help="end by itself")
@@ -84,6 +106,7 @@ class SimCommand:
     def run(self, args: Any) -> int:
         from fluxvla_core.cli.reporters import make_reporter
         from fluxvla_core.ros2.require import require_rclpy
+        from fluxvla_sim.ros2.streams import stream_latency, timed_fault
 
         if not args.ros2:
             raise UsageError(
@@ -92,17 +115,20 @@ class SimCommand:
                 "operator=dict(type='AlohaSimOperator') in the config",
             )
         faults = [timed_fault(text) for text in args.fault]
+        latencies = dict(map(stream_latency, args.latency))
         require_rclpy()
         reporter = make_reporter(args.log_format)
         try:
-            return self._simulate(args, faults, reporter)
+            return self._simulate(args, faults, latencies, reporter)
         finally:
             reporter.close()
 
-    def _simulate(self, args: Any, faults: list[Any], reporter: Any) -> int:
+    def _simulate(
+        self, args: Any, faults: list[Any], latencies: dict[str, float], reporter: Any
+    ) -> int:
         from fluxvla_sim.environment import ENVIRONMENTS
-        from fluxvla_sim.ros2.judge import Judge
-        from fluxvla_sim.ros2.node import NodeSettings, RobotNode, check_fault
+        from fluxvla_sim.ros2.node import NodeSettings, simulate
+        from fluxvla_sim.ros2.streams import check_fault, check_stream
 
         robot = ENVIRONMENTS[args.robot].robot
         world, _ = robot.find(args.task or robot.default_tasks[0])
@@ -110,37 +136,22 @@ class SimCommand:
         _some_cameras(body, args.cameras)
         for _, stream, fault in faults:
             check_fault(body, stream, fault)
+        for stream in latencies:
+            check_stream(body, stream)
         settings = NodeSettings(
-            name=f"sim_{args.robot}",
+            name=args.robot,
             seed=args.seed,
             real_time_factor=args.real_time_factor,
+            state_hz=args.state_hz,
             camera_hz=args.camera_hz,
+            latencies=latencies,
             height=args.height,
             width=args.width,
             best_effort=args.best_effort,
             faults=faults,
             domain_id=args.domain_id,
         )
-        scene = world.open_scene(args.render)
-        node = RobotNode(body, scene, settings, reporter, Judge(world))
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: node.stop())
-        try:
-            topics = [topic for topic, _ in body.states.values()]
-            reporter.info(
-                f"simulating {args.robot} at {args.real_time_factor:g} of real time: "
-                f"{', '.join([*topics, *body.cameras.values()])}; "
-                f"commands on {', '.join(body.commands)}; Ctrl-C ends"
-            )
-            node.run(args.seconds)
-        finally:
-            node.close()
-            scene.close()
-            counts = node.counts
-            reporter.info(
-                f"{counts.periods} periods ({counts.late} late), {counts.pictures} pictures, "
-                f"{counts.commands} commands"
-            )
+        simulate(body, world, settings, reporter, args.render, args.seconds)
         return 0
 
 
@@ -149,22 +160,6 @@ def _modes() -> str:
 
     names = {mode: f"{mode}:AMOUNT" if mode in AMOUNTS else mode for mode in MODES}
     return "; ".join(f"{names[mode]}: {what}" for mode, what in MODES.items())
-
-
-def timed_fault(text: str) -> tuple[float, str, Any]:
-    """``STREAM=MODE[:AMOUNT][@SECONDS]`` as (seconds, stream, fault).
-
-    Raises:
-        UsageError: another form.
-    """
-    from fluxvla_core.ros2.faults import Fault
-
-    fault, _, after = text.partition("@")
-    try:
-        seconds = float(after or 0.0)
-    except ValueError as error:
-        raise UsageError(f"{text!r}: {after!r} is no number of seconds") from error
-    return (seconds, *Fault.parse(fault))
 
 
 def _some_cameras(body: Any, names: list[str] | None) -> None:
@@ -184,6 +179,8 @@ def _aloha(args: Any) -> Any:
 
     if args.preset not in PRESETS:
         raise UsageError(f"unknown preset {args.preset!r}; known are {', '.join(PRESETS)}")
+    if args.speed_scaling is not None:
+        raise UsageError("an ALOHA has no speed slider: --speed-scaling is for a UR")
     return AlohaBody(PRESETS[args.preset])
 
 
@@ -196,4 +193,4 @@ def _ur(args: Any) -> Any:
         raise UsageError(
             f"unknown controller {args.controller!r}; known are {', '.join(CONTROLLERS)}"
         )
-    return URBody(args.controller)
+    return URBody(args.controller, 100.0 if args.speed_scaling is None else args.speed_scaling)

@@ -1,11 +1,12 @@
 """A scene behind a robot's topics, in real time or in a stated share of it.
 
 The calling thread steps the physics on absolute deadlines and publishes the robot's state; a second
-one draws the cameras, each at its own time, from a copy of the positions, so that a slow
+one draws the cameras (:mod:`fluxvla_sim.ros2.cameras`) from a copy of the positions, so that a slow
 renderer makes pictures rarer and nothing else late. Three topics are the simulation's own:
 ``/sim/reset`` (``std_msgs/Int64``: a seed), ``/sim/fault`` (``std_msgs/String``: as ``--fault``
 takes it, or ``STREAM=well``) and ``/sim/facts`` (``std_msgs/String``: JSON, ten times a simulated
-second and whenever an episode begins or a task is done).
+second and whenever an episode begins or a task is done). A robot may have more, for what a person
+sets on it.
 
 A machine that cannot draw and think in real time is given a ``real_time_factor``: the whole robot
 then lives that much slower, its rates with it, and whoever drives it follows the same slowed clock
@@ -15,24 +16,27 @@ then lives that much slower, its rates with it, and whoever drives it follows th
 from __future__ import annotations
 
 import json
+import math
+import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import ConfigError, FluxError, UsageError
-from fluxvla_core.ros2 import images, qos
+from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import FLOAT64, IMAGE
+from fluxvla_core.ros2.streams import IMAGE
 from fluxvla_core.ros2.trouble import BadMessage
-from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.ros2.bodies import Body
+from fluxvla_sim.ros2.cameras import Cameras
 from fluxvla_sim.ros2.judge import Judge
-from fluxvla_sim.world import CONTROL_HZ, Scene
+from fluxvla_sim.ros2.streams import check_fault, depths
+from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, World
 
 _FACTS_EVERY = 5
 # Simulated seconds after a reset in which no command is taken.
@@ -40,6 +44,8 @@ _SETTLE_S = 0.1
 # A process that was stopped for longer than this goes on from now, instead of catching up.
 _FAR_BEHIND_S = 0.5
 _WELL = "well"
+# Of a product of two rates; a billion parts are months.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,14 @@ class NodeSettings:
     """How a simulated robot presents itself.
 
     Args:
-        name: of the node.
+        name: of the robot; ``sim_`` before it names the node.
         seed: of the first scene.
         real_time_factor: simulated seconds in a second.
+        state_hz: states a simulated second, of every stream of them. Above ``CONTROL_HZ`` the
+            physics goes in smaller parts of a control period, down to its own 2 ms.
         camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
             nobody listens to is not drawn.
+        latencies: stream -> simulated seconds that its messages are under way, with true stamps.
         height, width: of every picture, in pixels.
         best_effort: offer pictures as camera drivers do by default, not reliably.
         faults: (seconds after the start, stream, fault), what falls ill by itself.
@@ -61,7 +70,9 @@ class NodeSettings:
     name: str
     seed: int = 0
     real_time_factor: float = 1.0
+    state_hz: float = CONTROL_HZ
     camera_hz: float = 30.0
+    latencies: Mapping[str, float] = field(default_factory=dict)
     height: int = 480
     width: int = 640
     best_effort: bool = False
@@ -75,11 +86,31 @@ class NodeSettings:
             )
         if not 0 < self.camera_hz <= 1000:
             raise ConfigError(f"cameras need a rate from 0 to 1000 Hz, got {self.camera_hz:g}")
+        most = CONTROL_HZ * SUBSTEPS
+        if not 0 < self.state_hz <= most:
+            raise ConfigError(
+                f"states need a rate from 0 to {most:g} Hz, as the physics is stepped; "
+                f"got {self.state_hz:g}"
+            )
+
+    @property
+    def parts(self) -> int:
+        """Into how many parts a control period is divided: as few as ``state_hz`` allows."""
+        whole = (n for n in range(1, SUBSTEPS + 1) if SUBSTEPS % n == 0)
+        return next(n for n in whole if CONTROL_HZ * n >= self.state_hz)
+
+    def states_by(self, part: int) -> int:
+        """How many states are said by the end of so many parts of control periods."""
+        return math.floor(part * self.state_hz / (CONTROL_HZ * self.parts) + _ROUNDING)
+
+    def latency_s(self, stream: str) -> float:
+        """How long a stream's messages are under way, in seconds of the wall clock."""
+        return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
 @dataclass
 class Counts:
-    """What was done, for the line at the end."""
+    """What was done, for the line at the end; ``late`` counts parts of periods."""
 
     periods: int = 0
     late: int = 0
@@ -116,8 +147,9 @@ class RobotNode:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._commanded = False
+        self._parts = 0
         self._told: dict[str, Any] = {}
-        self._connection = Connection(settings.name, settings.domain_id)
+        self._connection = Connection(f"sim_{settings.name}", settings.domain_id)
         try:
             self._reset(settings.seed)
             self._open()
@@ -132,13 +164,22 @@ class RobotNode:
             Faulted: the ROS thread ended.
             RunFailed: nothing can be drawn.
         """
-        drawing = _Drawing(self._draw)
-        drawing.start()
+        cameras = Cameras(
+            self._scene.model,
+            self._pictures,
+            tuple(self._body.cameras),
+            self._settings,
+            self._faults,
+            self._look,
+            self._stopping,
+        )
+        cameras.start()
         try:
-            self._live(seconds, drawing)
+            self._live(seconds, cameras)
         finally:
             self._stopping.set()
-            drawing.join()
+            cameras.join()
+            self.counts.pictures = cameras.sent
 
     def stop(self) -> None:
         """Let ``run`` return; from any thread or signal handler."""
@@ -149,9 +190,9 @@ class RobotNode:
         self.stop()
         self._connection.close()
 
-    def _live(self, seconds: float | None, drawing: _Drawing) -> None:
-        outbox = Outbox(self._faults)
-        period = 1.0 / (CONTROL_HZ * self._settings.real_time_factor)
+    def _live(self, seconds: float | None, cameras: Cameras) -> None:
+        outbox, settings = Outbox(self._faults), self._settings
+        part = 1.0 / (CONTROL_HZ * settings.parts * settings.real_time_factor)
         pending = sorted(self._settings.faults, key=lambda item: item[0])
         start = deadline = time.monotonic()
         while not self._stopping.is_set():
@@ -159,13 +200,13 @@ class RobotNode:
             if seconds is not None and now - start >= seconds:
                 return
             self._connection.check()
-            drawing.check()
+            cameras.check()
             while pending and now - start >= pending[0][0]:
                 _, stream, fault = pending.pop(0)
                 self._faults.set(stream, fault)
-            self._period(outbox, now)
+            self._part(outbox, now)
             outbox.flush(time.monotonic())
-            deadline += period
+            deadline += part
             behind = time.monotonic() - deadline
             if behind > 0:
                 self.counts.late += 1
@@ -173,22 +214,32 @@ class RobotNode:
             else:
                 self._stopping.wait(-behind)
 
-    def _period(self, outbox: Outbox, now: float) -> None:
+    def _part(self, outbox: Outbox, now: float) -> None:
+        parts = self._settings.parts
+        self._parts += 1
+        whole = self._parts % parts == 0
         with self._lock:
-            self._scene.step(self._body.target(self._simulated(now)))
-            state = self._scene.state
-            if self._commanded:
+            simulated = self._simulated(now)
+            self._scene.advance(self._body.target(simulated), SUBSTEPS // parts)
+            if whole and self._commanded:
                 self._judge.after(self._scene)
-            told = self._judge.tell()
+            due = self._settings.states_by(self._parts) > self._settings.states_by(self._parts - 1)
+            said = self._body.say(self._scene.state, simulated) if due else {}
             # Within the lock, so that no state of before a reset is stamped after it.
             stamp = self._now().to_msg()
-            reset_at = self._reset_at
-        for stream, message in self._body.say(state).items():
+        for stream, message in said.items():
             if stream in self._publishers:
                 if hasattr(message, "header"):
                     message.header.stamp = stamp
-                outbox.put(stream, self._publishers[stream], message, now)
-        self.counts.periods += 1
+                sent = now + self._settings.latency_s(stream)
+                outbox.put(stream, self._publishers[stream], message, sent)
+        if whole:
+            self.counts.periods += 1
+            self._tell()
+
+    def _tell(self) -> None:
+        with self._lock:
+            told, reset_at = self._judge.tell(), self._reset_at
         news = any(told[key] != self._told.get(key) for key in ("resets", "tasks"))
         if news or self.counts.periods % _FACTS_EVERY == 0:
             self._told = told
@@ -218,16 +269,16 @@ class RobotNode:
         }
         offered = qos.BEST_EFFORT if self._settings.best_effort else qos.RELIABLE
         self._pictures = {
-            camera: connection.publisher(topic, message_class(IMAGE), offered, depth=2)
-            for camera, topic in body.cameras.items()
+            stream: connection.publisher(topic, message_class(IMAGE), offered, depth=2)
+            for stream, topic in {**body.cameras, **depths(body)}.items()
         }
-        said = body.say(self._scene.state)
+        said = body.say(self._scene.state, self._simulated(time.monotonic()))
         for stream, (topic, message) in body.latched.items():
             profile = qos.profile(qos.RELIABLE, 1, latched=True)
             kept = connection.node.create_publisher(message_class(message), topic, profile)
             kept.publish(said[stream])
         self._facts_publisher = connection.publisher("/sim/facts", self._string)
-        for topic, message in body.commands.items():
+        for topic, message in {**body.commands, **body.knobs}.items():
             self._listen(topic, message, self._hear(topic))
         self._listen("/sim/reset", "std_msgs.msg:Int64", lambda m: self._reset(int(m.data)))
         self._listen("/sim/fault", "std_msgs.msg:String", lambda m: self._ill(m.data))
@@ -244,7 +295,7 @@ class RobotNode:
                     if self._is_late(message, now):
                         return
                     self._body.hear(topic, message, now)
-                    self._commanded = True
+                    self._commanded |= topic in self._body.commands
             except BadMessage as error:
                 # What a driver does with nonsense: nothing.
                 refused = self.counts.refused
@@ -287,76 +338,46 @@ class RobotNode:
             return
         self._faults.set(stream, fault)
 
-    def _draw(self) -> None:
-        mujoco, settings, model = import_mujoco(), self._settings, self._scene.model
-        renderer, data = Renderer(model), mujoco.MjData(model)
-        outbox = Outbox(self._faults)
-        period = 1.0 / (settings.camera_hz * settings.real_time_factor)
-        start = time.monotonic()
-        cameras = list(self._pictures)
-        # Spread over the period, as cameras that nobody synchronised.
-        due = {c: start + period * i / len(cameras) for i, c in enumerate(cameras)}
-        try:
-            while not self._stopping.is_set():
-                outbox.flush(time.monotonic())
-                camera = min(due, key=due.__getitem__)
-                wait = min(due[camera], outbox.next_due) - time.monotonic()
-                if wait > 0:
-                    self._stopping.wait(wait)
-                    continue
-                if not self._pictures[camera].get_subscription_count():
-                    due[camera] = max(due[camera] + period, time.monotonic())
-                    continue
-                with self._lock:
-                    data.qpos[:] = self._scene.data.qpos
-                    stamp = self._now().to_msg()
-                # All that a picture needs of the physics, given the positions.
-                mujoco.mj_kinematics(model, data)
-                mujoco.mj_comPos(model, data)
-                mujoco.mj_camlight(model, data)
-                pixels = renderer.render(data, camera, settings.height, settings.width)
-                message = images.fill(message_class(IMAGE)(), pixels, "rgb8")
-                message.header.stamp, message.header.frame_id = stamp, camera
-                now = time.monotonic()
-                outbox.put(camera, self._pictures[camera], message, now)
-                due[camera] = max(due[camera] + period, now)
-                self.counts.pictures += 1
-        finally:
-            renderer.close()
+    def _look(self, data: Any) -> Any:
+        """Fill ``data`` with the scene's positions; their stamp."""
+        with self._lock:
+            data.qpos[:] = self._scene.data.qpos
+            return self._now().to_msg()
 
 
-def check_fault(body: Body, stream: str, fault: Fault) -> None:
-    """Refuse a fault that a robot's stream cannot have.
+def simulate(
+    body: Body,
+    world: World,
+    settings: NodeSettings,
+    reporter: Reporter,
+    render: str = "cheap",
+    seconds: float | None = None,
+) -> None:
+    """A robot in a world until Ctrl-C or SIGTERM, or for ``seconds``; says what it does.
+
+    Args:
+        render: quality of the pictures, see ``fluxvla_core.evaluate.drawing``.
 
     Raises:
-        UsageError: there is no such stream (names those that there are), or its messages have
-            nothing that could be wrong in this way.
+        As ``RobotNode`` and its ``run``.
     """
-    known = [*body.states, *body.cameras]
-    if stream in body.latched:
-        raise UsageError(f"{stream} is said once, at the start: it can have no fault")
-    if stream not in known:
-        raise UsageError(f"the robot has no stream {stream!r}; it has {', '.join(known)}")
-    if fault.mode == "nan" and stream in body.cameras:
-        raise UsageError(f"{stream} is a camera: a picture's numbers cannot be NaN")
-    if fault.mode == "clock" and stream in body.states and body.states[stream][1] == FLOAT64:
-        raise UsageError(f"{stream} is a bare number: it bears no stamp that could be wrong")
-
-
-class _Drawing(threading.Thread):
-    """The drawing thread; ``check`` raises what ended it."""
-
-    def __init__(self, draw: Callable[[], None]) -> None:
-        super().__init__(name="fluxvla-sim-cameras")
-        self._draw = draw
-        self._error: BaseException | None = None
-
-    def run(self) -> None:
-        try:
-            self._draw()
-        except BaseException as error:  # noqa: BLE001 - raised again by check
-            self._error = error
-
-    def check(self) -> None:
-        if self._error is not None:
-            raise self._error
+    scene = world.open_scene(render)
+    node = RobotNode(body, scene, settings, reporter, Judge(world))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: node.stop())
+    try:
+        topics = [topic for topic, _ in body.states.values()]
+        reporter.info(
+            f"simulating {settings.name} at {settings.real_time_factor:g} of real time: "
+            f"{', '.join([*topics, *body.cameras.values()])}; "
+            f"commands on {', '.join(body.commands)}; Ctrl-C ends"
+        )
+        node.run(seconds)
+    finally:
+        node.close()
+        scene.close()
+        counts = node.counts
+        reporter.info(
+            f"{counts.periods} periods ({counts.late} late), {counts.pictures} pictures, "
+            f"{counts.commands} commands"
+        )

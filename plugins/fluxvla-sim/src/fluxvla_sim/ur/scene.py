@@ -15,11 +15,11 @@ from fluxvla_ur.embodiment import JOINTS
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluate.drawing import set_render
 from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.world import SUBSTEPS
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-SUBSTEPS = 10
 GRIPPER = "gripper/"
 FINGER_JOINT = f"{GRIPPER}right_driver_joint"
 FINGER_CLOSED = 0.8  # radians of the driver joint; 0 is open
@@ -115,12 +115,16 @@ class URScene:
 
     def step(self, action: npt.NDArray[np.float64]) -> None:
         """Drive to ``action`` ``(7,)`` for one control period (20 ms)."""
+        self.advance(action, SUBSTEPS)
+        self.steps += 1
+
+    def advance(self, action: npt.NDArray[np.float64], substeps: int) -> None:
+        """Drive to ``action`` for ``substeps`` steps of 2 ms."""
         self.data.ctrl[:6] = action[:6]
         self.data.ctrl[6] = (1.0 - action[6]) * FINGER_COMMAND
-        self._mujoco.mj_step(self.model, self.data, SUBSTEPS)
+        self._mujoco.mj_step(self.model, self.data, substeps)
         # Positions derived from the joints lag one step behind after mj_step; pictures need them.
         self._mujoco.mj_step1(self.model, self.data)
-        self.steps += 1
 
     @property
     def state(self) -> npt.NDArray[np.float64]:

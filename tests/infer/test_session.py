@@ -453,6 +453,24 @@ def test_after_a_stop_an_arm_that_stayed_begins_at_the_command_that_holds_it(
     bench.assert_within_limits()
 
 
+def test_an_episode_that_never_began_does_not_let_go_of_what_is_held(bench, real, gripping, asked):
+    bench.arm, bench.policy = real, gripping
+    before = []
+
+    def blind():
+        before.append(len(real.sent))
+        real.faults["get_frame"] = NotReady("camera front is silent")
+
+    asked(Acts({"2": blind, "rearm": real.faults.clear}, "1", "2", "rearm", "3", polls=0))
+
+    known = {**TASKS, "3": "stir"}
+    bench.run(task=None, max_publish_step=40, task_descriptions=known, ready_timeout=0.1)
+
+    jaw = [command[2] for command in real.sent[before[0] - 1 :]]
+    assert len(jaw) > 40
+    assert max(jaw) == 0.0
+
+
 def switched_off(arm):
     arm.faults["stuck"] = True
     arm.state[0] = -0.9

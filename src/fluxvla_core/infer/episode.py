@@ -155,8 +155,8 @@ class Episode:
 
     @property
     def commanded(self) -> Array | None:
-        """``(D,)`` its last command, None if it had not begun."""
-        return self._limiter.last if self._limiter.started else None
+        """``(D,)`` the last command of the run, None before any."""
+        return self._limiter.last if self._limiter.started else self._before
 
     def _begin(self) -> None:
         """Read where the arm is, and bring it to the start pose."""

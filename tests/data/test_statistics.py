@@ -12,6 +12,7 @@ from fluxvla_core.data.statistics import (
     column_statistics,
     histogram_statistics,
     image_histogram,
+    joined_statistics,
     moments,
 )
 
@@ -34,6 +35,15 @@ def test_columns_match_numpy_whatever_the_chunks(data, chunk):
     for name, level in QUANTILES.items():
         np.testing.assert_array_equal(stats[name], np.quantile(wide, level, axis=0))
     assert stats["count"].tolist() == [len(data)]
+
+
+@given(data=rows, chunk=st.integers(1, 20), cuts=st.lists(st.integers(0, 50)))
+def test_parts_give_what_all_rows_give_to_the_last_bit(data, chunk, cuts):
+    parts = np.split(data, sorted(min(cut, len(data)) for cut in cuts))
+    found = joined_statistics(lambda dims: (part[:, dims] for part in parts), chunk)
+    for name, expected in column_statistics(data, chunk).items():
+        np.testing.assert_array_equal(found[name], expected)
+        assert found[name].dtype == expected.dtype
 
 
 def test_merged_std_is_that_of_all_rows_in_any_number_of_dimensions():

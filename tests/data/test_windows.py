@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import tracemalloc
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.data.windows import window
+from fluxvla_core.data.windows import action_statistics, window
 
 
 @given(rows=st.integers(1, 30), data=st.data(), size=st.integers(1, 12))
@@ -20,3 +25,21 @@ def test_a_window_holds_its_last_action_and_masks_what_is_not_there(rows, data, 
     assert chunk.dtype == mask.dtype == np.float32
     chunk[:] = -1
     assert (actions >= 0).all()
+
+
+@pytest.mark.parametrize("per_step", [False, True])
+def test_statistics_of_windows_do_not_hold_a_copy_for_each_step(per_step):
+    """Fifty copies in float64 were 100 times the actions; one dimension of them is 100/D."""
+    frames, dims, size = 20_000, 14, 50
+    rng = np.random.default_rng(0)
+    recorded: Any = SimpleNamespace(
+        actions=rng.standard_normal((frames, dims)).astype(np.float32),
+        states=rng.standard_normal((frames, dims)).astype(np.float32),
+        rows=np.arange(frames),
+        end=np.full(frames, frames),
+    )
+    tracemalloc.start()
+    action_statistics([recorded], size, 0, np.ones(dims, np.bool_), per_step)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 30 * recorded.actions.nbytes

@@ -192,7 +192,9 @@ class DistributedRepeatingDataset:
     def _share_statistics(self) -> None:
         groups: dict[str, list[Any]] = {}
         for dataset in self.datasets:
-            for name in dataset.statistics:
+            # Asking for its statistics would compute them, only to replace them below.
+            own = isinstance(dataset, ParquetDataset)
+            for name in [dataset.statistic_name] if own else dataset.statistics:
                 groups.setdefault(name, []).append(dataset)
         for name, group in groups.items():
             if len(group) > 1:

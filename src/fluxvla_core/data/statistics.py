@@ -1,15 +1,16 @@
-"""Exact statistics of columns and of images, in one pass and mergeable.
+"""Exact statistics of columns and of images, without holding all rows at once.
 
 Mean and variance are kept as (count, mean, sum of squared deviations) in float64 and joined by
 Chan's formula, so many small chunks give what one big one gives. Quantiles of columns are true
-quantiles; pixels have 256 values, so their histogram loses nothing.
+quantiles, taken of one dimension at a time; pixels have 256 values, so their histogram loses
+nothing.
 Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing sample
 variances", Stanford STAN-CS-79-773, 1979.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy.typing as npt
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LEVELS = 256
+CHUNK = 65536
 
 Floats = npt.NDArray[np.float64]
 Stats = dict[str, npt.NDArray[Any]]
@@ -75,21 +77,54 @@ def moments(chunks: Iterable[npt.NDArray[Any]]) -> Moments:
     return total
 
 
-def column_statistics(rows: npt.NDArray[Any], chunk: int = 65536) -> Stats:
+def column_statistics(rows: npt.NDArray[Any], chunk: int = CHUNK) -> Stats:
     """Statistics of ``(N, D)`` rows: min, max, mean, std, the quantiles (each ``(D,)``), count.
 
     ``count`` is ``(1,)`` int64. The chunk bounds memory, not precision.
     """
-    total = moments(rows[i : i + chunk] for i in range(0, len(rows), chunk))
-    levels = np.quantile(rows.astype(np.float64), list(QUANTILES.values()), axis=0)
+    return joined_statistics(lambda dims: [rows[:, dims]], chunk)
+
+
+def joined_statistics(
+    parts: Callable[[slice], Iterable[npt.NDArray[Any]]], chunk: int = CHUNK
+) -> Stats:
+    """Those of several ``(n, D)`` arrays as if they were one, of which one is held at a time.
+
+    Args:
+        parts: gives all arrays, one after the other, with the dimensions that it is asked for.
+    """
+    total = moments(_cut(parts(slice(None)), chunk))
+    # True quantiles need all values of a dimension at once, but not those of all dimensions.
+    levels = [
+        np.quantile(_column(parts(slice(d, d + 1))), list(QUANTILES.values()), overwrite_input=True)
+        for d in range(len(total.mean))
+    ]
     return {
         "min": total.min,
         "max": total.max,
         "mean": total.mean,
         "std": total.std,
         "count": np.array([total.count], dtype=np.int64),
-        **dict(zip(QUANTILES, levels, strict=True)),
+        **dict(zip(QUANTILES, np.stack(levels, axis=1), strict=True)),
     }
+
+
+def _cut(parts: Iterable[npt.NDArray[Any]], size: int) -> Iterator[npt.NDArray[Any]]:
+    """All rows in chunks of ``size``, wherever one part ends and the next begins."""
+    held: list[npt.NDArray[Any]] = []
+    for part in parts:
+        while len(part):
+            held.append(part[: size - sum(map(len, held))])
+            part = part[len(held[-1]) :]
+            if sum(map(len, held)) == size:
+                yield np.concatenate(held)
+                held = []
+    if held:
+        yield np.concatenate(held)
+
+
+def _column(parts: Iterable[npt.NDArray[Any]]) -> Floats:
+    return np.concatenate([part[:, 0].astype(np.float64) for part in parts])
 
 
 def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:

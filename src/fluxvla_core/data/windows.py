@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.recording import Recorded
-from fluxvla_core.data.statistics import as_lists, column_statistics
+from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joined_statistics
 
 Floats = npt.NDArray[np.float32]
 
@@ -60,13 +60,17 @@ def action_statistics(
     if relative is None and not per_step:
         rows = np.concatenate([r.actions[r.chosen] for r in recordings])
         return as_lists(column_statistics(rows))
-    steps = [_step(recordings, first_action + j, relative) for j in range(size)]
     if per_step:
         # The last steps of a window longer than every episode occur nowhere.
-        each = [column_statistics(rows if len(rows) else steps[0]) for rows in steps]
+        each: list[Stats] = []
+        for j in range(size):
+            rows = _step(recordings, first_action + j, relative, slice(None))
+            each.append(column_statistics(rows) if len(rows) else each[0])
         stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
     else:
-        stats = column_statistics(np.concatenate(steps))
+        stats = joined_statistics(
+            lambda dims: (_step(recordings, first_action + j, relative, dims) for j in range(size))
+        )
     found = as_lists(stats)
     if relative is not None:
         found["relative"] = relative.astype(int).tolist()
@@ -74,14 +78,17 @@ def action_statistics(
 
 
 def _step(
-    recordings: Sequence[Recorded], ahead: int, relative: npt.NDArray[np.bool_] | None
+    recordings: Sequence[Recorded],
+    ahead: int,
+    relative: npt.NDArray[np.bool_] | None,
+    dims: slice,
 ) -> Floats:
     """Actions ``ahead`` rows after each usable one, where they are within the episode."""
     parts = []
     for recorded in recordings:
         rows = recorded.rows[recorded.rows + ahead < recorded.end[recorded.rows]]
-        actions = recorded.actions[rows + ahead]
+        actions = recorded.actions[:, dims][rows + ahead]
         if relative is not None:
-            actions = actions - recorded.states[rows][:, : actions.shape[1]] * relative
+            actions = actions - recorded.states[:, : len(relative)][:, dims][rows] * relative[dims]
         parts.append(actions)
     return np.concatenate(parts)

@@ -30,6 +30,9 @@ class ToyDataset:
     def __len__(self):
         return self.size
 
+    def get_sample(self, index, epoch):
+        return {}
+
 
 @OPERATORS.register_module()
 class ToyOperator:

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import pytest
+from torch import nn
 
 from fluxvla_core.config.resolve import installed
 from fluxvla_core.contracts import API
 from fluxvla_core.contracts.check import check_class, is_train_runner, missing_operator_methods
+from fluxvla_core.contracts.methods import MAY_HAVE, NEEDS
 from fluxvla_core.contracts.optional import can_continue
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
+from fluxvla_core.hooks import specs
+from fluxvla_core.metrics.vla_metric import VLAMetric
 from fluxvla_core.plugins.groups import REGISTRIES
 from fluxvla_core.plugins.registry import BY_NAME
 
@@ -89,6 +93,83 @@ def test_an_action_filter_is_called_with_an_action():
         check_class("action_filters", cls, "here")
 
 
+Fit = type("Fit", (nn.Module,), {"forward": lambda self, images: {}})
+Index = type("Index", (), {"__len__": lambda self: 1, "get_sample": lambda self, i, epoch: {}})
+
+
+@pytest.mark.parametrize(
+    ("registry", "base", "body", "problem"),
+    [
+        ("vlas", object, {"forward": lambda self, images: {}}, "it is no torch.nn.Module"),
+        ("vlas", nn.Module, {}, "it needs forward(), or predict_action()"),
+        ("vlas", nn.Module, {"forward": 3}, "forward is a int, not a method"),
+        ("vlas", Fit, {"fsdp_units": lambda self, x: []}, "fsdp_units() must accept no argument"),
+        (
+            "datasets",
+            object,
+            {"__len__": lambda self: 1, "__getitem__": lambda self, index: {}},
+            "it needs __len__() and get_sample(), or __len__() and get_samples(), or __call__()",
+        ),
+        (
+            "datasets",
+            object,
+            {"__len__": lambda self: 1, "get_sample": lambda self, index: {}},
+            "get_sample() must accept 2 arguments",
+        ),
+        ("datasets", Index, {"get_samples": lambda self: []}, "get_samples() must accept 1 arg"),
+        ("datasets", Index, {"prepare": lambda self: None}, "prepare() must accept 1 argument"),
+        ("transforms", object, {}, "__call__() is missing"),
+        ("collators", object, {}, "__call__() is missing"),
+        ("tokenizers", object, {}, "encode() is missing"),
+        ("metrics", VLAMetric, {"push": None}, "push() is missing"),
+        (
+            "metrics",
+            VLAMetric,
+            {"commit": lambda self, *, global_step, epoch, loss, lr: None},
+            "commit() must accept the keywords global_step, epoch, loss, lr, any other",
+        ),
+        ("metrics", VLAMetric, {"finalize": lambda self, x: None}, "finalize() must accept no arg"),
+        ("optimizers", object, {}, "build() is missing"),
+        ("action_filters", object, {}, "__call__() is missing"),
+        ("hooks", object, {"after_stp": lambda self, step: None}, "or after_step(), or"),
+        ("environments", object, {}, "observe() is missing"),
+        ("policies", object, {"reset": lambda self, seed: None}, "predict_action() is missing"),
+        ("commands", object, {}, "add_arguments() is missing"),
+    ],
+)
+def test_what_the_core_calls_must_be_there(registry, base, body, problem):
+    with pytest.raises(LoadFailed) as caught:
+        check_class(registry, type("Wrong", (base,), body), "here")
+    assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("registry", "cls"),
+    [
+        ("vlas", Fit),
+        ("vlas", type("Acts", (nn.Module,), {"predict_action": lambda self, **batch: None})),
+        ("datasets", Index),
+        (
+            "datasets",
+            type("Batch", (), {"__len__": lambda self: 1, "get_samples": lambda self, keys: []}),
+        ),
+        ("datasets", type("Prepares", (), {"__call__": lambda self, observation: {}})),
+        ("tokenizers", type("Letters", (), {"encode": lambda self, text: []})),
+        ("metrics", VLAMetric),
+        ("hooks", type("Log", (), {"after_step": lambda self, step: None})),
+        ("heads", type("Head", (), {})),
+        # Written in C, which does not always say what it takes.
+        ("transforms", type("Hash", (), {"__call__": staticmethod(getattr)})),
+    ],
+)
+def test_what_is_enough(registry, cls):
+    check_class(registry, cls, "here")
+
+
+def test_the_hooks_are_those_that_are_called():
+    assert {name for one in NEEDS["hooks"] for name in one} == set(specs.NAMES)
+
+
 def test_whether_a_policy_can_go_on_from_a_chunk():
     able = type("Able", (), {"continue_action": lambda self, observation, rest: None})
 
@@ -97,8 +178,9 @@ def test_whether_a_policy_can_go_on_from_a_chunk():
     assert not can_continue(object())
 
 
-def test_every_contract_has_a_version():
-    assert tuple(API) == REGISTRIES
+def test_every_registry_has_a_contract_and_its_version():
+    assert tuple(API) == tuple(NEEDS) == REGISTRIES
+    assert set(MAY_HAVE) <= set(REGISTRIES)
 
 
 @pytest.mark.parametrize("registry", REGISTRIES)

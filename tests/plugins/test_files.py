@@ -15,7 +15,7 @@ from fluxvla_core import HOOKS
 
 @HOOKS.register_module()
 class Watcher:
-    pass
+    def run_started(self): ...
 """
 
 

@@ -8,41 +8,21 @@ will pass.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 from typing import Any
 
+from fluxvla_core.contracts.methods import (
+    FULL_OPERATOR,
+    MAY_HAVE,
+    NEEDS,
+    RANDOM_TRANSFORM,
+    TRAIN_RUNNER,
+    Arguments,
+    Methods,
+)
 from fluxvla_core.contracts.protocols import API
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
 
-# registry -> method -> number of positional arguments that the core passes (without self).
-# An operator of the specification's shape has get_frame and commands of its own; what it lacks
-# is asked for when it is built, where the config can supply an embodiment.
-_METHODS: Mapping[str, Mapping[str, int]] = {
-    "operators": {"get_frame": 0},
-    "runners": {"run": 0, "run_setup": 0},
-    "transforms": {"__call__": 1},
-    "collators": {"__call__": 1},
-    "optimizers": {"build": 2},
-    "datasets": {},
-    "environments": {"reset": 2, "step": 1, "observe": 1, "close": 0},
-    "policies": {"reset": 1, "predict_action": 1},
-    "commands": {"add_arguments": 1, "run": 1},
-    "action_filters": {"__call__": 1},
-}
-# What a class may have besides (contracts.optional); checked where it is there.
-_OPTIONAL: Mapping[str, Mapping[str, int]] = {
-    "operators": {
-        "get_state": 0,
-        "state_stamp": 0,
-        "task_done": 0,
-        "task_success": 0,
-        "begin_episode": 2,
-        "pictures_after": 2,
-    },
-    "policies": {"continue_action": 2},
-    "action_filters": {"bind": 1, "reset": 1},
-}
-_FULL_OPERATOR = {"connect": 0, "get_frame": 0, "send_action": 1, "stop": 0, "close": 0}
+_MISSING = "is missing"
 
 
 def check_class(registry: str, cls: Any, origin: str) -> None:
@@ -58,20 +38,47 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
             f"{origin}: {name} in fluxvla.{registry} is a {type(cls).__name__}, not a class"
         )
     check_api(registry, cls, origin)
-    wanted = dict(_METHODS.get(registry, {}))
-    if registry == "runners" and is_train_runner(cls):
-        wanted = {"run": 1, "run_setup": 1}
-    if registry == "transforms" and getattr(cls, "needs_rng", False):
-        wanted = {"__call__": 2}
-    optional = _OPTIONAL.get(registry, {})
-    wanted |= {method: count for method, count in optional.items() if hasattr(cls, method)}
-    problems = [p for m, n in wanted.items() if (p := _method_problem(cls, m, n))]
+    problems = [] if registry != "vlas" or _is_module(cls) else ["it is no torch.nn.Module"]
+    problems += _problems(cls, _needs(registry, cls))
+    besides = MAY_HAVE.get(registry, {})
+    problems += _wrong(cls, {m: n for m, n in besides.items() if _lookup(cls, m) is not None})
     if problems:
         raise LoadFailed(
             f"{origin}: {name} does not fulfil the contract of fluxvla.{registry}: "
-            + "; ".join(problems),
+            + "; ".join(dict.fromkeys(problems)),
             next="see docs/writing-a-plugin.md for what each contract asks for",
         )
+
+
+def _needs(registry: str, cls: type) -> tuple[Methods, ...]:
+    if registry == "runners" and is_train_runner(cls):
+        return (TRAIN_RUNNER,)
+    if registry == "transforms" and getattr(cls, "needs_rng", False):
+        return (RANDOM_TRANSFORM,)
+    return NEEDS.get(registry, ({},))
+
+
+def _problems(cls: type, sets: tuple[Methods, ...]) -> list[str]:
+    """What keeps ``cls`` from having one of ``sets``; nothing if it has one."""
+    tried = [_wrong(cls, one) for one in sets]
+    if not all(tried):
+        return []
+    if len(sets) == 1:
+        return tried[0]
+    choice = ", or ".join(" and ".join(f"{method}()" for method in one) for one in sets)
+    there = [text for texts in tried for text in texts if not text.endswith(_MISSING)]
+    return [f"it needs {choice}", *there]
+
+
+def _wrong(cls: type, methods: Methods) -> list[str]:
+    return [text for m, n in methods.items() if (text := _method_problem(cls, m, n))]
+
+
+def _is_module(cls: type) -> bool:
+    """Whether ``cls`` is a ``torch.nn.Module``, told without importing torch."""
+    return any(
+        f"{c.__module__}.{c.__name__}" == "torch.nn.modules.module.Module" for c in cls.__mro__
+    )
 
 
 def check_api(registry: str, cls: type, origin: str) -> None:
@@ -108,34 +115,49 @@ def is_train_runner(cls: type) -> bool:
 def missing_operator_methods(operator: object) -> list[str]:
     """What an operator of the specification's shape lacks of the full contract."""
     cls = type(operator)
-    lacks = [f"{m}()" for m, n in _FULL_OPERATOR.items() if _method_problem(cls, m, n)]
+    lacks = [f"{m}()" for m, n in FULL_OPERATOR.items() if _method_problem(cls, m, n)]
     if not hasattr(operator, "embodiment"):
         lacks.insert(0, "embodiment")
     return lacks
 
 
-def _method_problem(cls: type, method: str, count: int) -> str | None:
-    function = inspect.getattr_static(cls, method, None)
-    if function is None:
-        return f"{method}() is missing"
-    if isinstance(function, (staticmethod, classmethod)):
-        bound = [object()] * count
-        function = function.__func__
-        bound = (
-            bound
-            if isinstance(inspect.getattr_static(cls, method), staticmethod)
-            else [*bound, cls]
-        )
-    else:
-        bound = [object()] * (count + 1)
+def _lookup(cls: type, method: str) -> Any:
+    """What ``cls`` or a base defines as ``method``, as it stands there; None if nothing.
+
+    Not what its metaclass has: every class is callable, and its objects need not be.
+    """
+    found = next((vars(base)[method] for base in cls.__mro__ if method in vars(base)), None)
+    # Stands in torch.nn.Module for the forward that a subclass is to bring.
+    return None if getattr(found, "__name__", "") == "_forward_unimplemented" else found
+
+
+def _method_problem(cls: type, method: str, arguments: Arguments) -> str | None:
+    found = _lookup(cls, method)
+    if found is None:
+        return f"{method}() {_MISSING}"
+    bound: list[object] = [] if isinstance(found, staticmethod) else [cls]
+    function = found.__func__ if isinstance(found, (staticmethod, classmethod)) else found
     if not callable(function):
         return f"{method} is a {type(function).__name__}, not a method"
+    if arguments is None:
+        return None
+    names = arguments if isinstance(arguments, tuple) else ()
+    bound += [None] * (arguments if isinstance(arguments, int) else 0)
     try:
-        inspect.signature(function).bind(*bound)
+        inspect.signature(function).bind(*bound, **dict.fromkeys(names))
     except TypeError as error:
-        what = "no argument" if count == 0 else f"{count} argument{'s' if count > 1 else ''}"
-        return f"{method}() must accept {what}: {error}"
+        return f"{method}() must accept {_told(arguments)}: {error}"
+    except ValueError:  # written in C, where not every function says what it takes
+        return None
     return None
+
+
+def _told(arguments: int | tuple[str, ...]) -> str:
+    if isinstance(arguments, tuple):
+        return f"the keyword{'s' if len(arguments) > 1 else ''} {', '.join(arguments)}"
+    if arguments == 0:
+        return "no argument"
+    return f"{arguments} argument{'s' if arguments > 1 else ''}"
 
 
 def _version(text: str) -> tuple[int, int] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -110,6 +111,41 @@ def test_a_registered_one_trains_is_saved_and_goes_on(tmp_path, registered):
     assert checkpoint_differences(*ends) == []
     seen = latest(tmp_path / "cut").json("optimizer.json")["scalars"]
     assert set(seen.values()) == {6}
+
+
+@pytest.fixture
+def two_rates():
+    class TwoRates:
+        """Matrices learn at the run's rate, vectors at a tenth of it."""
+
+        def build(self, groups, learning_rate):
+            matrices, vectors = groups
+            return torch.optim.AdamW(
+                [matrices, {**vectors, "lr": learning_rate / 10}], lr=learning_rate
+            )
+
+    OPTIMIZERS.register_module()(TwoRates)
+    yield
+    OPTIMIZERS.unregister("TwoRates")
+
+
+def test_groups_with_rates_of_their_own_keep_them_and_go_on_bit_for_bit(tmp_path, two_rates):
+    settings = {
+        "optimizer": {"type": "TwoRates"},
+        "lr_scheduler_type": "step-based",
+        "lr_schedule": {0: 0.01, 0.5: 0.001},
+        "save_iter_interval": 2,
+    }
+    whole = run(tmp_path / "whole", **settings)
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    for later in folders(tmp_path / "cut")[1:]:
+        shutil.rmtree(later)
+    cut = run(tmp_path / "cut", "auto", **settings)
+    for runner in (whole, cut):
+        rates = [group["lr"] for group in runner.optimizer.param_groups]
+        assert rates == [0.001, pytest.approx(0.0001)]
+    ends = [folders(tmp_path / d)[-1] for d in ("whole", "cut")]
+    assert checkpoint_differences(*ends) == []
 
 
 def test_a_class_without_build_is_no_optimizer():

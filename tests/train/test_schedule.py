@@ -82,8 +82,8 @@ def test_what_cannot_be_meant_is_refused(arguments, message):
 @pytest.mark.parametrize("kind", [t for t in TYPES if t != "step-based"])
 def test_the_scheduler_goes_on_from_its_step_alone(kind):
     def fresh():
-        optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
-        return optimizer, ScheduledLR(optimizer, make_schedule(kind, 0.3, 20, 0.2))
+        optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.3)
+        return optimizer, ScheduledLR(optimizer, make_schedule(kind, 0.3, 20, 0.2), 0.3)
 
     optimizer, scheduler = fresh()
     seen = []
@@ -99,5 +99,19 @@ def test_the_scheduler_goes_on_from_its_step_alone(kind):
     for step in range(7, 20):
         assert optimizer.param_groups[0]["lr"] == seen[step]
         assert scheduler.get_last_lr() == [seen[step]]
+        optimizer.step()
+        scheduler.step()
+
+
+def test_groups_of_the_runs_rate_have_the_schedules_bit_for_bit_and_others_their_share():
+    groups = [{"params": [torch.nn.Parameter(torch.zeros(1))]} for _ in range(3)]
+    groups[1]["lr"], groups[2]["lr"] = 0.03, 0.0
+    optimizer = torch.optim.SGD(groups, lr=0.3)
+    schedule = make_schedule("linear-warmup+cosine-decay", 0.3, 20, 0.2)
+    scheduler = ScheduledLR(optimizer, schedule, 0.3)
+    for step in range(20):
+        rates = [group["lr"] for group in optimizer.param_groups]
+        assert rates[0] == schedule(step)
+        assert rates[1:] == [pytest.approx(0.1 * schedule(step)), 0.0]
         optimizer.step()
         scheduler.step()

@@ -262,7 +262,7 @@ class BaseTrainRunner(TrainRun):
             options.warmup_ratio,
             options.lr_schedule,
         )
-        return ScheduledLR(self.optimizer, schedule)
+        return ScheduledLR(self.optimizer, schedule, options.learning_rate)
 
     def _training_step(self, batch: dict[str, Any]) -> Tensor:
         """Forward pass of one batch on the device: its loss, a scalar with a gradient."""

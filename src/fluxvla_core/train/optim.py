@@ -128,14 +128,20 @@ def torch_state(
 
 
 class ScheduledLR(torch.optim.lr_scheduler.LRScheduler):
-    """Sets every group's rate to ``schedule(step)``; its state is the step alone."""
+    """Sets every group's rate to ``schedule(step)``; its state is the step alone.
 
-    def __init__(self, optimizer: torch.optim.Optimizer, schedule: Schedule) -> None:
-        self.schedule = schedule
+    A group that the optimizer was built with at a multiple of ``learning_rate`` keeps to it.
+    """
+
+    def __init__(
+        self, optimizer: torch.optim.Optimizer, schedule: Schedule, learning_rate: float
+    ) -> None:
+        self.schedule, self.learning_rate = schedule, learning_rate
         super().__init__(optimizer)
 
     def get_lr(self) -> list[float | torch.Tensor]:
-        return [self.schedule(self.last_epoch)] * len(self.optimizer.param_groups)
+        rate = self.schedule(self.last_epoch)
+        return [rate * (float(base) / self.learning_rate) for base in self.base_lrs]
 
     def state_dict(self) -> dict[str, Any]:
         return {"step": self.last_epoch}

@@ -89,11 +89,12 @@ def test_trackio(tmp_path):
 
     with sqlite3.connect(tmp_path / "trackio" / "cubes.db") as found:
         rows = found.execute("select run_name, step, metrics from metrics order by step").fetchall()
+    name = f"night-{(tmp_path / 'trackio_run_id').read_text().strip()}"
     assert [(run, step, json.loads(values)["train/loss"]) for run, step, values in rows] == [
-        ("night", 1, 1.0),
-        ("night", 2, 0.5),
-        ("night", 3, 1 / 3),
-        ("night", 4, 0.25),
+        (name, 1, 1.0),
+        (name, 2, 0.5),
+        (name, 3, 1 / 3),
+        (name, 4, 0.25),
     ]
 
 
@@ -101,7 +102,8 @@ def test_trackio(tmp_path):
 def test_wandb_offline(tmp_path):
     pytest.importorskip("wandb")
     assert track("wandb", tmp_path, WANDB_MODE="offline", WANDB_SILENT="true") == ""
-    runs = sorted((tmp_path / "wandb").glob("offline-run-*-night/run-night.wandb"))
+    kept = (tmp_path / "wandb_run_id").read_text().strip()
+    runs = sorted((tmp_path / "wandb").glob(f"offline-run-*-{kept}/run-{kept}.wandb"))
     assert len(runs) == 2
     assert all(path.stat().st_size > 0 for path in runs)
 

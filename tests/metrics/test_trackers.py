@@ -109,7 +109,7 @@ def test_a_tracker_that_cannot_even_start_is_warned_of(tmp_path):
     assert said.lines[0].startswith("tracker jsonl failed and is left out")
 
 
-def test_wandb_gets_settings_steps_and_a_name_that_resumes(tmp_path, monkeypatch):
+def fake_wandb(monkeypatch):
     calls: list[object] = []
     run = types.SimpleNamespace(
         log=lambda values, step: calls.append((step, values)),
@@ -118,6 +118,11 @@ def test_wandb_gets_settings_steps_and_a_name_that_resumes(tmp_path, monkeypatch
     wandb = types.ModuleType("wandb")
     wandb.init = lambda **settings: calls.append(settings) or run
     monkeypatch.setitem(sys.modules, "wandb", wandb)
+    return calls
+
+
+def test_wandb_gets_settings_and_steps(tmp_path, monkeypatch):
+    calls = fake_wandb(monkeypatch)
     monkeypatch.setenv("WANDB_PROJECT", "cubes")
     tracker = open_tracker("wandb", Said(), tmp_path, "night", 4, {"lr": 1})
     tracker.log(5, {"loss": 0.5})
@@ -127,7 +132,7 @@ def test_wandb_gets_settings_steps_and_a_name_that_resumes(tmp_path, monkeypatch
         {
             "project": "cubes",
             "name": "night",
-            "id": "night",
+            "id": (tmp_path / "wandb_run_id").read_text().strip(),
             "resume": "allow",
             "dir": str(tmp_path),
             "config": {"lr": 1},
@@ -135,6 +140,19 @@ def test_wandb_gets_settings_steps_and_a_name_that_resumes(tmp_path, monkeypatch
         (5, {"train/loss": 0.5}),
         "finish",
     ]
+
+
+def test_a_run_is_another_ones_only_if_it_goes_on(tmp_path, monkeypatch):
+    """Work dirs of one name, or one that was begun again, were one run for wandb."""
+    calls = fake_wandb(monkeypatch)
+    starts = [("a", 0), ("a", 4), ("b", 0), ("a", 0), ("a", 2), ("moved", 2)]
+    for folder, step in starts:
+        open_tracker("wandb", Said(), tmp_path / folder / "night", "night", step, {}).close()
+    ids = [call["id"] for call in calls if call != "finish"]
+    assert ids[0] == ids[1]
+    assert ids[3] == ids[4]
+    assert len({ids[i] for i in (0, 2, 3, 5)}) == 4
+    assert {call["name"] for call in calls if call != "finish"} == {"night"}
 
 
 def test_tensorboard_purges_the_steps_that_are_done_again(tmp_path, monkeypatch):

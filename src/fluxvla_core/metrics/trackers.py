@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
@@ -86,7 +87,7 @@ class WandbTracker:
         self._run: Any = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "fluxvla"),
             name=run_id,
-            id=run_id,
+            id=_identity("wandb", run_dir, step),
             resume="allow",
             dir=str(run_dir),
             config=dict(hparams),
@@ -105,7 +106,8 @@ class WandbTracker:
 class TrackioTracker:
     """Trackio, which keeps runs on this machine (in ``TRACKIO_DIR``); ``trackio show`` has them.
 
-    ``TRACKIO_PROJECT`` names the project.
+    ``TRACKIO_PROJECT`` names the project. It knows a run by its name alone, which therefore ends
+    with what tells this one from another of the same name.
     """
 
     def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:
@@ -116,7 +118,7 @@ class TrackioTracker:
             self._trackio: Any = trackio
             trackio.init(
                 project=os.environ.get("TRACKIO_PROJECT", "fluxvla"),
-                name=run_id,
+                name=f"{run_id}-{_identity('trackio', run_dir, step)}",
                 config=json.loads(json.dumps(dict(hparams), default=str)),
                 resume="allow",
                 embed=False,
@@ -205,6 +207,17 @@ def open_tracker(
     """The tracker ``name``, guarded; ``step`` steps of the run have been done before."""
     make = _KINDS[name][0]
     return Guarded(name, reporter, lambda: make(run_dir, run_id, step, hparams))
+
+
+def _identity(tracker: str, run_dir: Path, step: int) -> str:
+    """What the tracker knows this run by: random, kept with the run, a new one for a new run."""
+    path = run_dir / f"{tracker}_run_id"
+    if step and path.is_file():
+        return path.read_text(encoding="utf-8").strip()
+    made = secrets.token_hex(4)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, made + "\n")
+    return made
 
 
 def _lines(path: Path) -> list[str]:

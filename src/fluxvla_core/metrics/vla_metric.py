@@ -26,7 +26,8 @@ class VLAMetric:
     Args:
         active_trackers: of ``jsonl``, ``tensorboard``, ``trackio``, ``wandb``.
         run_dir: where trackers write; the work dir by default.
-        run_id: name of the run; the work dir's name by default.
+        run_id: the name that trackers show; the work dir's name by default. Which run of theirs
+            goes on when this one does is kept in ``run_dir``.
         hparams: what is recorded as the run's settings; the config by default.
         window_size: the ``loss`` of a record is the mean over so many steps; with more than one,
             ``loss_raw`` is the step's own.

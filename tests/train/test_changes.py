@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from fluxvla_core.train.changes import changed_settings, changed_statistics
 
 
@@ -22,6 +24,36 @@ def test_paths_workers_logging_saving_and_length_may_change():
     ours["train"] |= {"max_steps": 20, "max_keep_ckpts": 1, "metric": {"type": "Mine", "n": 3}}
     ours["eval"]["episodes"] = 50
     assert changed_settings(tree(), ours, "train") == {}
+
+
+@pytest.mark.parametrize(
+    "schedule",
+    [
+        {"lr_scheduler_type": "linear-warmup+cosine-decay"},
+        {"lr_scheduler_type": "step-based", "lr_schedule": {"0": 1e-4}},
+        {"warmup_ratio": 0.1},
+    ],
+)
+def test_the_length_is_told_where_the_rate_follows_from_it(schedule):
+    before, now = tree(), tree()
+    before["train"] |= schedule
+    now["train"] |= {**schedule, "max_steps": 20}
+    assert changed_settings(before, now, "train") == {"train.max_steps": ("10", "20")}
+
+
+def test_another_validation_set_is_told():
+    """The best checkpoint, and when to stop, follow from it."""
+    before, now = tree(), tree()
+    before["val_dataloader"] = {"dataset": {"type": "ParquetDataset", "episodes": [1, 2]}}
+    now["val_dataloader"] = {"dataset": {"type": "ParquetDataset", "episodes": [1, 3]}}
+    assert changed_settings(before, now, "train") == {
+        "val_dataloader.dataset.episodes": ("[1, 2]", "[1, 3]")
+    }
+    assert list(changed_settings(tree(), now, "train")) == [
+        "val_dataloader.dataset.type",
+        "val_dataloader.dataset.episodes",
+    ]
+    assert changed_settings(tree(), {**tree(), "val_dataloader": None}, "train") == {}
 
 
 def test_a_table_in_a_list_is_compared_key_by_key():

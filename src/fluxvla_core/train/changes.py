@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from typing import Any
 
-TABLES = ("model", "train_dataloader")
-"""What a run is made of, besides the section that runs."""
+TABLES = ("model", "train_dataloader", "val_dataloader")
+"""What a run, and its best checkpoint, follow from, besides the section that runs."""
 HARMLESS = frozenset(
     {
         # Where things are. A model's frozen weights are compared by their sum, data by statistics.
@@ -19,13 +19,14 @@ HARMLESS = frozenset(
         # What is told and saved, and how often.
         *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
         *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
-        # How long it goes on.
-        *("max_epochs", "max_steps", "early_stop_patience"),
+        "early_stop_patience",  # how long it goes on
         # Samples a step: what they come to together is compared on its own.
         *("per_device_batch_size", "grad_accumulation_steps"),
     }
 )
 """Keys that may change without a word."""
+LENGTH = frozenset({"max_epochs", "max_steps"})
+"""And those that may where the learning rate does not follow from them."""
 _UNSET = "not set"
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -52,8 +53,14 @@ def changed_settings(
     Returns:
         Dotted key -> (before, now), as JSON or ``not set``.
     """
+    steady = all(_steady(tree[section]) for tree in (saved, ours) if section in tree)
+    harmless = HARMLESS | LENGTH if steady else HARMLESS
     before, now = (
-        {k: v for name in (section, *TABLES) for k, v in _leaves(name, plain(tree.get(name, {})))}
+        {
+            key: value
+            for name in (section, *TABLES)
+            for key, value in _leaves(name, plain(tree.get(name) or {}), harmless)
+        }
         for tree in (saved, ours)
     )
     return {
@@ -63,7 +70,13 @@ def changed_settings(
     }
 
 
-def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
+def _steady(runner: Mapping[str, Any]) -> bool:
+    """Whether the learning rate of a step is the same however long the run is."""
+    constant = runner.get("lr_scheduler_type", "constant") == "constant"
+    return constant and not runner.get("warmup_ratio")
+
+
+def _leaves(name: str, value: Any, harmless: Set[str]) -> Iterator[tuple[str, str]]:
     """Dotted keys below ``name`` with their values as text; lists of tables count from 0."""
     if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
         value = {str(i): item for i, item in enumerate(value)}
@@ -71,8 +84,8 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, json.dumps(value, ensure_ascii=False)
         return
     for key, item in value.items():
-        if key not in HARMLESS and not key.endswith("_path"):
-            yield from _leaves(f"{name}.{key}", item)
+        if key not in harmless and not key.endswith("_path"):
+            yield from _leaves(f"{name}.{key}", item, harmless)
 
 
 def changed_statistics(saved: Any, ours: Any, name: str = "") -> list[str]:

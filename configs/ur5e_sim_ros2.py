@@ -16,12 +16,12 @@ On a real robot ``operator.type`` is ``UROperator``, without ``seed`` and ``real
 _base_ = "ur5e_sim_lift.py"
 
 inference = dict(
-    max_publish_step=400,
+    # 8 s at the 125 commands a second that UROperator sends.
+    max_publish_step=1000,
     operator=dict(
         _delete_=True,
         type="URSimROSOperator",
         model="ur5e",
-        publish_rate=50.0,
         camera_names=("front", "wrist"),
         height=96,
         width=128,

@@ -20,7 +20,7 @@ from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
 from fluxvla_sim.ur.scene import HOME as UR_HOME
 from fluxvla_ur.operator import UROperator
 
-from fluxvla_core.build import RunContext
+from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.require import message_class
@@ -284,6 +284,21 @@ def test_a_stream_that_dies_stops_the_arm_and_is_named(simulate, topics, tmp_pat
     assert (trip.rule, "is silent" in trip.what) == ("freshness", True)
 
 
+class Staying:
+    """A policy that stays at one pose."""
+
+    action_rate_hz, horizon, cameras = 10.0, 5, ("front",)
+
+    def __init__(self, embodiment, pose):
+        self.embodiment, self.pose = embodiment, pose
+
+    def reset(self, seed):
+        return
+
+    def predict_action(self, observation):
+        return np.tile(self.pose, (self.horizon, 1))
+
+
 @pytest.mark.realtime
 class TestUR5e:
     @pytest.mark.parametrize(
@@ -291,7 +306,7 @@ class TestUR5e:
     )
     def test_it_is_driven(self, simulate, connect, topics, controller):
         simulate("ur5e", "--ros2", "--cameras", "front", "--controller", controller)
-        operator = connect(UROperator, controller=controller, publish_rate=50.0, **UR)
+        operator = connect(UROperator, controller=controller, **UR)
         np.testing.assert_allclose(operator.get_frame().state, UR_HOME, atol=0.02)
         assert operator.speed_scaling == 1.0
 
@@ -301,9 +316,50 @@ class TestUR5e:
         drive(operator, target, lambda state: (abs(state - target) < allowed).all())
         assert topics.facts()["tasks"]["lift_cube"]["success"] is False
 
+    def test_it_follows_at_full_speed_and_ignores_what_is_too_far(
+        self, simulate, connect, tmp_path
+    ):
+        simulation = simulate("ur5e", "--ros2", "--cameras", "front")
+        operator = connect(UROperator, **UR)
+        published, publish = [operator.get_state()], operator.publish_action
+
+        def publishing(action):
+            published.append(action)
+            publish(action)
+
+        operator.publish_action = publishing
+        goal = UR_HOME + [1.2, 0, 0, 0, 0, 0, 0]
+        run = BaseInferenceRunner(
+            operator=operator,
+            policy=Staying(operator.embodiment, goal),
+            task_descriptions={"1": "stay"},
+            prepare_pose=goal,
+            safety={"ramp_scale": 1.0, "max_age_s": 40.0, "max_skew_s": 20.0},
+            context=RunContext(work_dir=tmp_path, task="1", section="inference"),
+            record_fps=None,
+            max_publish_step=25,
+        )
+        run.run_setup()
+        assert run.run()["outcome"] == "max_steps"
+        steps = np.abs(np.diff(np.array(published)[:, :6], axis=0)).max(axis=1)
+        # At 30 Hz each of these would be beyond what the robot takes.
+        assert steps.max() * 125 > 0.04 * 30
+        assert steps.max() <= 0.04
+
+        operator = connect(UROperator, **UR)
+        wait_for(lambda: np.allclose(operator.get_state()[:6], goal[:6], atol=0.04))
+        operator.publish_action(goal + [0.2, 0, 0, 0, 0, 0, 0])
+        time.sleep(1.0)
+        np.testing.assert_allclose(operator.get_state()[:6], goal[:6], atol=0.04)
+        simulation.send_signal(signal.SIGINT)
+        told = "".join(simulation.communicate(timeout=60))
+        assert (
+            told.count("positions more than 0.04 rad from the last one and from the arm are") == 1
+        )
+
     def test_its_speed_slider_is_moved_and_its_cameras_have_depth(self, simulate, connect, topics):
         simulate("ur5e", "--ros2", "--cameras", "front", "--speed-scaling", "40")
-        operator = connect(UROperator, publish_rate=50.0, use_depth_image=True, **UR)
+        operator = connect(UROperator, use_depth_image=True, **UR)
         frame = operator.get_frame()
         assert 0.3 < np.nanmin(frame.depths["front"]) < np.nanmax(frame.depths["front"]) < 2.0
         assert operator.speed_scaling == 0.4
@@ -356,7 +412,7 @@ class TestInSimulation:
         self, simulate, connect, topics, monkeypatch
     ):
         simulate("ur5e", "--ros2", "--cameras", "front")
-        operator = connect(URSimROSOperator, publish_rate=50.0, **UR)
+        operator = connect(URSimROSOperator, **UR)
         operator.begin_episode("pick up the red cube", 4)
         assert operator.task_success() is False
         topics.tell("/sim/fault", "front=freeze")

@@ -162,6 +162,19 @@ class TestBodies:
 
         assert [body.target(t)[0] for t in (10.0, 10.25, 10.5, 11.0)] == [0.0, 0.5, 1.0, 1.0]
 
+    def test_streamed_positions_that_are_too_far_are_ignored(self):
+        body, topic = URBody(), "/forward_position_controller/commands"
+        body.reset(np.zeros(7))
+        for position in (0.04, 0.08):
+            body.hear(topic, SimpleNamespace(data=[position] * 6), 0.0)
+        with pytest.raises(BadMessage, match=r"more than 0\.04 rad from the last one and from the"):
+            body.hear(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
+        assert body.target(0.0)[0] == 0.08
+
+        body.say(np.full(7, 0.1), 0.0)
+        body.hear(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
+        assert body.target(0.0)[0] == 0.13
+
     def test_a_speed_slider_slows_down_what_is_left_of_a_trajectory(self):
         body = URBody("scaled_joint_trajectory_controller", speed_scaling=50.0)
         body.reset(np.zeros(7))

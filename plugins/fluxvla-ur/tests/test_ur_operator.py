@@ -10,7 +10,7 @@ from fluxvla_ur.embodiment import JOINTS, ur_spec
 from fluxvla_ur.operator import CONTROLLERS, TRAJECTORY, UROperator
 
 from fluxvla_core import BaseInferenceRunner, RunContext
-from fluxvla_core.errors import ConfigError, Faulted, NotReady
+from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
 from fluxvla_core.ros2.streams import FLOAT64, FLOAT64_ARRAY, IMAGE, JOINT_STATE
 from fluxvla_core.testing import OperatorConformance
 from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
@@ -26,18 +26,22 @@ SCALING = "/speed_scaling_state_broadcaster/speed_scaling"
 RUNNING = "/io_and_status_controller/robot_program_running"
 
 
+def where(pose):
+    """Names and positions of a UR's joint states; older drivers order them by the alphabet."""
+    at = dict(zip(JOINTS, pose, strict=True)) | {"finger_joint": 0.4}
+    names = sorted(at)
+    return {"names": names, "positions": [float(at[name]) for name in names]}
+
+
 def robot(controller=FORWARD, scaling=None, running=None):
-    """Streams and sinks of a UR's drivers; older ones order joints by the alphabet."""
+    """Streams and sinks of a UR's drivers."""
     topic, message = CONTROLLERS[controller]
-    where = dict(zip(JOINTS, POSE, strict=True)) | {"finger_joint": 0.4}
-    names = sorted(where)
     streams = [
         {
             "topic": "/joint_states",
             "message": JOINT_STATE,
             "hz": 125,
-            "names": names,
-            "positions": [where[name] for name in names],
+            **where(POSE),
             "follows": topic,
             "command_names": list(JOINTS),
         },
@@ -123,7 +127,23 @@ class TestConfig:
             ("/forward_position_controller/commands", FLOAT64_ARRAY),
             ("/gripper/command", FLOAT64),
         ]
-        assert operator.embodiment == ur_spec()
+        assert operator.embodiment == ur_spec(rate_hz=125.0)
+
+    @pytest.mark.parametrize(
+        ("model", "controller", "rate_hz"),
+        [("ur3e", FORWARD, 250.0), ("ur10e", FORWARD, 125.0), ("ur5e", SCALED, 30.0)],
+    )
+    def test_the_default_rate_is_what_the_robot_needs(self, model, controller, rate_hz):
+        operator = UROperator(model=model, controller=controller)
+
+        assert operator.embodiment.rate_hz == rate_hz
+
+    @pytest.mark.parametrize(("model", "rate_hz"), [("ur5e", 50.0), ("ur3e", 125.0)])
+    def test_a_rate_at_which_the_robot_would_ignore_commands_is_refused(self, model, rate_hz):
+        with pytest.raises(ConfigError, match=r"the robot ignores more than 0\.04 rad") as caught:
+            UROperator(model=model, publish_rate=rate_hz)
+        assert "leave publish_rate out, or set it to" in caught.value.next
+        UROperator(model=model, publish_rate=rate_hz, controller=SCALED)
 
     def test_topics_models_and_cameras_are_those_of_the_config(self):
         operator = UROperator(
@@ -177,6 +197,27 @@ class TestRobot:
         np.testing.assert_allclose(driver.on("/gripper/command")[0]["data"], 0.6)
         wait_for(lambda: np.allclose(operator.get_state(), [*np.add(POSE, 0.01), 0.25]))
 
+    def test_a_command_that_the_robot_would_ignore_is_refused(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect()
+        for count, away in ((1, 0.03), (2, 0.06)):
+            operator.send_action([*np.add(POSE, away), 0.5])
+            wait_for(lambda n=count: len(driver.on(COMMANDS)) == n)
+        jump = [*np.add(POSE, 0.06 + 0.05), 0.5]
+
+        with pytest.raises(Rejected, match=r"more than 0\.04 rad from the last one and from where"):
+            operator.send_action(jump)
+        assert len(driver.on(COMMANDS)) == 2
+        # Somebody moved it there by hand.
+        driver.tell(change={"/joint_states": {"follows": "", **where(np.add(POSE, 0.11))}})
+        wait_for(lambda: np.allclose(operator.get_state()[:6], np.add(POSE, 0.11)))
+        operator.send_action(jump)
+
+    def test_trajectories_may_be_as_long_as_they_like(self, connect, drivers):
+        driver = drivers(*robot(SCALED))
+        connect(controller=SCALED).send_action([*np.add(POSE, 0.5), 0.5])
+        wait_for(lambda: driver.on(CONTROLLERS[SCALED][0]))
+
     def test_a_gripper_among_the_joints(self, connect, drivers):
         drivers(*robot())
         operator = connect(gripper_joint="finger_joint", gripper_closed=0.8, gripper_open=0.0)
@@ -223,12 +264,12 @@ class TestWhatTheRobotSays:
     def test_a_slider_that_is_moved_while_the_arm_moves(self, connect, drivers, tmp_path):
         """Commands keep all limits and the share of the speed; the arm is not taken for blocked."""
         driver = drivers(*robot(scaling=20.0))
-        operator = connect(publish_rate=50.0)
+        operator = connect()
         wait_for(lambda: operator.newest("speed scaling"))
         published, publish = [], operator.publish_action
 
         def publishing(action):
-            share = {80: 100.0, 120: 30.0}.get(len(published))
+            share = {200: 100.0, 300: 30.0}.get(len(published))
             if share is not None:
                 driver.tell(change={SCALING: {"data": share}})
             published.append((operator.speed_scaling, action))
@@ -242,15 +283,15 @@ class TestWhatTheRobotSays:
             task_descriptions={"1": "turn"},
             prepare_pose=[0.4, *POSE[1:], 0.5],
             record_fps=None,
-            max_publish_step=160,
+            max_publish_step=400,
         )
         runner.run_setup()
         assert runner.run()["outcome"] == "max_steps"
 
         shares, actions = (np.array(values) for values in zip(*published, strict=True))
         joint = operator.embodiment.joints[0]
-        speed = np.diff(actions[:, 0], prepend=POSE[0]) * 50.0
-        push = np.diff(speed, prepend=0.0) * 50.0
+        speed = np.diff(actions[:, 0], prepend=POSE[0]) * 125.0
+        push = np.diff(speed, prepend=0.0) * 125.0
         assert sorted(set(shares)) == pytest.approx([0.2, 0.3, 1.0])
         assert np.abs(push).max() <= joint.acceleration
         assert np.abs(speed).max() <= joint.velocity

@@ -121,8 +121,9 @@ class RosOperator(ABC):
         """Called in every ``stop``, after the arm holds: stop what else can move."""
         return
 
-    def admit(self) -> None:
-        """Called before each command; raises Faulted where the robot says that it takes none."""
+    def admit(self, action: Array) -> None:
+        """Called before each command; raises Faulted where the robot says that it takes none, and
+        Rejected where it would not take this one."""
         return
 
     # The contract.
@@ -234,7 +235,7 @@ class RosOperator(ABC):
             connection.check()
             if self._fault is not None:
                 raise self._fault
-            self.admit()
+            self.admit(checked)
             self.publish_action(checked)
             self._last, self._moving = checked, True
 

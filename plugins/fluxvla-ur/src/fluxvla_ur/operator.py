@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import ConfigError, Faulted
+from fluxvla_core.errors import ConfigError, Faulted, Rejected
 from fluxvla_core.ros2 import joints
 from fluxvla_core.ros2.operator import RosOperator
 from fluxvla_core.ros2.require import message_class
@@ -26,6 +26,7 @@ from fluxvla_core.ros2.trouble import BadMessage, Stale
 from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
 from fluxvla_ur.readiness import check_not_paused
+from fluxvla_ur.servo import STEP, STREAMED, check_rate, is_taken, servo_rate
 
 Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
@@ -33,7 +34,7 @@ BOOL = "std_msgs.msg:Bool"
 _ARM = len(JOINTS)
 
 CONTROLLERS: Mapping[str, tuple[str, str]] = {
-    "forward_position_controller": ("/forward_position_controller/commands", FLOAT64_ARRAY),
+    STREAMED: ("/forward_position_controller/commands", FLOAT64_ARRAY),
     "scaled_joint_trajectory_controller": (
         "/scaled_joint_trajectory_controller/joint_trajectory",
         TRAJECTORY,
@@ -67,7 +68,9 @@ class UROperator(RosOperator):
         speed_scaling_topic: percent, from the speed scaling state broadcaster.
         program_running_topic: whether the robot's program runs, from the IO and status controller.
         use_depth_image: read depth into ``frame.depths``.
-        publish_rate: commands a second.
+        publish_rate: commands a second. With ``forward_position_controller``, by default as many
+            as the robot needs at full speed: 125, for the UR3e's wrists 250; too few are refused
+            (``fluxvla_ur.servo`` says why). With the others 30.
         camera_names: what front and wrist camera are called, in this order; with fewer names the
             last is not used.
         height, width: of every picture, in pixels.
@@ -87,7 +90,7 @@ class UROperator(RosOperator):
     def __init__(
         self,
         model: str = "ur5e",
-        controller: str = "forward_position_controller",
+        controller: str = STREAMED,
         img_front_topic: str = "/front_camera/color/image_raw",
         img_left_topic: str = "/wrist_camera/color/image_raw",
         img_front_depth_topic: str = "/front_camera/depth/image_raw",
@@ -99,7 +102,7 @@ class UROperator(RosOperator):
         speed_scaling_topic: str = "/speed_scaling_state_broadcaster/speed_scaling",
         program_running_topic: str = "/io_and_status_controller/robot_program_running",
         use_depth_image: bool = False,
-        publish_rate: float = RATE_HZ,
+        publish_rate: float | None = None,
         camera_names: Sequence[str] = tuple(camera.name for camera in CAMERAS),
         height: int = 480,
         width: int = 640,
@@ -132,9 +135,15 @@ class UROperator(RosOperator):
             raise ConfigError(f"trajectory_time_s must be positive, got {trajectory_time_s}")
         try:
             cameras = tuple(Camera(name, height, width) for name in camera_names)
-            self.embodiment = ur_spec(model, cameras, publish_rate)
+            usual = ur_spec(model, cameras, RATE_HZ)
+            default = servo_rate(usual) if controller == STREAMED else RATE_HZ
+            rate = default if publish_rate is None else publish_rate
+            self.embodiment = ur_spec(model, cameras, rate)
         except ValueError as error:
             raise ConfigError(f"UROperator: {error}") from error
+        self._streamed = controller == STREAMED
+        if self._streamed:
+            check_rate(self.embodiment)
         topic, self._arm_message = CONTROLLERS[controller]
         self._arm_command = puppet_arm_left_cmd_topic or topic
         self._images = (img_front_topic, img_left_topic)
@@ -200,7 +209,7 @@ class UROperator(RosOperator):
             raise BadMessage(f"the speed scaling ({self._scaling_topic}) is {percent}")
         return min(max(percent / 100.0, 0.0), 1.0)
 
-    def admit(self) -> None:
+    def admit(self, action: Array) -> None:
         running = self.newest("program running")
         if running is not None and not running.message.data:
             raise Faulted(
@@ -209,6 +218,8 @@ class UROperator(RosOperator):
                 next="look at the teach pendant, clear the stop, and play the program again",
             )
         check_not_paused(self.speed_scaling)
+        if self._streamed:
+            self._check_step(action[:_ARM])
 
     def publish_action(self, action: Array) -> None:
         closed, opened = self._gripper_ends
@@ -229,6 +240,18 @@ class UROperator(RosOperator):
         point.time_from_start.sec, point.time_from_start.nanosec = seconds, nanoseconds
         command.joint_names = list(self._names)
         command.points = [point]
+
+    def _check_step(self, target: Array) -> None:
+        last = self.last_action
+        if last is not None and is_taken(target, last[:_ARM]):
+            return
+        if not is_taken(target, self.get_state()[:_ARM]):
+            raise Rejected(
+                f"the command is more than {STEP:g} rad from the last one and from where the arm "
+                "is: the robot would ignore it, and those after it",
+                cause="commands come too rarely for their speed, or one of them is a jump",
+                next="leave out publish_rate in operator and runner, or interpolate",
+            )
 
     def _gripper_position(self) -> float:
         received = self.newest("gripper")

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from fluxvla_aloha.presets import Preset
 from fluxvla_ur.embodiment import JOINTS
 from fluxvla_ur.operator import BOOL, CONTROLLERS, TRAJECTORY
+from fluxvla_ur.servo import STEP, STREAMED, is_taken
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.ros2 import joints
@@ -131,6 +132,8 @@ class AlohaBody:
 class URBody:
     """A UR arm as ur_robot_driver presents it, and a gripper that takes and gives a number.
 
+    Like the program on a real robot it ignores streamed positions that are too far away.
+
     Args:
         controller: the one that is active.
         speed_scaling: the teach pendant's slider in percent, which ``/sim/speed_scaling`` moves.
@@ -147,9 +150,7 @@ class URBody:
     # Older drivers sort joints by name; whoever reads them by index is found out here.
     _NAMES = tuple(sorted(JOINTS))
 
-    def __init__(
-        self, controller: str = "forward_position_controller", speed_scaling: float = 100.0
-    ) -> None:
+    def __init__(self, controller: str = STREAMED, speed_scaling: float = 100.0) -> None:
         self._topic, message = CONTROLLERS[controller]
         self._scaled = controller == self._SCALED
         if not 0 <= speed_scaling <= 100:
@@ -177,6 +178,7 @@ class URBody:
 
     def say(self, state: Array, now: float) -> dict[str, Any]:
         where = dict(zip(JOINTS, state, strict=False))
+        self._measured = np.array(state[: self._ARM])
         arm = message_class(JOINT_STATE)()
         number = message_class(FLOAT64)
         return {
@@ -195,6 +197,11 @@ class URBody:
             return
         arm = command_values(message, JOINTS, topic)
         seconds = 0.0
+        if self.commands[topic] != TRAJECTORY and not is_taken(arm, self._to, self._measured):
+            raise BadMessage(
+                f"{topic}: positions more than {STEP:g} rad from the last one and from the arm are "
+                "ignored, as the program on the robot does"
+            )
         if self.commands[topic] == TRAJECTORY:
             after = message.points[-1].time_from_start
             seconds = after.sec + after.nanosec * 1e-9
@@ -217,7 +224,7 @@ class URBody:
         return np.append(self._from + share * (self._to - self._from), self._gripper)
 
     def reset(self, state: Array) -> None:
-        self._from = self._to = np.array(state[: self._ARM])
+        self._from = self._to = self._measured = np.array(state[: self._ARM])
         self._gripper = float(state[self._ARM])
         self._since = self._seconds = 0.0
 

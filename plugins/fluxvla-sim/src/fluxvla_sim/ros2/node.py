@@ -44,6 +44,9 @@ _SETTLE_S = 0.1
 # A process that was stopped for longer than this goes on from now, instead of catching up.
 _FAR_BEHIND_S = 0.5
 _WELL = "well"
+# Commands that may wait while this process is kept from running: a UR ignores what comes after a
+# gap, and a simulation's stall is none of the commander's.
+_WAITING = 200
 # Of a product of two rates; a billion parts are months.
 _ROUNDING = 1e-9
 
@@ -284,7 +287,7 @@ class RobotNode:
         self._listen("/sim/fault", "std_msgs.msg:String", lambda m: self._ill(m.data))
 
     def _listen(self, topic: str, message: str, callback: Callable[[Any], None]) -> None:
-        profile = qos.profile(qos.RELIABLE, 10)
+        profile = qos.profile(qos.RELIABLE, _WAITING)
         self._connection.node.create_subscription(message_class(message), topic, callback, profile)
 
     def _hear(self, topic: str) -> Callable[[Any], None]:

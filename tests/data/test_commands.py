@@ -221,6 +221,19 @@ def test_statistics_for_people(shared, takes, fluxvla):
     assert any(line.startswith("  green") for line in out)
 
 
+def test_statistics_tell_people_what_hardly_moves(tmp_path, recorder, take, fluxvla):
+    still = take(4, 300)
+    still.state[:, 0] = 0.5
+    still.action[:, 2] = 0.0
+    still.action[7, 2] = 1.0
+    out = fluxvla("stats", recorder(tmp_path / "still", [still]))[1].splitlines()
+    action = out.index("action: 300 frames")
+    state = out.index("observation.state: 300 frames")
+    assert [i for i, line in enumerate(out) if line.endswith("  never moves")] == [state + 2]
+    rare = "  moves in under 2 % of the frames"
+    assert [i for i, line in enumerate(out) if line.endswith(rare)] == [action + 4]
+
+
 def test_statistics_of_version_2_are_not_written(tmp_path, takes, fluxvla):
     root = write_v2(tmp_path / "old", takes)
     code, out, err = fluxvla("stats", root, "--write")

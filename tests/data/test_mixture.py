@@ -178,6 +178,16 @@ def test_statistics_are_computed_once_for_all_that_share_them(shared, others, mo
     assert computed == [38]
 
 
+def test_what_several_doubt_of_shared_statistics_is_said_once(tmp_path, recorder, take):
+    roots = []
+    for key in (0, 1):
+        still = take(key, 6)
+        still.state[:, 1] = 0.5
+        roots.append(recorder(tmp_path / str(key), [still]))
+    (said,) = mixture(*(table(root, transforms=[NORMALISE]) for root in roots)).doubts()
+    assert "state elbow" in said
+
+
 def test_another_robot_has_statistics_of_its_own(shared, others, left):
     groups = {"right": [table(shared), table(others[0])], "left": table(left)}
     dataset = DistributedRepeatingDataset(groups)

@@ -379,3 +379,13 @@ def test_parameters_that_make_no_sense_are_refused(shared, options, message):
 def test_no_dataset_named():
     with pytest.raises(ConfigError, match="data_root_path names no dataset"):
         ParquetDataset([], [], ["top"])
+
+
+def test_joints_that_hardly_move_are_called_by_their_names(tmp_path, recorder, take):
+    still = take(4, 12)
+    still.state[:, 1] = 0.5
+    root = recorder(tmp_path / "still", [still])
+    (said,) = load(root, [{"type": "NormalizeStatesAndActions"}]).doubts()
+    assert ": state elbow (range 0, divided by 1e-06);" in said
+    assert load(root, TRANSFORMS).doubts() == []
+    assert load(root).doubts() == []

@@ -29,6 +29,18 @@ def _fast():
         yield
 
 
+def test_what_a_dataset_doubts_is_said_before_the_first_step(tmp_path):
+    class Doubted(TinyDataset):
+        def doubts(self):
+            return ["state wrist never moves"]
+
+    said = Said()
+    runner = make(tmp_path, reporter=said)
+    runner.run_setup(37)
+    runner.run(Doubted())
+    assert said.lines.count("warning: state wrist never moves") == 1
+
+
 def test_a_run_ends_with_a_checkpoint_that_is_enough_by_itself(tmp_path):
     """T4 of the field notes: the final state was not saved."""
     said = Said()

@@ -221,3 +221,83 @@ def test_unreadable_statistics(tmp_path):
     (tmp_path / "list.json").write_text("[]")
     with pytest.raises(ConfigError, match=r"list\.json holds a list, not a table"):
         DenormalizePrivateAction(tmp_path / "list.json")
+
+
+JOINTS = ("waist", "wrist", "gripper")
+
+
+def seldom():
+    """A joint that moves, one that is held, and a gripper that opens in 5 of 1000 frames."""
+    rows = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    rows[:, 1:] = 0.25, 0.0
+    rows[500:505, 2] = 0.08
+    entry = stats_of(rows)
+    return {"proprio": entry, "action": entry}
+
+
+def test_what_hardly_moves_is_named_with_its_scale():
+    (said,) = NormalizeStatesAndActions().doubts(seldom(), JOINTS, JOINTS)
+    assert "NormalizeStatesAndActions(norm_type='mean_std', std_floor=0)" in said
+    assert said.endswith(
+        ": state wrist (range 0, divided by 1e-06); set std_floor=0.01 or so, in the data's units: "
+        "nothing is divided by less; or another norm_type"
+    )
+    (said,) = NormalizeStatesAndActions(std_floor=1e-5).doubts(seldom())
+    assert ": state 1 (range 0, divided by 1.1e-05);" in said
+
+
+def test_moves_that_would_be_blown_up_are_refused():
+    """The gripper's 8 cm became 160000: its quantiles are equal."""
+    with pytest.raises(ConfigError) as caught:
+        NormalizeStatesAndActions(norm_type="quantile").doubts(seldom(), JOINTS, JOINTS)
+    words = str(caught.value)
+    for what in ("state", "action"):
+        assert f"{what} gripper (range 0.08, divided by 5e-07)" in words
+    assert "waist" not in words
+    assert "wrist" not in words
+    assert "set std_floor=0.01 or so" in words
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"std_floor": 0.01},
+        {"std_floor": 0.01, "norm_type": "quantile"},
+        {"norm_type": "none"},
+    ],
+)
+def test_a_floor_leaves_no_doubts(settings):
+    assert NormalizeStatesAndActions(**settings).doubts(seldom(), JOINTS, JOINTS) == []
+
+
+def test_what_is_not_normalised_is_not_doubted():
+    stats = {**seldom(), "proprio": make_stats()["proprio"]}
+    mask = [True, True, False]
+    quantile = {"norm_type": "quantile", "action_norm_mask": mask}
+    assert NormalizeStatesAndActions(**quantile).doubts(stats) == []
+    # A held joint is one that no action moves, whatever a model says of it.
+    assert NormalizeStatesAndActions().doubts(stats) == []
+
+
+def test_rare_moves_far_from_the_rest_are_doubted_not_refused():
+    rows = np.zeros((100_000, 1), np.float32)
+    rows[7] = 1.0
+    stats = {"proprio": make_stats(dim=1)["proprio"], "action": stats_of(rows)}
+    (said,) = NormalizeStatesAndActions().doubts(stats, ["lift"], ["lift"])
+    assert ": action lift (range 1, divided by 0.0032);" in said
+
+
+def test_each_dimension_is_doubted_at_the_step_where_it_moves_least():
+    rows = [np.random.default_rng(j).normal(size=(300, 2)) for j in range(3)]
+    rows[1][:, 1] = 0.0
+    rows[1][3, 1] = 1.0
+    each = [stats_of(r) for r in rows]
+    action = {name: [e[name] for e in each] for name in each[0]}
+    stats = {"proprio": make_stats(dim=2)["proprio"], "action": action}
+    with pytest.raises(ConfigError, match=r"action 1 \(range 1, divided by 5e-07\)"):
+        NormalizeStatesAndActions(norm_type="quantile").doubts(stats)
+
+
+def test_statistics_without_extremes_are_not_doubted():
+    bare = {"mean": [0.0], "std": [0.0]}
+    assert NormalizeStatesAndActions().doubts({"proprio": bare, "action": bare}) == []

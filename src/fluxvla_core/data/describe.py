@@ -58,7 +58,7 @@ def describe(root: Path) -> dict[str, Any]:
         ],
         "cameras": {key: _camera(meta, key) for key in meta.cameras},
         "vectors": {
-            key: {"size": meta.vector(key), "names": _names(meta, key)} for key in meta.vectors
+            key: {"size": meta.vector(key), "names": meta.names(key)} for key in meta.vectors
         },
         "data": _size(data),
     }
@@ -126,13 +126,22 @@ def table(meta: Metadata, stats: Mapping[str, Stats]) -> list[str]:
     out = []
     for key, entry in stats.items():
         out.append(f"{key}: {int(entry['count'][0])} frames")
-        names = _names(meta, key) or [str(i) for i in range(entry["mean"].size)]
+        said = ["red", "green", "blue"] if key in meta.cameras else meta.names(key)
+        names = said or [str(i) for i in range(entry["mean"].size)]
         width = max(6, *(len(name) for name in names))
         out.append(f"  {'':{width}}" + "".join(f"{name:>11}" for name in SHOWN))
         flat = {name: entry[name].ravel() for name in SHOWN}
         for i, name in enumerate(names):
-            out.append(f"  {name:{width}}" + "".join(f"{flat[s][i]:11.4g}" for s in SHOWN))
+            numbers = "".join(f"{flat[s][i]:11.4g}" for s in SHOWN)
+            out.append(f"  {name:{width}}{numbers}{_still({s: flat[s][i] for s in SHOWN})}")
     return out
+
+
+def _still(values: Mapping[str, float]) -> str:
+    """What a normalisation divides by next to nothing."""
+    if values["min"] == values["max"]:
+        return "  never moves"
+    return "  moves in under 2 % of the frames" if values["q01"] == values["q99"] else ""
 
 
 def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
@@ -161,17 +170,6 @@ def _camera(meta: Metadata, key: str) -> dict[str, Any]:
     files = {meta.video_file(key, file) for file in places.files} if places else set()
     codec = said.get("video.codec")
     return {"height": height, "width": width, "codec": codec, **_size(files)}
-
-
-def _names(meta: Metadata, key: str) -> list[str]:
-    """The entries' names: a list, or in older datasets a table of lists; [] if they do not fit."""
-    if key in meta.cameras:
-        return ["red", "green", "blue"]
-    names = meta.features[key].get("names")
-    if isinstance(names, Mapping):
-        names = [n for part in names.values() if isinstance(part, list) for n in part]
-    fits = isinstance(names, list) and len(names) == meta.vector(key)
-    return [str(n) for n in names or ()] if fits else []
 
 
 def _size(files: set[Path]) -> dict[str, int]:

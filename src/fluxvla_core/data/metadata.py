@@ -106,6 +106,17 @@ class Metadata:
             )
         return int(feature["shape"][0])
 
+    def names(self, key: str) -> list[str]:
+        """What a vector's entries are called: a list, in older datasets a table of lists.
+
+        Empty if they have no names, or others than it has entries.
+        """
+        names = self.features[key].get("names")
+        if isinstance(names, Mapping):
+            names = [n for part in names.values() if isinstance(part, list) for n in part]
+        fits = isinstance(names, list) and len(names) == self.vector(key)
+        return [str(n) for n in names or ()] if fits else []
+
     def hint(self, name: str, known: Sequence[str]) -> str:
         """``; did you mean …? there are …`` for a message."""
         short = {v3.camera_name(k): k for k in known}

@@ -117,6 +117,15 @@ class DistributedRepeatingDataset:
         """The instructions of all datasets."""
         return tuple(dict.fromkeys(t for d in self.datasets for t in getattr(d, "tasks", ())))
 
+    def doubts(self) -> list[str]:
+        """What somebody should know before training begins; the same of several is said once.
+
+        Raises:
+            ConfigError: see ``ParquetDataset.doubts``.
+        """
+        asked = [d for d in self.datasets if hasattr(d, "doubts")]
+        return list(dict.fromkeys(doubt for dataset in asked for doubt in dataset.doubts()))
+
     def use_seed(self, seed: int) -> None:
         """Draw by the run's seed from now on, here and in every dataset, but for given ones."""
         if not self._own_seed:

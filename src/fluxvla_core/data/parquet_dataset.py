@@ -108,6 +108,7 @@ class ParquetDataset:
         self._embodiment = find_embodiment(self.recordings, embodiment)
         if use_delta:
             self.recordings = [differences(r) for r in self.recordings]
+        self.state_key, self.action_key = state_key, action_key
         self.action_window_size = action_window_size
         self.window_start_idx = window_start_idx
         self.use_delta = use_delta
@@ -159,6 +160,17 @@ class ParquetDataset:
         Each has mean, std, min, max, q01, q10, q50, q90, q99 and count, as lists.
         """
         return {self.statistic_name: pooled_statistics([self])}
+
+    def doubts(self) -> list[str]:
+        """What somebody should know before training begins: what transforms say of the statistics.
+
+        Raises:
+            ConfigError: numbers would be normalised to what nothing can be learnt from.
+        """
+        meta, stats = self.recordings[0].meta, self.statistics[self.statistic_name]
+        names = meta.names(self.state_key), meta.names(self.action_key)
+        asked = [t for t in self.pipeline.transforms if hasattr(t, "doubts")]
+        return [doubt for transform in asked for doubt in transform.doubts(stats, *names)]
 
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
         """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""

@@ -33,6 +33,9 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
         run.hooks = HookCaller(context)
     run.dataset = dataset
     take_seed(dataset, options.seed)
+    doubts: list[str] = getattr(dataset, "doubts", list)()
+    for doubt in doubts if world.first else ():
+        context.reporter.warn(doubt)
     run.plan = run._plan(len(dataset), run._shards(dataset))
     run._saver = Saver(world, options.async_save, run.optimizer)
     run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.transforms.scaling import Affine, check_norm_type, make_affine
+from fluxvla_core.transforms.stillness import hardly_moving
 
 Sample = dict[str, Any]
 Floats = npt.NDArray[np.float64]
@@ -98,6 +99,47 @@ class NormalizeStatesAndActions:
             statistic_name=statistic_name,
             action_key=self.action_key,
         )
+
+    def doubts(
+        self, stats: Mapping[str, Any], states: Sequence[str] = (), actions: Sequence[str] = ()
+    ) -> list[str]:
+        """What somebody should know before they train by ``stats``: what hardly moves in the data.
+
+        ``states`` and ``actions`` are the names of the dimensions.
+
+        Raises:
+            ConfigError: one that does move, but rarely, would be divided by its ``quantile``
+                range of 0: its moves would be blown up a million times.
+        """
+        if self.norm_type == "none":
+            return []
+        state, action = self._scales(stats)
+        entries = stats[self.state_key], stats[self.action_key]
+        mask = self.action_norm_mask
+        moved = list(hardly_moving("action", entries[1], action.scale, actions, mask))
+        found = [
+            *hardly_moving("state", entries[0], state.scale, states),
+            # One that never moves is no harm here: whatever a model says of it, it stays there.
+            *(still for still in moved if still.blown_up),
+        ]
+        who = f"{type(self).__name__}(norm_type={self.norm_type!r}, std_floor={self.std_floor:g})"
+        todo = (
+            "set std_floor=0.01 or so, in the data's units: nothing is divided by less; "
+            "or another norm_type"
+        )
+        rare = [still for still in found if still.blown_up and still.rare]
+        if self.norm_type == "quantile" and rare:
+            raise ConfigError(
+                f"{who} would blow up {', '.join(map(str, rare))}",
+                cause="they move in under 2 % of the frames, so that q01 and q99 are equal",
+                next=todo,
+            )
+        if not found:
+            return []
+        return [
+            f"{who} divides by next to nothing what hardly moves in the data, so that small errors "
+            f"and rare moves become huge numbers: {', '.join(map(str, found))}; {todo}"
+        ]
 
     def _scales(self, stats: Any) -> tuple[Affine, Affine]:
         if self._known is None or self._known[0] is not stats:

@@ -152,6 +152,27 @@ def test_one_process_in_bf16_with_recomputing(tmp_path):
     assert {t.dtype for n, t in tensors.items() if n != "batches"} == {torch.float32}
 
 
+def moved_whole(work_dir):
+    """Torch moves a unit when it splits it: only what stays whole is moved here, at the end."""
+    runner = build(work_dir)
+    vla = runner._build_vla()
+    frozen = [p.data_ptr() for p in vla.parameters() if not p.requires_grad]
+    moved, to = [], torch.Tensor.to
+    torch.Tensor.to = lambda t, *args, **kwargs: (
+        moved.append(t.data_ptr()) or to(t, *args, **kwargs)
+    )
+    try:
+        runner._wrap_model(vla)
+    finally:
+        torch.Tensor.to = to
+    assert frozen
+    assert sorted(moved) == sorted(frozen)
+
+
+def test_no_device_holds_the_whole_model(tmp_path):
+    assert run_ranks(1, moved_whole, tmp_path) == [0]
+
+
 WORKER = """
 import json, os, pathlib, sys
 from fluxvla_core.testing.training import train

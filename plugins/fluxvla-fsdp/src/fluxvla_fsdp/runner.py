@@ -52,11 +52,11 @@ class FSDPTrainRunner(BaseTrainRunner):
 
         from fluxvla_core.train.units import units_of
 
-        vla = vla.to(self.world.device)
+        frozen = {p for p in vla.parameters() if not p.requires_grad}
         shared: dict[str, Any] = {
             "mesh": self._mesh(),
             "mp_policy": self._precision(),
-            "ignored_params": {p for p in vla.parameters() if not p.requires_grad},
+            "ignored_params": frozen,
         }
         reshard = self.sharding_strategy in ("full-shard", "hybrid-shard")
         for unit in units_of(vla):
@@ -65,6 +65,9 @@ class FSDPTrainRunner(BaseTrainRunner):
                 fully_shard(modules, reshard_after_forward=reshard, **shared)
         # Whatever is in no unit is gathered first and used until the end: no use in letting go.
         fully_shard(vla, reshard_after_forward=False, **shared)
+        # What is split was moved unit by unit: the whole model need not fit one device.
+        for parameter in frozen:
+            parameter.data = parameter.data.to(self.world.device)
         return vla
 
     def _mesh(self) -> DeviceMesh:

@@ -55,6 +55,18 @@ class TestSmall(OperatorConformance):
         return operator.heard
 """
 
+# One of the specification's shape, whose readings are a dict, and how its runner understands them.
+SHAPED = (
+    GOOD.replace(
+        "    def get_frame(self):\n",
+        "    def get_frame(self):\n        return vars(self._read())\n    def _read(self):\n",
+    ).replace("SmallOperator", "ShapedOperator")
+    + """
+    def frame(self, operator):
+        return Frame(**operator.get_frame())
+"""
+)
+
 BROKEN = {
     "test_is_complete": ('    api = "1.0"\n', ""),
     "test_import_is_light": ("import time\n", "import time, torch\n"),
@@ -102,8 +114,9 @@ BROKEN = {
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """``specimen::check`` -> outcome: all checks of the right one, its own of each wrong one."""
     folder = tmp_path_factory.mktemp("specimens")
-    wanted = ["specimen_right.py"]
-    (folder / wanted[0]).write_text(GOOD)
+    wanted = ["specimen_right.py", "specimen_shaped.py"]
+    for name, source in zip(wanted, (GOOD, SHAPED), strict=True):
+        (folder / name).write_text(source)
     for number, (check, (old, new)) in enumerate(BROKEN.items()):
         assert old in GOOD
         name = f"specimen_{number}.py"
@@ -122,8 +135,9 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return found
 
 
-def test_a_right_operator_passes_every_check(outcomes):
-    right = {k: v for k, v in outcomes.items() if k.startswith("specimen_right.py::")}
+@pytest.mark.parametrize("specimen", ["specimen_right.py", "specimen_shaped.py"])
+def test_a_right_operator_passes_every_check(outcomes, specimen):
+    right = {k: v for k, v in outcomes.items() if k.startswith(f"{specimen}::")}
     assert len(right) >= 20
     assert set(right.values()) == {"PASSED"}
 

@@ -1,7 +1,8 @@
-"""Train a small policy on a few demonstrations, then let it drive the arm in memory.
+"""Train a small policy on a few demonstrations, then let it drive the simulated arm.
 
 python -m fluxvla_myrobot.demos work_dirs/myrobot/dataset
 fluxvla run --config configs/myrobot.py --section runner
+python -m fluxvla_myrobot.sim arm &
 fluxvla run --config configs/myrobot.py --section inference --task 1
 """
 
@@ -75,30 +76,6 @@ runner = dict(
     metric=dict(type="VLAMetric", active_trackers=("jsonl",)),
 )  # fmt: skip
 
-# The page's operator describes no robot; this does. Nothing is sent without it.
-embodiment = dict(
-    name="myrobot",
-    joints=[
-        dict(name=f"joint_{n}", unit="rad", lower=-3.14, upper=3.14, velocity=2, acceleration=10)
-        for n in range(1, 7)
-    ]
-    + [
-        dict(
-            name="gripper",
-            unit="m",
-            lower=0.0,
-            upper=0.085,
-            velocity=0.2,
-            acceleration=2.0,
-            kind="gripper",
-            open=0.085,
-            closed=0.0,
-        )
-    ],
-    cameras=[dict(name=name, height=32, width=32) for name in CAMERAS],
-    rate_hz=30,
-)
-
 inference = dict(
     type="MyRobotInferenceRunner",
     seed=7,
@@ -108,7 +85,6 @@ inference = dict(
         "2": "place it on the shelf",
     },
     max_publish_step=90,
-    embodiment=embodiment,
     dataset=dict(
         type="PrivateInferenceDataset",
         embodiment_id=3,

@@ -1,8 +1,9 @@
-"""An operator, as the page 'Adding Custom Engines' writes it.
+"""An operator, as the page 'Adding Custom Engines' writes it, on ROS 2.
 
-Where the page uses rospy, this uses ``fluxvla_myrobot.topics``, a robot in memory. Its pictures are
-arrays already, so there is no cv_bridge. The page's operator has no wrist camera although its
-runner reads one; here it has.
+Three things differ from the page. ROS 2 is where ROS 1 was, and ``connect`` opens it, not the
+constructor, so that a config can be checked without a robot. There is a wrist camera, which the
+page's runner reads and its operator lacks. Below the page's methods is what it leaves out of the
+operator contract.
 """
 # The code below is the page's, in its own style.
 # ruff: noqa
@@ -11,11 +12,14 @@ runner reads one; here it has.
 import threading
 from collections import deque
 
-from fluxvla_myrobot import topics
+from fluxvla_core.errors import NotReady
+from fluxvla_core.ros2.actions import checked_action
+from fluxvla_core.ros2.images import to_rgb
+from fluxvla_myrobot.embodiment import SPEC
 
 
 class MyRobotOperator:
-    """A custom robot's communication."""
+    """A custom robot's ROS communication."""
 
     def __init__(self,
                  img_front_topic: str,
@@ -39,25 +43,40 @@ class MyRobotOperator:
         self._joint_state_buffer = deque(maxlen=1)
         self._lock = threading.Lock()
 
-        self._init_ros()
+        self._connection = None
 
     def _init_ros(self):
         """Subscribe and advertise."""
-        topics.Subscriber(self._img_front_topic, self._img_front_callback)
-        topics.Subscriber(self._img_wrist_topic, self._img_wrist_callback)
-        topics.Subscriber(self._joint_state_topic, self._joint_state_callback)
-        self._joint_cmd_pub = topics.Publisher(self._joint_cmd_topic)
-        self._gripper_pub = topics.Publisher('/gripper_command')
+        from fluxvla_core.ros2.connection import Connection
+        self._connection = Connection('my_robot')
+        node = self._connection.node
+
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import Image, JointState
+        from std_msgs.msg import Float64
+
+        node.create_subscription(
+            Image, self._img_front_topic, self._img_front_callback, qos_profile_sensor_data)
+        node.create_subscription(
+            Image, self._img_wrist_topic, self._img_wrist_callback, qos_profile_sensor_data)
+        node.create_subscription(
+            JointState, self._joint_state_topic, self._joint_state_callback, qos_profile_sensor_data)
+        self._joint_cmd_pub = node.create_publisher(
+            JointState, self._joint_cmd_topic, 1)
+        self._gripper_pub = node.create_publisher(
+            Float64, '/gripper_command', 1)
 
     def _img_front_callback(self, msg):
         """A picture of the front camera."""
+        img = to_rgb(msg, msg.height, msg.width)
         with self._lock:
-            self._img_front_buffer.append(msg)
+            self._img_front_buffer.append(img)
 
     def _img_wrist_callback(self, msg):
         """A picture of the wrist camera."""
+        img = to_rgb(msg, msg.height, msg.width)
         with self._lock:
-            self._img_wrist_buffer.append(msg)
+            self._img_wrist_buffer.append(img)
 
     def _joint_state_callback(self, msg):
         """The joints."""
@@ -83,10 +102,41 @@ class MyRobotOperator:
 
     def servoj(self, joint_positions):
         """Send joint positions."""
-        msg = topics.JointState()
+        from sensor_msgs.msg import JointState
+        msg = JointState()
         msg.position = list(joint_positions)
         self._joint_cmd_pub.publish(msg)
 
     def movegrip(self, gripper_position):
         """Open or close the gripper."""
-        self._gripper_pub.publish(float(gripper_position))
+        from std_msgs.msg import Float64
+        self._gripper_pub.publish(Float64(data=float(gripper_position)))
+
+    # What the page leaves out.
+
+    api = '1.0'
+    embodiment = SPEC
+
+    def connect(self):
+        """Open the connection; nothing if it is open."""
+        if self._connection is None:
+            self._init_ros()
+
+    def send_action(self, action):
+        """Send one command of seven numbers, if they are within the limits."""
+        checked = checked_action(self.embodiment, action)
+        if self._connection is None:
+            raise NotReady('the robot is not connected', next='call connect() first')
+        self.servoj(checked[:6])
+        self.movegrip(checked[6])
+
+    def stop(self):
+        """Nothing is sent: the arm stays where it was last told to go."""
+
+    def close(self):
+        """Give the connection back and forget what was read; any number of times."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        for buffer in (self._img_front_buffer, self._img_wrist_buffer, self._joint_state_buffer):
+            buffer.clear()

@@ -79,7 +79,8 @@ class Cameras(threading.Thread):
 
     def _draw(self, renderer: Renderer, data: Any, camera: str) -> None:
         depth = depth_stream(camera)
-        wanted = [s for s in (camera, depth) if self._publishers[s].get_subscription_count()]
+        there = [stream for stream in (camera, depth) if stream in self._publishers]
+        wanted = [s for s in there if self._publishers[s].get_subscription_count()]
         if not wanted:
             return
         stamp = self._look(data)

@@ -12,7 +12,7 @@ from fluxvla_sim.ros2.bodies import Body
 
 def depths(body: Body) -> dict[str, str]:
     """Stream -> topic of the depth pictures of those cameras that a robot has."""
-    return {depth_stream(camera): body.depths[camera] for camera in body.cameras}
+    return {depth_stream(c): body.depths[c] for c in body.cameras if c in body.depths}
 
 
 def check_stream(body: Body, stream: str) -> None:

@@ -33,7 +33,7 @@ def where(pose):
     return {"names": names, "positions": [float(at[name]) for name in names]}
 
 
-def robot(controller=FORWARD, scaling=None, running=None):
+def robot(controller=FORWARD, scaling=100.0, running=True):
     """Streams and sinks of a UR's drivers."""
     topic, message = CONTROLLERS[controller]
     streams = [
@@ -120,9 +120,11 @@ class TestConfig:
             ("cam_high", "/front_camera/color/image_raw", True),
             ("cam_left_wrist", "/wrist_camera/color/image_raw", True),
             ("gripper", "/gripper/position", True),
-            ("speed scaling", SCALING, False),
-            ("program running", RUNNING, False),
+            ("speed scaling", SCALING, True),
+            ("program running", RUNNING, True),
         ]
+        status = UROperator(require_status=False).streams()[-2:]
+        assert [s.required for s in status] == [False, False]
         assert [(c.topic, c.message) for c in operator.commands()] == [
             ("/forward_position_controller/commands", FLOAT64_ARRAY),
             ("/gripper/command", FLOAT64),
@@ -316,6 +318,45 @@ class TestWhatTheRobotSays:
 
         with pytest.raises(Faulted, match="the robot is paused: its speed scaling is 0"):
             operator.send_action([*POSE, 0.5])
+
+    def test_a_robot_that_says_nothing_of_itself_is_refused(self, ros_domain, drivers):
+        drivers(*robot(scaling=None, running=None))
+        with pytest.raises(NotReady, match=f"no publisher on {SCALING}") as caught:
+            UROperator(**{**QUICK, "connect_timeout_s": 2.0}).connect()
+
+        assert f"no publisher on {RUNNING} (program running)" in caught.value.what
+        assert "speed_scaling_state_broadcaster is not active" in caught.value.cause
+        assert "require_status=False" in caught.value.cause
+
+    def test_a_program_that_never_ran_is_refused(self, ros_domain, drivers):
+        """ur_robot_driver tells of changes only: until it is played first, it says nothing."""
+        streams, sinks = robot()
+        streams[-1]["latched"] = False
+        drivers(streams, sinks)
+        with pytest.raises(NotReady, match=r"no message arrives on program running") as caught:
+            UROperator(**{**QUICK, "connect_timeout_s": 2.0}).connect()
+
+        assert "External Control was not played on the teach pendant" in caught.value.cause
+
+    def test_without_them_there_is_a_warning(self, connect, drivers, caplog):
+        drivers(*robot(scaling=None, running=None))
+        operator = connect(require_status=False)
+
+        for label in (f"speed scaling ({SCALING})", f"program running ({RUNNING})"):
+            assert f"nobody publishes {label}: " in caplog.text
+        operator.send_action([*POSE, 0.5])
+        assert operator.speed_scaling == 1.0
+
+    @pytest.mark.parametrize("require_status", [True, False])
+    def test_a_slider_that_falls_silent_stops_the_arm(self, connect, drivers, require_status):
+        driver = drivers(*robot())
+        operator = connect(require_status=require_status)
+        wait_for(lambda: operator.newest("speed scaling"))
+        driver.tell(fault=f"{SCALING}=drop")
+        time.sleep(0.7)
+
+        with pytest.raises(NotReady, match=rf"speed scaling \({SCALING}\) is silent for"):
+            operator.get_state()
 
     @pytest.mark.parametrize("running", [True, False])
     def test_a_robot_whose_program_stopped_refuses(self, connect, drivers, running):

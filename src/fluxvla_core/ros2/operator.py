@@ -319,7 +319,7 @@ class RosOperator(ABC):
         }
         startup = Startup(connection, self._specs, commands, self._publishers)
         startup.wait(self.connect_timeout_s)
-        for warning in startup.count(self.rate_window_s):
+        for warning in [*startup.count(self.rate_window_s), *startup.unheard()]:
             log.warning("%s", warning)
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
@@ -380,17 +380,23 @@ class RosOperator(ABC):
         return [spec for spec in self._specs if spec.kind in kinds]
 
     def _fresh(self) -> dict[str, Received]:
-        """The newest message of every stream that has one; no required stream is silent."""
+        """The newest message of every stream that has one; none that should speak is silent."""
         connection = self._connected()
         connection.check()
         newest = {spec.name: connection.streams[spec.name].newest() for spec in self._specs}
-        required = {spec.name: newest[spec.name] for spec in self._specs if spec.required}
-        silent = sync.silent(required, time.monotonic(), self.max_age_s)
+        watched = {
+            spec.name: newest[spec.name]
+            for spec in self._specs
+            if not spec.latched and (spec.required or newest[spec.name] is not None)
+        }
+        silent = sync.silent(watched, time.monotonic(), self.max_age_s)
         if silent:
-            raise self._silence(connection, silent)
+            raise self._silence(connection, silent, whole=len(silent) == len(watched))
         return {name: received for name, received in newest.items() if received is not None}
 
-    def _silence(self, connection: Connection, silent: Mapping[str, float | None]) -> Stale:
+    def _silence(
+        self, connection: Connection, silent: Mapping[str, float | None], whole: bool
+    ) -> Stale:
         lines, gone = [], []
         for name, age in silent.items():
             stream = connection.streams[name]
@@ -399,7 +405,7 @@ class RosOperator(ABC):
             if not connection.node.get_publishers_info_by_topic(stream.topic):
                 gone.append(stream.topic)
         cause = "the device froze, or its driver was killed or hangs"
-        if len(silent) == sum(spec.required for spec in self._specs):
+        if whole:
             cause = "every stream at once: the network is gone, or this machine is overloaded"
         if gone:
             cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"

@@ -39,6 +39,7 @@ class Startup:
         self._connection = connection
         self._node = connection.node
         self._specs = [spec for spec in specs if spec.required]
+        self._optional = [spec for spec in specs if not spec.required]
         self._exclusive = [command.topic for command in commands if command.exclusive]
         self._publishers = publishers
         self._since = time.monotonic()
@@ -93,6 +94,15 @@ class Startup:
             raise contested
         return warnings
 
+    def unheard(self) -> list[str]:
+        """Warnings about streams that nobody publishes, and that need not be."""
+        published = discovery.published(self._node, self._connection.name)
+        return [
+            f"nobody publishes {spec.label}" + (f": {spec.unheard}" if spec.unheard else "")
+            for spec in self._optional
+            if spec.topic not in published
+        ]
+
     def _check_losses(self) -> None:
         """Waiting longer does not help a stream of which so much was sent and nothing arrived."""
         streams = [self._stream(spec) for spec in self._specs]
@@ -110,7 +120,14 @@ class Startup:
         for stream in quiet:
             stream.refresh()
         if quiet:
-            return NotReady("waiting") if hurry else self._why(quiet)
+            if hurry:
+                return NotReady("waiting")
+            error = self._why(quiet)
+            known = {spec.name: spec.unheard for spec in self._specs}
+            causes = [known[stream.name] for stream in quiet]
+            if all(causes):
+                error.cause = "; ".join(causes)
+            return error
         # Not the graph's word for it: until the two have found each other, commands are lost, and
         # the first one that arrives would be a jump.
         deaf = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]

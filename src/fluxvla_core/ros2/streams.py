@@ -36,9 +36,11 @@ class StreamSpec:
         depth: how many messages are kept.
         expected_hz: messages a second that should come; None: as many as are sent.
         camera: size of the pictures, for ``camera`` and ``depth``.
-        required: whether ``connect`` waits for it, and a silence of it is an error; only ``side``
-            streams need not be.
-        latched: ask for the last message that was sent before, where publishers keep it.
+        required: whether ``connect`` waits for it; only ``side`` streams need not be. Without, it
+            warns if nobody publishes it. What has spoken once must go on in either case.
+        latched: ask for the last message that was sent before, where publishers keep it. It is sent
+            when something changes, so that silence means nothing.
+        unheard: the likely cause where it is not heard, for messages.
     """
 
     name: str
@@ -50,6 +52,7 @@ class StreamSpec:
     camera: Camera | None = None
     required: bool = True
     latched: bool = False
+    unheard: str = ""
 
     @property
     def label(self) -> str:

@@ -67,6 +67,8 @@ class UROperator(RosOperator):
         puppet_gripper_left_cmd_topic: the gripper's commands, a number.
         speed_scaling_topic: percent, from the speed scaling state broadcaster.
         program_running_topic: whether the robot's program runs, from the IO and status controller.
+        require_status: whether these two must be heard before anything moves. Only without
+            ur_robot_driver there is a reason to say False: a stop on the robot goes unnoticed then.
         use_depth_image: read depth into ``frame.depths``.
         publish_rate: commands a second. With ``forward_position_controller``, by default as many
             as the robot needs at full speed: 125, for the UR3e's wrists 250; too few are refused
@@ -101,6 +103,7 @@ class UROperator(RosOperator):
         puppet_gripper_left_cmd_topic: str = "/gripper/command",
         speed_scaling_topic: str = "/speed_scaling_state_broadcaster/speed_scaling",
         program_running_topic: str = "/io_and_status_controller/robot_program_running",
+        require_status: bool = True,
         use_depth_image: bool = False,
         publish_rate: float | None = None,
         camera_names: Sequence[str] = tuple(camera.name for camera in CAMERAS),
@@ -153,6 +156,7 @@ class UROperator(RosOperator):
         self._gripper_command = puppet_gripper_left_cmd_topic
         self._scaling_topic = speed_scaling_topic
         self._running_topic = program_running_topic
+        self._require_status = require_status
         self._use_depth = use_depth_image
         self._names = tuple(joint_prefix + name for name in JOINTS)
         self._gripper_joint = gripper_joint
@@ -173,10 +177,28 @@ class UROperator(RosOperator):
             found.append(
                 StreamSpec("gripper", self._gripper_state, self._gripper_message, SIDE, depth=1)
             )
-        # Other drivers, and simulations, do not have these two.
-        scaling = StreamSpec("speed scaling", self._scaling_topic, FLOAT64, SIDE, 1, required=False)
+        hint = " (drivers that have none: require_status=False)" if self._require_status else ""
+        scaling = StreamSpec(
+            "speed scaling",
+            self._scaling_topic,
+            FLOAT64,
+            SIDE,
+            depth=1,
+            required=self._require_status,
+            unheard="the driver's speed_scaling_state_broadcaster is not active, or has another "
+            f"name{hint}",
+        )
         running = StreamSpec(
-            "program running", self._running_topic, BOOL, SIDE, 1, required=False, latched=True
+            "program running",
+            self._running_topic,
+            BOOL,
+            SIDE,
+            depth=1,
+            required=self._require_status,
+            latched=True,
+            # The driver tells of changes only, and begins with a program that does not run.
+            unheard="External Control was not played on the teach pendant since the driver "
+            f"started, or its io_and_status_controller has another name{hint}",
         )
         return [*found, scaling, running]
 

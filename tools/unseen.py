@@ -116,6 +116,20 @@ BrokenRunner = 7
 '''
 
 
+DOCTOR = ("plugins", "doctor")
+SYMPTOMS = (
+    "fluxvla_corrupt-1.0.dist-info: ",
+    "fluxvla-broken 4.2 provides 'BrokenOperator' but it needs "
+    "'acme_vendor_sdk_that_is_not_there', which is not installed (fluxvla_broken/robot.py:4)",
+    "fluxvla-garbled 4.2 provides 'GarbledOperator' but its source has a syntax error: "
+    "fluxvla_garbled/robot.py:5: ",
+    "entry point NobodyOperator = 'fluxvla_typo.robot:NobodyOperator' names an object that does "
+    "not exist",
+    "fluxvla-typo 4.2: 7 in fluxvla.runners is a int, not a class",
+)
+"""What the doctor has to say of the broken ones, all of them installed."""
+
+
 def write_project(folder: Path, name: str, operator: str, runner: str, module: str) -> Path:
     """A source tree of a plugin distribution; returns it."""
     package = name.replace("-", "_")
@@ -142,6 +156,12 @@ def mistyped(folder: Path) -> Path:
     """``fluxvla-typo``: imports, but its entry points name what is no class, or is not there."""
     module = "AcmeTypo = 7\n"
     return write_project(folder, "fluxvla-typo", "NobodyOperator", "AcmeTypo", module)
+
+
+def garbled(folder: Path) -> Path:
+    """``fluxvla-garbled``: its module is no Python."""
+    module = '"""Cut short."""\n\n\nclass GarbledOperator:\n    def __init__(self,\n'
+    return write_project(folder, "fluxvla-garbled", "GarbledOperator", "GarbledRunner", module)
 
 
 def corrupt(env: Env) -> Path:
@@ -187,7 +207,7 @@ def check(env: Env, builder: Env, folder: Path) -> None:
     """
     shutil.rmtree(folder, ignore_errors=True)
     config = folder / "acme.toml"
-    projects = [good(folder), failing(folder), mistyped(folder)]
+    projects = [good(folder), failing(folder), mistyped(folder), garbled(folder)]
     config.write_text(CONFIG, encoding="utf-8")
     fine, *broken = (wheel(project, folder / "dist", builder) for project in projects)
     run = ("run", "--config", str(config), "--work-dir", str(folder / "work"))
@@ -196,14 +216,35 @@ def check(env: Env, builder: Env, folder: Path) -> None:
         install(env, fine)
         _expect(env, "AcmeEvalRunner", "plugins", "list")
         _expect(env, "reached: True", *run)
+        _expect(env, "no problems: ", *DOCTOR)
         install(env, *broken)
         info = corrupt(env)
         _expect(env, "AcmeEvalRunner", "plugins", "list")
         _expect(env, "reached: True", *run)
+        told = diagnosis(env)
+        if lacking := [words for words in SYMPTOMS if words not in told]:
+            raise StepFailed(["fluxvla", *DOCTOR], 1, f"did not say {lacking}:\n{told}")
+        if "fluxvla-acme" in told:
+            raise StepFailed(["fluxvla", *DOCTOR], 1, f"blamed what is sound:\n{told}")
     finally:
-        remove(env, "fluxvla-acme", "fluxvla-broken", "fluxvla-typo")
+        remove(env, "fluxvla-acme", "fluxvla-broken", "fluxvla-typo", "fluxvla-garbled")
         if info is not None:
             shutil.rmtree(info)
+
+
+def diagnosis(env: Env) -> str:
+    """What ``fluxvla plugins doctor`` says of an installation with something broken in it.
+
+    Raises:
+        StepFailed: it finds nothing, or does not end as a command that found something.
+    """
+    try:
+        said = env.run("fluxvla", *DOCTOR, quiet=True)
+    except StepFailed as failure:
+        if failure.status != 1:
+            raise
+        return failure.output
+    raise StepFailed(["fluxvla", *DOCTOR], 0, f"found nothing:\n{said}")
 
 
 def _expect(env: Env, words: str, *command: str) -> None:

@@ -73,8 +73,9 @@ def test_two_providers_are_an_error_that_lists_both(install):
     ("source", "message"),
     [
         (None, "its own module 'mod_x' is missing"),
-        ("import rclpy_absent", "it needs 'rclpy_absent', which is not installed"),
-        ("raise OSError('no display')", "raised OSError on import: no display"),
+        ("\nimport rclpy_absent", "'rclpy_absent', which is not installed (mod_x.py:2)"),
+        ("raise OSError('no display')", "raised OSError on import: no display (mod_x.py:1)"),
+        ("class X", "raised SyntaxError on import: expected ':' (mod_x.py:1)"),
         ("raise SystemExit(3)", "raised SystemExit on import: 3"),
         ("Y = 1", "names an object that does not exist"),
         ("X = 1", "is a int, not a class"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,12 +22,15 @@ from tools.shell import StepFailed
         (unseen.good, "fluxvla-acme", "fluxvla_acme"),
         (unseen.failing, "fluxvla-broken", "fluxvla_broken"),
         (unseen.mistyped, "fluxvla-typo", "fluxvla_typo"),
+        (unseen.garbled, "fluxvla-garbled", "fluxvla_garbled"),
     ],
 )
 def test_a_wheel_with_entry_points(make, name: str, package: str, tmp_path: Path) -> None:
     project = make(tmp_path)
     assert project.name == name
-    ast.parse((project / package / "robot.py").read_text())
+    source = (project / package / "robot.py").read_text()
+    with nullcontext() if make is not unseen.garbled else pytest.raises(SyntaxError):
+        ast.parse(source)
     wheel = unseen.wheel(project, tmp_path / "dist", Env(Path(sys.prefix)))
     with zipfile.ZipFile(wheel) as archive:
         points = archive.read(f"{package}-4.2.dist-info/entry_points.txt").decode()
@@ -43,6 +47,7 @@ class Fluxvla(Env):
 
     def run(self, program: str, *words: str, **options: object) -> str:
         line = " ".join([program, *map(str, words)])
+        sound = not any("pip install" in ran and "fluxvla_broken" in ran for ran in self.ran)
         self.ran.append(line)
         if "sysconfig" in line:
             return str(self.root)
@@ -50,20 +55,34 @@ class Fluxvla(Env):
             folder, source = Path(words[-2]), Path(words[-1])
             folder.mkdir(exist_ok=True)
             (folder / f"{source.name.replace('-', '_')}-4.2-py3-none-any.whl").touch()
-        return self.said.get(str(words[0]), "")
+        if "doctor" in line and not sound and self.said["doctor"]:
+            raise StepFailed([program, *words], 1, self.said["doctor"])
+        return self.said.get("list" if "list" in line else str(words[0]), "")
 
 
-@pytest.mark.parametrize("deaf", [False, True])
+FINDS = "\n".join(unseen.SYMPTOMS)
+
+
+@pytest.mark.parametrize(
+    ("run", "doctor", "problem"),
+    [
+        ("reached: True", FINDS, None),
+        ("", FINDS, "did not say 'reached: True'"),
+        ("reached: True", FINDS.replace("robot.py:4", "robot.py"), r"did not say \[.*acme_vendor"),
+        ("reached: True", f"{FINDS}\nfluxvla-acme 4.2 cannot", "blamed what is sound"),
+        ("reached: True", "", "found nothing"),
+    ],
+)
 def test_the_check_leaves_the_environment_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deaf: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: str, doctor: str, problem: str | None
 ) -> None:
     env = Fluxvla(tmp_path / "env")
     env.root.mkdir()
     monkeypatch.setattr(Fluxvla, "ran", [])
-    answers = {"plugins": "AcmeEvalRunner", "run": "" if deaf else "reached: True"}
+    answers = {"list": "AcmeEvalRunner", "plugins": "no problems: 3", "run": run, "doctor": doctor}
     monkeypatch.setattr(Fluxvla, "said", answers)
-    if deaf:
-        with pytest.raises(StepFailed, match="did not say 'reached: True'"):
+    if problem is not None:
+        with pytest.raises(StepFailed, match=problem):
             unseen.check(env, env, tmp_path / "folder")
     else:
         unseen.check(env, env, tmp_path / "folder")

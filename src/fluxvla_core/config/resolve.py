@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from fluxvla_core.config import constructor
 from fluxvla_core.config.constructor import Signature
-from fluxvla_core.config.source import lacks
+from fluxvla_core.config.source import Opaque, flaw, lacks
+from fluxvla_core.config.source import find as find_source
 from fluxvla_core.contracts.check import check_api
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
 from fluxvla_core.plugins import known
@@ -99,6 +100,13 @@ def installed(plugin: Plugin) -> Found:
             raise LoadFailed(
                 f"{plugin.origin} provides {plugin.name!r} but its module {plugin.module!r} is "
                 f"missing (a stale or orphaned install): reinstall {plugin.dist}"
+            )
+        source = find_source(plugin.module, plugin.attribute)
+        broken = flaw(source.name) if isinstance(source, Opaque) else None
+        if broken:
+            raise LoadFailed(
+                f"{plugin.origin} provides {plugin.name!r} but its source has a syntax error: "
+                f"{broken}"
             )
         if lacks(plugin.module, plugin.attribute):
             raise LoadFailed(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from fluxvla_core.plugins.locate import locate
+from fluxvla_core.plugins.locate import locate, place
 
 # Bases that no constructor parameter of ours comes from; parsing torch would take a second.
 _PLAIN = frozenset(
@@ -37,11 +37,7 @@ class Module:
     stars: tuple[str, ...]
 
     def place(self, line: int) -> str:
-        """``package/module.py:line``: short, and enough to find it."""
-        top = self.name.partition(".")[0]
-        parts = self.path.parts
-        start = len(parts) - 1 - parts[::-1].index(top) if top in parts else len(parts) - 1
-        return f"{'/'.join(parts[start:])}:{line}"
+        return place(self.path, self.name, line)
 
 
 @dataclass(frozen=True)
@@ -70,18 +66,39 @@ class Opaque:
 Base = Source | Opaque
 
 
+def flaw(dotted: str) -> str | None:
+    """``file:line`` and why it is no Python, of a module on the way to ``dotted``; else None."""
+    parts = dotted.split(".")
+    for end in range(len(parts), 0, -1):
+        name = ".".join(parts[:end])
+        path = _file(name)
+        if path is None:
+            continue
+        try:
+            ast.parse(path.read_bytes(), str(path))
+        except SyntaxError as error:
+            return f"{place(path, name, error.lineno or 1)}: {error.msg}"
+        except ValueError as error:  # a NUL, before Python 3.12
+            return f"{place(path, name, 1)}: {error}"
+    return None
+
+
+def _file(name: str) -> Path | None:
+    """The source file of a module, where there is one that is ours to read."""
+    path = None if name.partition(".")[0] in _CLOSED else locate(name)
+    return path if path is not None and path.suffix == ".py" and path.is_file() else None
+
+
 @functools.cache
 def parse(name: str) -> Module | None:
-    """The module called ``name``, or None where there is no source to read."""
-    if name.partition(".")[0] in _CLOSED:
-        return None
-    path = locate(name)
-    if path is None or path.suffix != ".py" or not path.is_file():
+    """The module called ``name``, or None where there is no source that can be read."""
+    path = _file(name)
+    if path is None:
         return None
     try:
         tree = ast.parse(path.read_bytes(), str(path))
     except (SyntaxError, ValueError):
-        return None  # loading the plugin is what reports this
+        return None  # ``flaw`` tells
     names: dict[str, ast.AST] = {}
     stars = []
     for node in _top(tree.body):

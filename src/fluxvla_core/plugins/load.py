@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import difflib
 import importlib
+from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
 from fluxvla_core.plugins import _metadata, known
 from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
 from fluxvla_core.plugins.groups import PREFIX
+from fluxvla_core.plugins.locate import place
 
 LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
+TRACES = f"FLUXVLA_STRICT=1 {DOCTOR} shows the traceback"
 
 
 def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
@@ -109,14 +112,16 @@ def load(plugin: Plugin) -> Any:
                 next=f"reinstall {plugin.dist}",
             ) from error
         raise LoadFailed(
-            f"{provides} it needs {error.name!r}, which is not installed",
+            f"{provides} it needs {error.name!r}, which is not installed{_where(error, module)}",
             next=f"pip install {plugin.dist} again with its dependencies, or install {error.name}",
         ) from error
     except KeyboardInterrupt:
         raise
     except (Exception, SystemExit) as error:
+        text = error.msg if isinstance(error, SyntaxError) else error
         raise LoadFailed(
-            f"{provides} raised {type(error).__name__} on import: {error}", next=DOCTOR
+            f"{provides} raised {type(error).__name__} on import: {text}{_where(error, module)}",
+            next=TRACES,
         ) from error
     for part in plugin.attribute.split("."):
         if not hasattr(found, part):
@@ -127,3 +132,18 @@ def load(plugin: Plugin) -> Any:
             )
         found = getattr(found, part)
     return found
+
+
+def _where(error: BaseException, module: str) -> str:
+    """`` (package/module.py:line)``: the last place in ``module``'s package on the way to it."""
+    import traceback  # `fluxvla --help` has no use for it
+
+    if isinstance(error, SyntaxError) and error.filename:
+        return f" ({place(Path(error.filename), module, error.lineno or 1)})"
+    top = module.partition(".")[0]
+    places = [
+        place(Path(frame.f_code.co_filename), top, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] == top
+    ]
+    return f" ({places[-1]})" if places else ""

@@ -1,4 +1,4 @@
-"""Find a module's source file without importing anything."""
+"""Find a module's source file without importing anything, and name places in it."""
 
 from __future__ import annotations
 
@@ -27,3 +27,11 @@ def locate(module: str) -> Path | None:
             if file.is_file():
                 return file
     return None
+
+
+def place(path: Path, module: str, line: int) -> str:
+    """``package/module.py:line``: short, and enough to find it."""
+    top = module.partition(".")[0]
+    parts = path.parts
+    start = len(parts) - 1 - parts[::-1].index(top) if top in parts else len(parts) - 1
+    return f"{'/'.join(parts[start:])}:{line}"

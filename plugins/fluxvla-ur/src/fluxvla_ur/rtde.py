@@ -250,7 +250,14 @@ class URRTDEOperator:
                 raise self._not_obeying()
             period = 1.0 / self.embodiment.rate_hz
             lookahead, gain = self._servo
-            if not self._control.servoJ(checked[:_ARM].tolist(), 0.0, 0.0, period, lookahead, gain):
+            target = checked[:_ARM].tolist()
+            try:
+                obeyed = self._control.servoJ(target, 0.0, 0.0, period, lookahead, gain)
+            except RuntimeError as error:
+                # The client looks for a controller that it loses within the call, in vain.
+                self._broken = True
+                raise self._not_obeying() from error
+            if not obeyed:
                 raise self._not_obeying()
             self._spoke, self._moving, self._last = time.monotonic(), True, checked
             if self._gripper is not None:

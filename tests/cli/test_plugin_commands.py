@@ -304,3 +304,26 @@ def test_a_syntax_error_is_told_without_an_import(fluxvla: Fluxvla, install: Ins
     assert said.format("Handed", "acme_top/robot.py:3: unindent does not match") in out
     assert said.format("Nul", "acme_nul.py:1: source code ") in out
     assert "cannot work  acme-typo 1.0 provides 'Odd'" in fluxvla("plugins", "show", "Odd").out
+
+
+def test_what_a_module_defines_is_not_said_to_be_missing(
+    fluxvla: Fluxvla, install: Install, alone: Callable[[], None]
+) -> None:
+    source = """
+from contextlib import suppress
+class _Made: ...
+First = Second = _Made
+Third, (Fourth, *_) = _Made, (_Made,)
+with suppress(ImportError):
+    Fifth = _Made
+for _ in range(1):
+    table = {}
+    class Sixth: ...
+table["Gone"] = table
+"""
+    names = ("First", "Second", "Third", "Fourth", "Fifth", "Sixth", "Gone")
+    points = "".join(f"{name} = acme_made:{name}\n" for name in names)
+    install("acme-made", entry_points=f"[fluxvla.heads]\n{points}", files={"acme_made.py": source})
+    alone()
+    (line,) = fluxvla("plugins", "doctor", "--no-import").out.splitlines()
+    assert "entry point Gone = 'acme_made:Gone' names an object that does not exist" in line

@@ -109,11 +109,19 @@ def parse(name: str) -> Module | None:
                 if alias.name == "*" and isinstance(node, ast.ImportFrom):
                     stars.append(_absolute(node, name, path))
                 names[alias.asname or alias.name.partition(".")[0]] = node
-        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            names[node.targets[0].id] = node.value
+        elif isinstance(node, ast.Assign):
+            for target in node.targets:
+                value = node.value if isinstance(target, ast.Name) else node  # of a, b = ...
+                names.update(dict.fromkeys(_stored(target), value))
         elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
             names[node.target.id] = node.value
     return Module(name, path, names, tuple(stars))
+
+
+def _stored(target: ast.expr) -> list[str]:
+    """The names that an assignment to ``target`` defines; ``a.b`` and ``a[b]`` define none."""
+    found = (n for n in ast.walk(target) if isinstance(n, ast.Name))
+    return [name.id for name in found if isinstance(name.ctx, ast.Store)]
 
 
 def _top(body: list[ast.stmt]) -> Iterator[ast.stmt]:
@@ -122,6 +130,8 @@ def _top(body: list[ast.stmt]) -> Iterator[ast.stmt]:
         yield node
         if isinstance(node, ast.If):
             yield from _top([*node.orelse, *node.body])
+        elif isinstance(node, (ast.With, ast.For)):
+            yield from _top(node.body)
         elif isinstance(node, ast.Try):
             for handler in node.handlers:
                 yield from _top(handler.body)

@@ -25,7 +25,7 @@ def write(takes_file: str, root: str, codec: str) -> None:
     names = takes["names"].tolist()
     features: dict[str, dict[str, object]] = {
         f"observation.images.{camera}": {
-            "dtype": "video",
+            "dtype": "image" if codec == "png" else "video",
             "shape": takes[f"0/{camera}"].shape[1:],
             "names": ["height", "width", "channels"],
         }
@@ -33,7 +33,8 @@ def write(takes_file: str, root: str, codec: str) -> None:
     }
     for key in ("observation.state", "action"):
         features[key] = {"dtype": "float32", "shape": (len(names),), "names": names}
-    dataset = LeRobotDataset.create("test/oracle", 10, features, root, "arm", vcodec=codec)
+    how = {"use_videos": False} if codec == "png" else {"vcodec": codec}
+    dataset = LeRobotDataset.create("test/oracle", 10, features, root, "arm", **how)
     for episode, task in enumerate(takes["tasks"].tolist()):
         for i in range(len(takes[f"{episode}/state"])):
             dataset.add_frame(

@@ -142,7 +142,7 @@ def test_a_missing_feature_gets_a_hint(shared):
     assert "feature 'task_index' is int64 of shape (1,), not a vector of float32" in text
 
 
-def test_pictures_in_the_tables_are_not_read(dataset):
+def test_pictures_that_are_not_in_the_tables(dataset):
     info = json.loads((dataset / "meta/info.json").read_text())
     info["features"]["observation.images.side"] = {
         "dtype": "image",
@@ -150,8 +150,15 @@ def test_pictures_in_the_tables_are_not_read(dataset):
         "names": None,
     }
     edit_info(dataset, features=info["features"])
-    with pytest.raises(DataError, match=r"'observation\.images\.side' is stored as 'image'"):
+    words = r"observation\.images\.side holds null, not the bytes of pictures"
+    with pytest.raises(DataError, match=words):
         ParquetDataset(str(dataset), [], ["side"])
+    info["features"]["observation.images.side"]["shape"] = [32, 48, 1]
+    edit_info(dataset, features=info["features"])
+    with pytest.raises(DataError, match=r"'observation\.images\.side' is of shape \(32, 48, 1\)"):
+        ParquetDataset(str(dataset), [], ["side"])
+    with pytest.raises(DataError, match="'action' is stored as 'float32', it is no camera"):
+        ParquetDataset(str(dataset), [], ["action"])
 
 
 def test_totals_that_do_not_agree(dataset):

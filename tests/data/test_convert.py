@@ -158,7 +158,7 @@ def test_what_is_not_converted(shared, broken, tmp_path, capsys):
     info = json.loads(path.read_text())
     info["features"]["side"] = {"dtype": "image", "shape": [4, 4, 3], "names": None}
     path.write_text(json.dumps(info))
-    assert "side stored as 'image'; only video is converted" in refused(broken, out)
+    assert "column 'side' is missing" in refused(broken, out)
     assert main(["data", "convert", str(broken), str(shared)]) == 2
 
 

@@ -34,8 +34,9 @@ from .version2 import write_v2
 SIDE = Path(__file__).with_name("lerobot_side.py")
 CAMERAS = ("top", "wrist")
 OURS = {"h264": "h264", "av1": "libsvtav1"}
-# From our datasets, by LeRobot, from a version 2.1 by us, from the same by LeRobot.
-MADE = ("merged", "theirs", "converted", "theirs converted")
+# From our datasets, by LeRobot, from a version 2.1 by us, from the same by LeRobot; then with
+# pictures in the tables: by LeRobot, from a version 2.1 by us.
+MADE = ("merged", "theirs", "converted", "theirs converted", "theirs stored", "stored")
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,10 @@ def seen(tmp_path_factory, recorder, takes, many):
     write_v2(folder / "old", many)
     convert(folder / "old", roots["converted"])
     shutil.copytree(folder / "old", roots["theirs converted"])
+    convert(write_v2(folder / "old stored", many, codec="png"), roots["stored"])
     save_takes(folder / "takes.npz", takes)
     jobs = [["write", folder / "takes.npz", roots["theirs"], "libsvtav1"]]
+    jobs += [["write", folder / "takes.npz", roots["theirs stored"], "png"]]
     jobs += [["convert", roots["theirs converted"]]]
     jobs += [["read", root, folder / f"{name}.npz"] for name, root in roots.items()]
     run(env, folder / "jobs.json", jobs)
@@ -132,7 +135,7 @@ def test_lerobot_and_we_see_the_same(name, seen):
         assert theirs.described["tasks"][i] == sample["task_description"]
 
 
-@pytest.mark.parametrize("name", [*OURS, "merged", "converted"])
+@pytest.mark.parametrize("name", [*OURS, "merged", "converted", "stored"])
 def test_lerobot_reads_what_we_recorded(name, seen, many):
     found = seen[name]
     if name in OURS:
@@ -172,6 +175,14 @@ def test_we_read_what_lerobot_recorded(seen, takes):
     np.testing.assert_array_equal(dataset[7]["states"], takes[1].state[0])
     top = dataset[12]["images"][0].transpose(1, 2, 0)
     assert np.abs(top.astype(int) - enlarge(takes[1].top)[5]).mean() < 8
+    validate(root)
+
+
+def test_pictures_that_lerobot_put_into_tables_are_exact(seen, takes):
+    root = seen["theirs stored"].root
+    assert not list(root.rglob("*.mp4"))
+    top = ParquetDataset(str(root), [], CAMERAS)[12]["images"][0].transpose(1, 2, 0)
+    np.testing.assert_array_equal(top, enlarge(takes[1].top)[5])
     validate(root)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -17,12 +18,16 @@ from fluxvla_core.data.statistics import column_statistics, histogram_statistics
 CAMERAS = ("top", "wrist")
 JOINTS = ["waist", "elbow", "gripper"]
 FPS = 10
+STORED = ("png", "jpg")
 
 
 def write_v2(
     root: Path, takes: Sequence[Any], version: str = "v2.1", chunk: int = 2, codec: str = "h264"
 ) -> Path:
-    """Episodes one file each, ``chunk`` of them in a folder; the jsonl lines in no order."""
+    """Episodes one file each, ``chunk`` of them in a folder; the jsonl lines in no order.
+
+    ``codec`` may be ``png`` or ``jpg`` too: pictures then stand in the tables.
+    """
     tasks = list(dict.fromkeys(take.task for take in takes))
     rows = {"episodes": [], "tasks": [], "episodes_stats": []}
     rows["tasks"] = [{"task_index": i, "task": task} for i, task in enumerate(tasks)][::-1]
@@ -32,12 +37,17 @@ def write_v2(
         start += len(take.state)
         path = root / f"data/chunk-{i // chunk:03d}/episode_{i:06d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.table({k: column(a) for k, a in columns.items()}), path)
+        table = {k: column(a) for k, a in columns.items()}
+        if codec in STORED:
+            for camera in CAMERAS:
+                table[f"observation.images.{camera}"] = pictures(getattr(take, camera), codec)
+        pq.write_table(pa.table(table), path, row_group_size=5)
         stats = {k: column_statistics(a.reshape(len(a), -1)) for k, a in columns.items()}
         for camera in CAMERAS:
             key = f"observation.images.{camera}"
-            path = root / f"videos/chunk-{i // chunk:03d}/{key}/episode_{i:06d}.mp4"
-            write_video(path, getattr(take, camera), codec)
+            if codec not in STORED:
+                path = root / f"videos/chunk-{i // chunk:03d}/{key}/episode_{i:06d}.mp4"
+                write_video(path, getattr(take, camera), codec)
             histogram = sum(image_histogram(image) for image in getattr(take, camera))
             stats[key] = histogram_statistics(histogram, len(take.state))
         old = ("min", "max", "mean", "std", "count")
@@ -50,8 +60,20 @@ def write_v2(
         path = root / f"meta/{name}.jsonl"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (root / "meta/info.json").write_text(json.dumps(info(takes, tasks, version, chunk)))
+    described = info(takes, tasks, version, chunk)
+    if codec in STORED:
+        for camera in CAMERAS:
+            described["features"][f"observation.images.{camera}"].update(dtype="image", info=None)
+        described.update(video_path=None, total_videos=0)
+    (root / "meta/info.json").write_text(json.dumps(described))
     return root
+
+
+def pictures(images: np.ndarray, kind: str) -> Any:
+    """A column as the Image feature of Hugging Face's datasets stores it."""
+    files = [cv2.imencode(f".{kind}", image[..., ::-1])[1].tobytes() for image in images]
+    rows = [{"bytes": data, "path": f"frame-{i:06d}.{kind}"} for i, data in enumerate(files)]
+    return pa.array(rows, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
 
 
 def write_video(path: Path, images: np.ndarray, codec: str) -> None:

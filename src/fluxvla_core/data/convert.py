@@ -1,8 +1,8 @@
 """Datasets of LeRobot v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
 
-Rows and video packets are copied as they are. Statistics are computed anew, exactly: version 2 has
-no quantiles, and estimates its pictures from samples. That decodes every frame, so what comes out
-is known to be whole.
+Rows, with pictures that stand in them, and video packets are copied as they are. Statistics are
+computed anew, exactly: version 2 has no quantiles, and estimates its pictures from samples. That
+decodes every frame, so what comes out is known to be whole.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from fluxvla_core.data.files import read_table, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.optional import arrow, parquet
 from fluxvla_core.data.statistics import LEVELS, as_lists, image_histogram
-from fluxvla_core.data.video import VideoFile
+from fluxvla_core.data.stored_images import ImageColumn
+from fluxvla_core.data.video import Source, open_source
 from fluxvla_core.data.writer import built_aside
 from fluxvla_core.errors import DataError
 
@@ -45,8 +46,7 @@ def convert(root: str | Path, out: str | Path, reporter: Reporter | None = None)
     ``root`` stays as it is. ``out`` appears in one step when it is whole.
 
     Raises:
-        DataError: ``root`` is damaged, of version 3.0 already, or holds pictures in its tables;
-            ``out`` exists.
+        DataError: ``root`` is damaged, or of version 3.0 already; ``out`` exists.
         RunFailed: the disk is full.
     """
     say = reporter or SilentReporter()
@@ -54,12 +54,6 @@ def convert(root: str | Path, out: str | Path, reporter: Reporter | None = None)
     meta = read_metadata(source)
     if meta.version == v3.VERSION:
         raise DataError(f"{source}: is of version {v3.VERSION} already")
-    images = [key for key, f in meta.features.items() if f["dtype"] == "image"]
-    if images:
-        raise DataError(
-            f"{source}: {', '.join(images)} stored as 'image'; only video is converted",
-            next="make videos of them with the LeRobot that recorded them",
-        )
     checked = read_columns(meta, meta.vectors)
     with built_aside(target, f"{source} is as it was", "make room and convert again") as staging:
         _write(meta, checked["task_index"], staging, say)
@@ -85,26 +79,31 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
             }
         )
     columns = _copy_rows(meta, rows, out)
-    videos = list(episodes.videos)
     histograms: list[dict[str, Counts]] = [{} for _ in rows]
-    total = len(videos) * int(episodes.lengths.sum())
-    for part, key in enumerate(videos):
+    frames = int(episodes.lengths.sum())
+    total = len(meta.cameras) * frames
+    for part, key in enumerate(meta.cameras):
         clips, parameters = [], []
         for i, length in enumerate(map(int, episodes.lengths)):
-            path = meta.video_file(key, episodes.videos[key].files[i])
-            clip, kind = whole_clip(path, length, meta.fps)
-            clips.append(clip)
-            parameters.append(kind)
-            histograms[i][key] = _count_pixels(path, length, meta.fps)
-            done = part * total // len(videos) + int(episodes.end_row[i])
+            source: Source = ImageColumn(meta.data_file(episodes.files[i]), key)
+            period = 1.0
+            if key in episodes.videos:
+                source = meta.video_file(key, episodes.videos[key].files[i])
+                clip, kind = whole_clip(source, length, meta.fps)
+                clips.append(clip)
+                parameters.append(kind)
+                period = 1 / meta.fps
+            histograms[i][key] = _count_pixels(source, length, period)
+            done = part * frames + int(episodes.end_row[i])
             say.progress("convert frames", done, total, camera=v3.camera_name(key))
-        groups = _groups(clips, parameters)
-        write_videos(key, clips, groups, rows, out, meta.fps)
+        if clips:
+            groups = _groups(clips, parameters)
+            write_videos(key, clips, groups, rows, out, meta.fps)
     for row, counts, values in zip(rows, histograms, columns, strict=True):
         row.update(flat_statistics(statistics_of(counts, values)))
     write_tables(rows, out, {task: i for i, task in enumerate(meta.tasks)})
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
-    totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in videos}
+    totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in meta.cameras}
     stats = statistics_of(totals, whole)
     write_json(out / v3.STATS, {key: as_lists(entry) for key, entry in stats.items()})
     if (meta.root / v3.EMBODIMENT).is_file():
@@ -118,7 +117,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
         "data_files_size_in_mb": v3.DATA_FILE_MB,
         "video_files_size_in_mb": v3.VIDEO_FILE_MB,
         "data_path": v3.DATA,
-        "video_path": v3.VIDEO if videos else None,
+        "video_path": v3.VIDEO if episodes.videos else None,
     }
     write_json(out / v3.INFO, info)
 
@@ -184,15 +183,15 @@ def _numbers(table: Any) -> Columns:
     return found
 
 
-def _count_pixels(path: Path, frames: int, fps: float) -> Counts:
-    video = VideoFile(path)
+def _count_pixels(source: Source, frames: int, period: float) -> Counts:
+    pictures = open_source(source)
     try:
         counts = np.zeros((3, LEVELS), np.int64)
         for i in range(frames):
-            counts += image_histogram(video.read(i / fps))
+            counts += image_histogram(pictures.read(i * period))
         return counts
     finally:
-        video.close()
+        pictures.close()
 
 
 def _groups(clips: Sequence[Clip], parameters: Sequence[bytes]) -> list[list[int]]:

@@ -23,7 +23,7 @@ from fluxvla_core.data.statistics import (
     histogram_statistics,
     image_histogram,
 )
-from fluxvla_core.data.video import VideoFile
+from fluxvla_core.data.video import open_source
 from fluxvla_core.errors import DataError
 
 SHOWN = ("min", "q01", "mean", "q50", "q99", "max", "std")
@@ -76,6 +76,7 @@ def lines(facts: Mapping[str, Any]) -> list[str]:
     ]
     for key, camera in facts["cameras"].items():
         place = f"{camera['files']} files, {camera['bytes'] / 1e6:.1f} MB"
+        place = place if camera["files"] else "in the tables"
         out.append(f"  camera    {key}: {camera['height']} x {camera['width']}, {place}")
     for key, vector in facts["vectors"].items():
         names = f": {', '.join(vector['names'])}" if vector["names"] else ""
@@ -102,22 +103,22 @@ def dataset_statistics(
     if not pixels:
         return meta, stats
     every = np.ones(len(meta.episodes), np.bool_)
-    videos = [key for key, f in meta.features.items() if f["dtype"] == "video"]
     frames = len(columns["timestamp"])
-    for part, key in enumerate(videos):
+    total = frames * len(meta.cameras)
+    for part, key in enumerate(meta.cameras):
         track = make_track(meta, key, columns["timestamp"], every)
         histogram = np.zeros((3, LEVELS), np.int64)
         done = part * frames
-        for number, path in enumerate(track.files):
-            video = VideoFile(path)
+        for number, source in enumerate(track.files):
+            pictures = open_source(source)
             for time in np.sort(track.time[track.file == number]):
-                histogram += image_histogram(video.read(float(time)))
+                histogram += image_histogram(pictures.read(float(time)))
                 done += 1
                 if done % 100 == 0:
-                    reporter.progress("count pixels", done, frames * len(videos))
-            video.close()
+                    reporter.progress("count pixels", done, total)
+            pictures.close()
         stats[key] = histogram_statistics(histogram, frames)
-    reporter.progress("count pixels", frames * len(videos), frames * len(videos))
+    reporter.progress("count pixels", total, total)
     return meta, stats
 
 
@@ -164,7 +165,7 @@ def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
 
 def _camera(meta: Metadata, key: str) -> dict[str, Any]:
     feature = meta.features[key]
-    height, width, _ = feature["shape"]
+    height, width = meta.picture_size(key)
     said = feature.get("info") or feature.get("video_info") or {}
     places = meta.episodes.videos.get(key)
     files = {meta.video_file(key, file) for file in places.files} if places else set()

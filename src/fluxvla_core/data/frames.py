@@ -83,8 +83,8 @@ class Frames:
             for camera, track in enumerate(self._tracks[part])
         ]
         # In the order of the files: neighbours share an open decoder, sometimes a group of frames.
-        for path, time, i, camera in sorted(wanted):
-            found[i][camera] = self._files.read(path, time).transpose(2, 0, 1)
+        for source, time, i, camera in sorted(wanted, key=lambda w: (str(w[0]), *w[1:])):
+            found[i][camera] = self._files.read(source, time).transpose(2, 0, 1)
         return found
 
     def _decode_all(

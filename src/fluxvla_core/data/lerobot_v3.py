@@ -106,6 +106,9 @@ def datasets_schema(features: Mapping[str, Mapping[str, Any]]) -> bytes:
     for key, feature in features.items():
         if feature["dtype"] == "video":
             continue
+        if feature["dtype"] == "image":
+            columns[key] = {"_type": "Image"}
+            continue
         value = {"dtype": feature["dtype"], "_type": "Value"}
         width = feature["shape"][0]
         single = feature["shape"] == [1]

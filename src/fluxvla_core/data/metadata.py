@@ -72,18 +72,23 @@ class Metadata:
         """The feature that ``name`` (a feature, or a camera's short name) means.
 
         Raises:
-            DataError: there is none, or it is not stored as video.
+            DataError: there is none, or its pictures are not in colour.
         """
         for key in (name, v3.image_feature(name)):
             if key in self.features:
                 dtype = self.features[key]["dtype"]
-                if dtype == "video":
-                    return key
-                raise DataError(
-                    f"{self.root}: {key!r} is stored as {dtype!r}, only video is read",
-                    next="convert it to a dataset with video" if dtype == "image" else None,
-                )
+                if key not in self.cameras:
+                    raise DataError(f"{self.root}: {key!r} is stored as {dtype!r}, it is no camera")
+                shape = tuple(self.features[key]["shape"])
+                if dtype == "image" and 3 not in (shape[0], shape[-1]):
+                    raise DataError(f"{self.root}: {key!r} is of shape {shape}, not in colour")
+                return key
         raise DataError(f"{self.root}: there is no camera {name!r}{self.hint(name, self.cameras)}")
+
+    def picture_size(self, key: str) -> tuple[int, int]:
+        """Height and width of a camera's pictures; some datasets name the channels first."""
+        first, middle, last = map(int, self.features[key]["shape"])
+        return (middle, last) if first == 3 and last != 3 else (first, middle)
 
     def vector(self, name: str) -> int:
         """The width of the vector feature ``name``.

@@ -18,6 +18,11 @@ def reformatter() -> Any:
     return _load("av.video.reformatter").VideoReformatter()
 
 
+def opencv() -> Any:
+    """OpenCV."""
+    return _load("cv2")
+
+
 def arrow() -> Any:
     """pyarrow."""
     return _load("pyarrow")

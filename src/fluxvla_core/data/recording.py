@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.video import check_video
+from fluxvla_core.data.stored_images import ImageColumn, StoredImages
+from fluxvla_core.data.video import Source, check_video
 from fluxvla_core.errors import DataError
 
 Floats = npt.NDArray[np.float32]
@@ -20,10 +21,13 @@ Floats = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Track:
-    """One camera: frame ``row`` is in ``files[file[row]]`` at ``time[row]`` seconds."""
+    """One camera: frame ``row`` is in ``files[file[row]]`` at ``time[row]`` seconds.
+
+    Of pictures that stand in tables, ``time`` is the row in the file.
+    """
 
     key: str
-    files: tuple[Path, ...]
+    files: tuple[Source, ...]
     file: npt.NDArray[np.int32]
     time: npt.NDArray[np.float64]
     height: int
@@ -133,6 +137,8 @@ def make_track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[
     Raises:
         DataError: a file of a chosen episode is missing or too short.
     """
+    if meta.features[key]["dtype"] == "image":
+        return _stored_track(meta, key)
     places = meta.episodes.videos[key]
     lengths = meta.episodes.lengths
     # Only the files of the chosen episodes: a part of a dataset can be copied and trained on.
@@ -145,12 +151,26 @@ def make_track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[
     for path, end in zip(files, ends, strict=True):
         check_video(path, end)
     file = [numbers.get(f, -1) for f in places.files]
-    height, width, _ = meta.features[key]["shape"]
+    height, width = meta.picture_size(key)
     return Track(
         key=key,
         files=files,
         file=np.repeat(np.array(file, np.int32), lengths),
         time=np.repeat(places.starts, lengths) + timestamp.astype(np.float64),
-        height=int(height),
-        width=int(width),
+        height=height,
+        width=width,
     )
+
+
+def _stored_track(meta: Metadata, key: str) -> Track:
+    """Of pictures that stand in the tables, which are read for their columns in any case."""
+    numbers = {f: i for i, f in enumerate(dict.fromkeys(meta.episodes.files))}
+    files = tuple(ImageColumn(meta.data_file(f), key) for f in numbers)
+    for column in files:
+        StoredImages(column).close()
+    of_episode = np.array([numbers[f] for f in meta.episodes.files], np.int32)
+    file = np.repeat(of_episode, meta.episodes.lengths)
+    first = np.unique(file, return_index=True)[1]
+    row = (np.arange(len(file)) - first[file]).astype(np.float64)
+    height, width = meta.picture_size(key)
+    return Track(key, files, file, row, height, width)

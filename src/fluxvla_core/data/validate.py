@@ -19,7 +19,7 @@ from fluxvla_core.data.files import read_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.recording import Track, make_track
 from fluxvla_core.data.statistics import column_statistics
-from fluxvla_core.data.video import VideoFile
+from fluxvla_core.data.video import open_source
 from fluxvla_core.errors import DataError, FluxError
 
 LISTED = 20
@@ -46,7 +46,7 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
     )
     wrong = _wrong_times(meta, columns["timestamp"])
     tracks: list[Track] = []
-    for camera in (k for k, f in meta.features.items() if f["dtype"] == "video"):
+    for camera in meta.cameras:
         try:
             every = np.ones(len(meta.episodes), np.bool_)
             tracks.append(make_track(meta, camera, columns["timestamp"], every))
@@ -76,19 +76,19 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
 
 
 def _decode(track: Track, number: int, say: Reporter, done: int, total: int) -> None:
-    video = VideoFile(track.files[number])
+    pictures = open_source(track.files[number])
     try:
         for count, time in enumerate(np.sort(track.time[track.file == number])):
-            image = video.read(float(time))
+            image = pictures.read(float(time))
             if image.shape != (track.height, track.width, 3):
                 raise DataError(
-                    f"{video.path}: the frame at {time:.3f} s is {image.shape[0]} x "
+                    f"{pictures.path}: the frame at {time:.3f} s is {image.shape[0]} x "
                     f"{image.shape[1]}, info.json says {track.height} x {track.width}"
                 )
             if count % EVERY == 0:
                 say.progress("decode frames", done + count, total)
     finally:
-        video.close()
+        pictures.close()
 
 
 def _wrong_times(meta: Metadata, timestamp: npt.NDArray[Any]) -> list[str]:

@@ -16,9 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.optional import libav, reformatter
+from fluxvla_core.data.stored_images import ImageColumn, StoredImages
 from fluxvla_core.errors import DataError
 
 Image = npt.NDArray[np.uint8]
+Source = Path | ImageColumn
 COPY_AGAIN = "copy the file again from where it came from; to decode every frame of a dataset: "
 
 
@@ -124,26 +126,31 @@ class VideoFile:
         )
 
 
+def open_source(source: Source) -> VideoFile | StoredImages:
+    """What reads the frames of ``source``. Raises DataError if it cannot be read."""
+    return StoredImages(source) if isinstance(source, ImageColumn) else VideoFile(source)
+
+
 class VideoFiles:
     """Frames of many files; keeps up to ``capacity`` of them open."""
 
     def __init__(self, capacity: int = 32) -> None:
         self.capacity = capacity
-        self._open: OrderedDict[Path, VideoFile] = OrderedDict()
+        self._open: OrderedDict[Source, VideoFile | StoredImages] = OrderedDict()
         self._owner = os.getpid()
 
-    def read(self, path: Path, time: float) -> Image:
+    def read(self, source: Source, time: float) -> Image:
         """See :meth:`VideoFile.read`."""
         if self._owner != os.getpid():
             # After a fork both processes would move one shared file offset.
             self._open, self._owner = OrderedDict(), os.getpid()
-        video = self._open.get(path)
+        video = self._open.get(source)
         if video is None:
-            video = self._open[path] = VideoFile(path)
+            video = self._open[source] = open_source(source)
             if len(self._open) > self.capacity:
                 self._open.popitem(last=False)[1].close()
         else:
-            self._open.move_to_end(path)
+            self._open.move_to_end(source)
         return video.read(time)
 
     def close(self) -> None:

@@ -162,6 +162,7 @@ class Demo:
         times = ", ".join(f"{name} {clock(entry.seconds)}" for name, entry in entries)
         activate = Path(sys.prefix) / "bin" / "activate"
         if activate.is_file():
-            self._say(f"To go on by hand:  source {os.path.relpath(activate)}  and then: fluxvla --help")
+            place = os.path.relpath(activate)
+            self._say(f"To go on by hand:  source {place}  and then: fluxvla --help")
         self._say(f"Time: {clock(self.elapsed_s())} in all ({times})")
         sys.stdout.flush()

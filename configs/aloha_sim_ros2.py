@@ -15,9 +15,9 @@ How often it succeeds, over as many cube positions, in real time:
         --work-dir work_dirs/aloha_sim_transfer
 
 On a machine that cannot simulate and think in real time, ``--real-time-factor 0.5`` there and
-``--set inference.operator.real_time_factor=0.5`` here slow both down alike. On a real robot
-``operator.type`` is ``AlohaOperator``, which has neither this nor ``seed``; ``preset`` has the
-topics of AgileX and of Interbotix, ``arms`` the limits.
+``--set inference.operator.real_time_factor+=0.5`` here slow both down alike. On a real robot
+``operator.type`` is ``AlohaOperator``: its ``preset`` has the topics of AgileX (the default) or of
+Interbotix, ``arms`` the limits.
 """
 
 _base_ = "aloha_sim_transfer.py"
@@ -25,17 +25,7 @@ _base_ = "aloha_sim_transfer.py"
 inference = dict(
     # A real robot does not wait: what became of the chunk's last keyframes is seen before they end.
     max_publish_step=400,
-    operator=dict(
-        _delete_=True,
-        type="AlohaSimROSOperator",
-        preset="cobot_magic",
-        arms="viperx300",
-        camera_names=("top",),
-        height=144,
-        width=192,
-        seed=500,
-        real_time_factor=1.0,
-    ),
+    operator=dict(type="AlohaSimROSOperator"),
 )
 
 eval = dict(

@@ -102,12 +102,8 @@ inference = dict(
     task_descriptions=TASKS,
     execute_horizon=5,
     max_publish_step=300,
+    # What every ALOHA takes, simulated or real: ``type`` alone says which it is.
     operator=dict(
-        type="AlohaSimOperator",
-        arms="viperx300",
-        camera_names=("top",),
-        height=144,
-        width=192,
-        seed=7,
+        type="AlohaSimOperator", arms="viperx300", camera_names=("top",), height=144, width=192
     ),
 )

@@ -65,7 +65,6 @@ inference = dict(
     task_descriptions={"1": "pick up the red cube"},
     execute_horizon=5,
     max_publish_step=300,
-    operator=dict(
-        type="URSimOperator", camera_names=("front", "wrist"), height=96, width=128, seed=500
-    ),
+    # What every UR takes, simulated or real: ``type`` alone says which it is.
+    operator=dict(type="URSimOperator", camera_names=("front", "wrist"), height=96, width=128),
 )

@@ -10,7 +10,7 @@ and in another the policy, from the work dir that the training made; with ``--se
     fluxvla run --config configs/ur5e_sim_ros2.py --section inference --task 1 \
         --work-dir work_dirs/ur5e_sim_lift
 
-On a real robot ``operator.type`` is ``UROperator``, without ``seed`` and ``real_time_factor``.
+On a real robot ``operator.type`` is ``UROperator``; its ``model`` is a UR5e by default.
 """
 
 _base_ = "ur5e_sim_lift.py"
@@ -18,16 +18,7 @@ _base_ = "ur5e_sim_lift.py"
 inference = dict(
     # 8 s at the 125 commands a second that UROperator sends.
     max_publish_step=1000,
-    operator=dict(
-        _delete_=True,
-        type="URSimROSOperator",
-        model="ur5e",
-        camera_names=("front", "wrist"),
-        height=96,
-        width=128,
-        seed=500,
-        real_time_factor=1.0,
-    ),
+    operator=dict(type="URSimROSOperator"),
 )
 
 eval = dict(

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 import fluxvla_core
-from fluxvla_core.build import RunContext, build_from_cfg, parameters
+from fluxvla_core.build import RunContext, build_from_cfg, parameters, takes
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import Registry
 
@@ -110,6 +110,15 @@ def test_the_config_itself_is_left_alone(registry):
 
 def test_parameters_follow_keywords_into_the_base():
     assert parameters(Child) == {"own", "rate", "cfg", "context"}
+
+
+def test_what_a_tables_class_takes_can_be_asked(registry):
+    assert takes({"type": "Child", "own": "x"}, registry, "rate")
+    assert takes({"type": Child}, registry, "own")
+    assert not takes({"type": "Base"}, registry, "own")
+    assert not takes(Base(), registry, "rate"), "it is built already"
+    with pytest.raises(ConfigError, match="needs type = '<class name>'"):
+        takes({}, registry, "rate")
 
 
 def test_public_names_are_pinned_and_lazy():

@@ -76,14 +76,7 @@ def build_from_cfg(
         return cfg
     arguments = {**defaults, **cfg}
     name = arguments.pop("type", None)
-    if inspect.isclass(name):
-        cls = name
-    elif isinstance(name, str):
-        cls = registry.get(name)
-    else:
-        raise ConfigError(
-            f"a table for fluxvla.{registry.name} needs type = '<class name>', got {name!r}"
-        )
+    cls = _class_of(name, registry)
     taken = parameters(cls)
     for key in INJECTED:
         if key in cfg and context is not None:
@@ -110,6 +103,16 @@ def build_from_cfg(
         if explained is None:
             raise
         raise explained from error
+
+
+def takes(cfg: Any, registry: Registry, name: str) -> bool:
+    """Whether the class of the table ``cfg`` has a parameter called ``name``; an object has none.
+
+    Raises:
+        ConfigError: no ``type``.
+        PluginError: the class cannot be had.
+    """
+    return isinstance(cfg, Mapping) and name in parameters(_class_of(cfg.get("type"), registry))
 
 
 def parameters(cls: type) -> set[str]:
@@ -141,6 +144,17 @@ def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) ->
         for one in wrong
     ]
     return ConfigError.from_problems(tuple(problems), next=f"fluxvla plugins show {cls.__name__}")
+
+
+def _class_of(name: Any, registry: Registry) -> type:
+    if inspect.isclass(name):
+        return name
+    if isinstance(name, str):
+        cls: type = registry.get(name)
+        return cls
+    raise ConfigError(
+        f"a table for fluxvla.{registry.name} needs type = '<class name>', got {name!r}"
+    )
 
 
 def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:

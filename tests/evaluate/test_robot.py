@@ -145,6 +145,13 @@ def test_every_task_is_counted_over_its_seeds(evaluate, section, tmp_path, liste
     assert ("evaluation", "results.json") in listener.artifacts
 
 
+def test_scenes_count_up_from_the_seed_where_the_operators_table_has_none(evaluate, tmp_path):
+    evaluate({"operator": {"type": "Simulated"}})
+
+    # As with a seed of its own: even ones begin within reach of the goal.
+    assert [r["success"] for r in episodes(tmp_path)] == [True, True, False, False] * 2
+
+
 def test_an_interrupted_evaluation_goes_on(evaluate, section, tmp_path, listener, monkeypatch):
     real, calls = Simulated.task_done, []
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from fluxvla_core.build import build_operator_from_cfg, build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
+from fluxvla_core.spec.embodiment import differences
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 NAMES = ("aloha_sim_transfer", "aloha_sim_ros2", "ur5e_sim_lift", "ur5e_sim_ros2")
@@ -17,6 +19,40 @@ NAMES = ("aloha_sim_transfer", "aloha_sim_ros2", "ur5e_sim_lift", "ur5e_sim_ros2
 def test_nothing_is_wrong_with_it(name, capsys):
     assert main(["config", "check", str(CONFIGS / f"{name}.py")]) == 0
     assert "no problems" in capsys.readouterr().out
+
+
+SAME = {
+    "aloha_sim_transfer": ("AlohaSimOperator", "AlohaSimROSOperator", "AlohaOperator"),
+    "aloha_sim_ros2": ("AlohaSimOperator", "AlohaSimROSOperator", "AlohaOperator"),
+    "ur5e_sim_lift": ("URSimOperator", "URSimROSOperator", "UROperator"),
+    "ur5e_sim_ros2": ("URSimOperator", "URSimROSOperator", "UROperator"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [(name, kind) for name, kinds in SAME.items() for kind in kinds]
+)
+def test_the_operators_type_is_all_that_another_robot_needs(name, kind, capsys):
+    config = str(CONFIGS / f"{name}.py")
+    changed = ["--set", f"inference.operator.type={kind}"]
+    assert main(["run", "--config", config, "--section", "inference", *changed, "--dry-run"]) == 0
+    assert kind in capsys.readouterr().out
+
+    table = load_config(config).tree["inference"]["operator"]
+    own, other = (build_operator_from_cfg({**table, **type_}) for type_ in ({}, {"type": kind}))
+    assert type(other).__name__ == kind
+    assert differences(own.embodiment, other.embodiment) == []
+    assert own.embodiment.cameras == other.embodiment.cameras
+
+
+@pytest.mark.parametrize("kind", ["AlohaSimOperator", "AlohaSimROSOperator"])
+@pytest.mark.parametrize(("said", "seed"), [({}, 42), ({"seed": 3}, 3)])
+def test_a_simulated_scene_begins_from_the_runners_seed(kind, said, seed):
+    table = load_config(CONFIGS / "aloha_sim_ros2.py").tree["inference"]
+    operator = {**table["operator"], "type": kind, **said}
+
+    runner = build_runner_from_cfg({**table, "seed": 42, "operator": operator})
+    assert runner.ros_operator.seed == seed
 
 
 @pytest.mark.parametrize(

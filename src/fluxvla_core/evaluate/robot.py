@@ -46,8 +46,8 @@ class RobotEvalRunner:
         tasks: ids of the section's ``task_descriptions``, or name -> id, where results are to be
             compared with others that have names of their own; all of them by default.
         episodes: for each task.
-        seed: of each task's first episode, for the policy and, where the section's operator has a
-            ``seed``, for the scene; the others count up from it.
+        seed: of each task's first episode, for the policy and, where the section's operator takes
+            one, for the scene; the others count up from it.
         go_on: after a safety stop, go on with the next episode. Only for robots that can hurt
             nobody: else somebody must look first, and start the same command again.
         record_videos: how many episodes the results show: failures first, then successes.

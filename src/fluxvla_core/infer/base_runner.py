@@ -21,6 +21,7 @@ from fluxvla_core.build import (
     build_action_filter_from_cfg,
     build_operator_from_cfg,
     build_policy_from_cfg,
+    takes,
 )
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.optional import can_continue
@@ -39,6 +40,7 @@ from fluxvla_core.infer.session import Session
 from fluxvla_core.infer.sources import TaskSource, task_source
 from fluxvla_core.infer.tasks import Task, check_descriptions
 from fluxvla_core.infer.views import scaled_views
+from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.record.ros_messages import typestore
 from fluxvla_core.record.trace import next_folder
 from fluxvla_core.safety.ramp import check_pose
@@ -56,7 +58,8 @@ class BaseInferenceRunner:
     Args:
         cfg: the whole config (injected).
         context: what the run knows (injected): work dir, task, reporter.
-        seed: of the policy's noise; episode ``n`` uses ``seed + n``.
+        seed: of the policy's noise; episode ``n`` uses ``seed + n``. Also of a simulated operator
+            whose table says no other.
         ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         policy: table or object of the Policy contract, instead of a checkpoint.
@@ -168,7 +171,9 @@ class BaseInferenceRunner:
         for name, value in counts.items():
             if value is not None and value < 1:
                 raise self._wrong(name, f"must be at least 1, got {value}")
-        self.ros_operator = build_operator_from_cfg(operator, context)
+        # A robot does not begin from a seed: configs that are for both leave it out of its table.
+        scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
+        self.ros_operator = build_operator_from_cfg(operator, context, **scene)
         own_sending = type(self)._execute_actions is not BaseInferenceRunner._execute_actions
         self.robot = Robot(self.ros_operator, embodiment, sends=own_sending)
         self.embodiment = self.robot.embodiment

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -119,10 +120,14 @@ def scene(libero):
 
 
 @pytest.fixture
-def stock(libero):
+def stock(libero, monkeypatch):
     """``stock(task, size=0)``: LIBERO's own environment, as its evaluation makes it."""
     from fluxvla_libero.require import quiet
     from fluxvla_libero.scene import ENV_SEED
+
+    # Tests hide GPUs from torch by an empty text, of which robosuite wants a number.
+    if os.environ.get("CUDA_VISIBLE_DEVICES") == "":
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
 
     def make(task, size=0):
         with quiet():

@@ -133,7 +133,7 @@ def test_nothing_is_sent_before_the_first_task(bench, make_arm, asked):
 
 def test_an_arm_that_fails_while_it_is_held_stops_the_run(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
-    asked(Slow("1", "2", polls=1000))
+    asked(Slow("1", "2", polls=60))
     bench.arm.faults = {"send_action": OSError("cable pulled"), "after": 25}
 
     with pytest.raises(Faulted, match=r"Arm\.send_action raised OSError: cable pulled"):
@@ -146,7 +146,7 @@ def test_what_stops_an_arm_between_two_tasks_is_recorded_with_the_one_before(
     bench, make_arm, asked
 ):
     bench.arm = make_arm(realtime=True)
-    asked(Slow("1", "2", polls=1000))
+    asked(Slow("1", "2", polls=60))
     bench.arm.faults = {"send_action": OSError("cable pulled"), "after": 25}
     stop = bench.arm.stop
     bench.arm.stop = lambda: (stop(), 1 / 0)
@@ -167,7 +167,7 @@ def test_a_trip_that_cannot_be_recorded_is_said_and_stops_all_the_same(
 ):
     monkeypatch.setattr("fluxvla_core.record.held.LINES", "there/is/no/such/folder")
     bench.arm = make_arm(realtime=True)
-    asked(Slow("1", "2", polls=1000))
+    asked(Slow("1", "2", polls=60))
     bench.arm.faults = {"send_action": OSError("cable pulled"), "after": 25}
 
     with pytest.raises(Faulted, match="cable pulled"):

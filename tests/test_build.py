@@ -84,6 +84,7 @@ def test_a_constructor_that_fails_at_a_value_of_another_type(registry, values, t
     with pytest.raises(ConfigError) as found:
         build_from_cfg(table, registry, context)
     assert told in str(found.value)
+    assert "likely cause: the constructor raised " in str(found.value)
     for key, place in origins.items():
         assert f"{place}: {key}: Counting" in str(found.value)
 

@@ -102,6 +102,8 @@ def build_from_cfg(
         explained = _explained(cls, cfg, context)
         if explained is None:
             raise
+        # An annotation may be wrong: what really happened stands beside it.
+        explained.cause = f"the constructor raised {type(error).__name__}: {error}"
         raise explained from error
 
 

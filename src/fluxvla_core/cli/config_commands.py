@@ -9,7 +9,7 @@ from typing import Any
 
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
 from fluxvla_core.cli.plan import choose_section
-from fluxvla_core.config import Config, apply_overrides, check_config, examine, keys, load_config
+from fluxvla_core.config import Config, apply_overrides, examine, keys, load_config
 from fluxvla_core.config.check import Use
 from fluxvla_core.plugins.files import load_plugin_files
 
@@ -49,9 +49,11 @@ class Check:
     def run(self, args: argparse.Namespace) -> int:
         load_plugin_files(args.plugin_files)
         config = apply_overrides(load_config(args.file), args.overrides)
+        checked = examine(config, args.section)
         if args.section is not None:
-            choose_section(config, examine(config, args.section), args.section)
-        checked = check_config(config, args.section)
+            choose_section(config, checked, args.section)
+        if checked.problems:
+            raise checked.error()
         print(f"{config.file}: no problems; sections: {', '.join(checked.sections) or 'none'}")
         for line in used(checked.uses):
             print(line)

@@ -44,10 +44,11 @@ class Doctor:
         )
 
     def run(self, args: argparse.Namespace) -> int:
-        count = 0
-        for count, text in enumerate(self._findings(args), 1):  # noqa: B007 - read afterwards
+        healthy = True
+        for text in self._findings(args):
+            healthy = False
             print(text, flush=True)
-        if count:
+        if not healthy:
             return EXIT_FAILED
         plugins = [p for many in index().plugins.values() for p in many]
         dists = {p.dist for p in plugins}

@@ -358,19 +358,22 @@ class Episode:
                 self._path.brake(self._most_braking())
             except Exception as error:  # noqa: BLE001 - the operator's own stop comes next
                 plan.context.reporter.warn(f"braking failed: {_what(error)}")
-        failure = plan.robot.stop()
-        if failure:
-            plan.context.reporter.warn(failure)
+        failure = self._stop_robot()
         seconds = plan.robot.clock.now() - began
         self._record.event("stop", rule=rule, problem=problem, seconds=seconds, failure=failure)
+
+    def _stop_robot(self) -> str | None:
+        """The operator's own stop; what went wrong with it."""
+        failure = self._plan.robot.stop()
+        if failure:
+            self._plan.context.reporter.warn(failure)
+        return failure
 
     def _stop_held(self, error: FluxError) -> None:
         plan = self._plan
         if plan.latch.tripped is None:
             plan.latch.trip(self._rule(error), error)
-        failure = plan.robot.stop()
-        if failure:
-            plan.context.reporter.warn(failure)
+        failure = self._stop_robot()
         try:
             note_trip(self._folder, **asdict(plan.latch.trips[-1]), failure=failure)
         except RunFailed as problem:

@@ -134,37 +134,14 @@ class Packer:
 
     def picture(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
         """The CDR of an ``Image``: ``(H, W, 3)`` uint8 RGB."""
-        height, width = image.shape[:2]
-        message = self._store.types[IMAGE](
-            header=self._header(ns, camera),
-            height=height,
-            width=width,
-            encoding="rgb8",
-            is_bigendian=0,
-            step=3 * width,
-            data=np.ascontiguousarray(image).reshape(-1),
-        )
-        packed: memoryview = self._store.serialize_cdr(message, IMAGE)
-        return packed
+        return self._image(camera, image, "rgb8", ns)
 
     def depth(self, camera: str, metres: npt.NDArray[np.float32], ns: int) -> memoryview:
         """The CDR of an ``Image`` of ``(H, W)`` distances: whole millimetres, 0 for nothing.
 
         NaN is nothing, as is what is farther than the 65.535 m that the encoding reaches.
         """
-        height, width = metres.shape
-        millimetres = to_millimetres(metres).astype("<u2")
-        message = self._store.types[IMAGE](
-            header=self._header(ns, camera),
-            height=height,
-            width=width,
-            encoding="16UC1",
-            is_bigendian=0,
-            step=2 * width,
-            data=millimetres.view(np.uint8).reshape(-1),
-        )
-        packed: memoryview = self._store.serialize_cdr(message, IMAGE)
-        return packed
+        return self._image(camera, to_millimetres(metres).astype("<u2"), "16UC1", ns)
 
     def jpeg(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
         """The CDR of a ``CompressedImage``: ``(H, W, 3)`` uint8 RGB; loses a little."""
@@ -190,6 +167,22 @@ class Packer:
             effort=empty,
         )
         packed: memoryview = self._store.serialize_cdr(message, JOINT_STATE)
+        return packed
+
+    def _image(self, camera: str, pixels: npt.NDArray[Any], encoding: str, ns: int) -> memoryview:
+        """The CDR of an ``Image``; ``pixels`` are little-endian."""
+        height, width = pixels.shape[:2]
+        data = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
+        message = self._store.types[IMAGE](
+            header=self._header(ns, camera),
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=0,
+            step=data.size // height,
+            data=data,
+        )
+        packed: memoryview = self._store.serialize_cdr(message, IMAGE)
         return packed
 
     def _odometry(self, speeds: Any, ns: int) -> memoryview:

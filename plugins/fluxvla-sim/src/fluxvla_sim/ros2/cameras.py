@@ -5,13 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.ros2 import images
 from fluxvla_core.ros2.faults import Faults, Outbox
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.streams import IMAGE, depth_stream
 from fluxvla_sim.render import Renderer, import_mujoco
+
+if TYPE_CHECKING:
+    from fluxvla_sim.ros2.node import NodeSettings
 
 
 class Cameras(threading.Thread):
@@ -24,7 +27,7 @@ class Cameras(threading.Thread):
         model: of the scene.
         publishers: stream -> publisher, of pictures (a camera's name) and of depth.
         cameras: names, of those that have a publisher.
-        settings: ``NodeSettings``.
+        settings: rates, latencies and the size of the pictures.
         faults: shared with the other streams.
         look: takes ``mujoco.MjData`` to fill with the scene's positions, and gives their stamp.
         stopping: ends the thread.
@@ -35,7 +38,7 @@ class Cameras(threading.Thread):
         model: Any,
         publishers: Mapping[str, Any],
         cameras: tuple[str, ...],
-        settings: Any,
+        settings: NodeSettings,
         faults: Faults,
         look: Callable[[Any], Any],
         stopping: threading.Event,

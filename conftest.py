@@ -36,10 +36,10 @@ settings.load_profile("fluxvla")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What opens a ROS network waits for other processes, and needs the machine to itself."""
+    """What opens a ROS network waits for other processes, which a busy machine keeps waiting."""
     for item in items:
         if "ros_domain" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.realtime)
+            item.add_marker(pytest.mark.network)
 
 
 @pytest.fixture(autouse=True)

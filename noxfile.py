@@ -36,10 +36,14 @@ OPTIONAL = {
     "fluxvla-libero": "libero",
     "fluxvla-metaworld": "metaworld",
 }
-PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
-SLOWEST = "--durations=15"
-PARALLEL = ["-n", PROCESSES, "--dist", "loadfile", "-m", "not realtime and not slow", SLOWEST]
-ALONE = ["-m", "realtime and not slow", SLOWEST]
+# More than there are cores: tests wait for processes that they start.
+PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "3")
+SPREAD = ["--dist", "loadfile", "--durations=15"]
+STAGES = {
+    "pytest": ["-n", PROCESSES, *SPREAD, "-m", "not network and not realtime and not slow"],
+    "pytest, over networks": ["-n", "2", *SPREAD, "-m", "network and not realtime and not slow"],
+    "pytest, in real time": ["-m", "realtime and not slow", "--durations=15"],
+}
 
 
 @nox.session
@@ -55,8 +59,7 @@ def tests(session: nox.Session) -> None:
         step("types", lambda: dev.run("mypy", cwd=ROOT))
         step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
         make_renderable(session, dev)
-        # A test that waits for a network or a deadline does not share its core with another one.
-        for name, words in (("pytest", PARALLEL), ("pytest, in real time", ALONE)):
+        for name, words in STAGES.items():
             step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=rendering.VARIABLES))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
         step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))

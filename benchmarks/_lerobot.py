@@ -20,8 +20,7 @@ def prepared(*requirements: str, folder: str = "lerobot") -> Env | None:
     try:
         env = lerobot_env.prepare(lambda text: print(text, file=sys.stderr), ROOT / ".nox" / folder)
         if requirements:
-            pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
-            env.run(*pip, *requirements, quiet=True, echo=False)
+            env.pip_install(*requirements, quiet=True)
     except (shell.StepFailed, OSError) as error:
         print(f"without LeRobot, which cannot be installed: {error}", file=sys.stderr)
         return None

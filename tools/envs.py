@@ -53,10 +53,18 @@ class Env:
         command = [self.bin / program, *words]
         return shell.run(command, cwd=cwd, env=variables, quiet=quiet, echo=echo)
 
-    def pip_install(self, *words: str | os.PathLike[str], constraints: Path) -> None:
-        """pip install under the constraints; raises StepFailed."""
-        options = ["-q", "--disable-pip-version-check", "-c", str(constraints)]
-        self.run("python", "-m", "pip", "install", *options, *words)
+    def pip_install(
+        self,
+        *words: str | os.PathLike[str],
+        constraints: Path | None = None,
+        quiet: bool = False,
+    ) -> None:
+        """pip install, under the constraints if there are any; raises StepFailed."""
+        # Compiling all of torch and transformers takes a minute; Python compiles what is imported.
+        options = ["-q", "--disable-pip-version-check", "--no-compile"]
+        if constraints is not None:
+            options += ["-c", str(constraints)]
+        self.run("python", "-m", "pip", "install", *options, *words, quiet=quiet, echo=not quiet)
 
     def create(self) -> None:
         """Make it anew and empty, with the Python that runs this."""

@@ -87,13 +87,11 @@ def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "le
 
     def install_base() -> None:
         # No constraints: they are this project's, and LeRobot's needs are others.
-        nothing = root / "constraints.txt"
-        nothing.write_text("", encoding="utf-8")
-        torch_build.install(env, version, nothing, log)
-        _pip(env, *NEEDS)
+        torch_build.install(env, version, None, log)
+        env.pip_install(*NEEDS, quiet=True)
 
     def install_parts(changed: list[str], fresh: bool) -> None:
-        _pip(env, "--no-deps", *LEROBOT)
+        env.pip_install("--no-deps", *LEROBOT, quiet=True)
         declare_operators(env)
         _link_ffmpeg(env)
         # Some Pythons (Debian's, unless libpython3.x is installed) lack the library it links to.
@@ -101,11 +99,6 @@ def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "le
 
     env.filled(base, {"lerobot": " ".join(LEROBOT) + DECLARED}, install_base, install_parts)
     return env
-
-
-def _pip(env: Env, *words: str) -> None:
-    pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check")
-    env.run(*pip, *words, quiet=True, echo=False)
 
 
 def declare_operators(env: Env) -> None:

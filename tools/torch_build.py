@@ -38,7 +38,7 @@ def attempts(version: str, *, gpu: bool, platform: str = sys.platform) -> list[s
     return ["cpu-wheel", "uv", "plain"]
 
 
-def install(env: Env, version: str, constraints: Path, log: Callable[[str], None]) -> str:
+def install(env: Env, version: str, constraints: Path | None, log: Callable[[str], None]) -> str:
     """Install torch into ``env``; return the attempt that worked. Raises StepFailed from the last.
 
     ``constraints`` may hold ``torch==VERSION``: that admits ``VERSION+cpu`` as well.
@@ -61,14 +61,15 @@ def install(env: Env, version: str, constraints: Path, log: Callable[[str], None
     return ways[-1]
 
 
-def _quietly(env: Env, way: str, version: str, constraints: Path) -> None:
-    pip = ["python", "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+def _quietly(env: Env, way: str, version: str, constraints: Path | None) -> None:
     if way == "cpu-wheel":
-        env.run(*pip, "-c", str(constraints), f"torch=={version}+cpu", quiet=True)
+        env.pip_install(f"torch=={version}+cpu", constraints=constraints, quiet=True)
         return
-    env.run(*pip, "uv", quiet=True)
+    env.pip_install("uv", quiet=True)
     uv = ["uv", "pip", "install", "-q", "--python", str(env.python), "--torch-backend=cpu"]
-    env.run(*uv, "-c", str(constraints), f"torch=={version}", quiet=True)
+    if constraints is not None:
+        uv += ["-c", str(constraints)]
+    env.run(*uv, f"torch=={version}", quiet=True)
 
 
 def _first_error(text: str) -> str:

@@ -67,6 +67,12 @@ SHAPED = (
 """
 )
 
+# One that has more streams than the embodiment: a depth picture comes with its own stamp.
+DEEP = GOOD.replace('"front": now}', '"front": now, "front depth": now}').replace(
+    "SmallOperator", "DeepOperator"
+)
+RIGHT = {"specimen_right.py": GOOD, "specimen_shaped.py": SHAPED, "specimen_deep.py": DEEP}
+
 BROKEN = {
     "test_is_complete": ('    api = "1.0"\n', ""),
     "test_import_is_light": ("import time\n", "import time, torch\n"),
@@ -114,8 +120,8 @@ BROKEN = {
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """``specimen::check`` -> outcome: all checks of the right one, its own of each wrong one."""
     folder = tmp_path_factory.mktemp("specimens")
-    wanted = ["specimen_right.py", "specimen_shaped.py"]
-    for name, source in zip(wanted, (GOOD, SHAPED), strict=True):
+    wanted = list(RIGHT)
+    for name, source in RIGHT.items():
         (folder / name).write_text(source)
     for number, (check, (old, new)) in enumerate(BROKEN.items()):
         assert old in GOOD
@@ -135,7 +141,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("specimen", ["specimen_right.py", "specimen_shaped.py"])
+@pytest.mark.parametrize("specimen", RIGHT)
 def test_a_right_operator_passes_every_check(outcomes, specimen):
     right = {k: v for k, v in outcomes.items() if k.startswith(f"{specimen}::")}
     assert len(right) >= 20

@@ -17,6 +17,7 @@ from fluxvla_core.build import RunContext, build_operator_from_cfg
 from fluxvla_core.errors import ConfigError, LoadFailed, NotReady, Rejected
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, ODOMETRY, TWIST
+from fluxvla_core.ros2.trouble import BadMessage
 from fluxvla_core.testing import OperatorConformance
 from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
 
@@ -299,6 +300,12 @@ class TestCobotMagic:
         assert set(frame.depths) == set(frame.images)
         np.testing.assert_allclose(frame.depths["cam_high"], 1.5)
         np.testing.assert_allclose(frame.base, [0.2, -0.1])
+
+    def test_a_speed_of_the_base_that_is_no_number(self, connect, drivers):
+        streams, sinks = robot(base=True)
+        drivers([*streams[:-1], streams[-1] | {"data": [float("nan"), 0.0]}], sinks)
+        with pytest.raises(BadMessage, match=r"base \(/odom_raw\): its speed is \[nan, 0.0\]"):
+            connect(use_robot_base=True)
 
     def test_both_arms_are_commanded_by_name_with_raw_grippers(self, connect, drivers):
         driver = drivers(*robot())

@@ -14,6 +14,7 @@ from fluxvla_core.testing.ros2 import ros_domain
 __all__ = ["ros_domain"]
 
 SMALL = ["--height", "48", "--width", "64", "--camera-hz", "20"]
+_END_S = 60.0
 # Machines that run tests stall for seconds.
 PATIENT = {
     "height": 48,
@@ -39,6 +40,10 @@ class OverRos2(OperatorConformance):
         with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
             yield
             process.terminate()
+            try:
+                process.wait(_END_S)
+            finally:
+                process.kill()
 
 
 class TestAlohaSimROSOperator(OverRos2):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -214,6 +215,26 @@ class TestRobot:
         driver.tell(change={"/joint_states": {"follows": "", **where(np.add(POSE, 0.11))}})
         wait_for(lambda: np.allclose(operator.get_state()[:6], np.add(POSE, 0.11)))
         operator.send_action(jump)
+
+    def test_a_stop_is_said_again_until_the_robot_takes_it(self, connect, drivers):
+        driver = drivers(*robot())
+        operator = connect()
+        driver.tell(change={"/joint_states": {"follows": ""}})
+        for count in range(1, 9):
+            operator.send_action([*np.add(POSE, 0.03 * count), 0.5])
+            wait_for(lambda n=count: len(driver.on(COMMANDS)) == n)
+        # The base is blocked, and the other joints have a little way to go.
+        reached, there = np.add(POSE, [0.0, *[0.18] * 5]), np.add(POSE, [0.0, *[0.24] * 5])
+        driver.tell(change={"/joint_states": where(reached)})
+        wait_for(lambda: np.allclose(operator.get_state()[:6], reached))
+        stopping = threading.Thread(target=operator.stop)
+        stopping.start()
+        wait_for(lambda: len(driver.on(COMMANDS)) >= 10)
+        driver.tell(change={"/joint_states": where(there)})
+        stopping.join(10.0)
+        assert not stopping.is_alive()
+
+        np.testing.assert_allclose(driver.on(COMMANDS)[-1]["data"], there)
 
     def test_trajectories_may_be_as_long_as_they_like(self, connect, drivers):
         driver = drivers(*robot(SCALED))

@@ -22,7 +22,7 @@ from fluxvla_core.testing import OperatorConformance
 from .fake_ur import HOME, FakeUR
 
 client = pytest.importorskip("rtde_control", reason="pip install ur-rtde")
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.network
 # Machines that run tests stall for a second; what is silent for longer is silent.
 PATIENT = {"max_age_s": 2.0, "connect_timeout_s": 10.0, "watchdog_hz": 1.0}
 POSE = np.array([*HOME, 1.0])

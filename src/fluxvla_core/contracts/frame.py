@@ -20,7 +20,8 @@ class Frame:
     Args:
         state: ``(state_dim,)`` float64 in the embodiment's units and order.
         images: camera name -> ``(height, width, 3)`` uint8, RGB.
-        stamps: stream -> monotonic receipt time in seconds; ``"state"`` and each camera name.
+        stamps: stream -> monotonic receipt time in seconds; ``"state"``, each camera name, and what
+            else came with them.
     """
 
     state: npt.NDArray[np.float64]

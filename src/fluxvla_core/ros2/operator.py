@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
-from fluxvla_core.ros2 import discovery, frames, sync
+from fluxvla_core.ros2 import discovery, frames, silence, sync
 from fluxvla_core.ros2.actions import checked_action, hold_target
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.frames import RobotFrame
@@ -110,12 +110,20 @@ class RosOperator(ABC):
         """Send a ``(dim,)`` action that was checked, with :meth:`publish`."""
 
     def read_base(self, messages: Mapping[str, Any]) -> Array | None:
-        """``(2,)`` speeds of a mobile base of the ``side`` streams' messages; None without one."""
+        """``(2,)`` speeds of a mobile base of the ``side`` streams' messages; None without one.
+
+        Raises:
+            Faulted: a speed is not finite.
+        """
         return None
 
     def on_connected(self, connection: Connection) -> None:
         """Called at the end of ``connect``."""
         return
+
+    def publish_hold(self, target: Array, last: Array) -> None:
+        """Send the ``(dim,)`` command that holds the arm; ``last`` is the one that it follows."""
+        self.publish_action(target)
 
     def on_stop(self) -> None:
         """Called in every ``stop``, after the arm holds: stop what else can move."""
@@ -250,9 +258,10 @@ class RosOperator(ABC):
             if self._connection is None:
                 return
             steps = [self.on_stop]
-            if self._moving and self._last is not None:
-                self._last = target = self._hold_target(self._last)
-                steps.insert(0, lambda: self.publish_action(target))
+            last = self._last
+            if self._moving and last is not None:
+                self._last = target = self._hold_target(last)
+                steps.insert(0, lambda: self.publish_hold(target, last))
             self._moving = False
             for step in steps:
                 try:
@@ -391,29 +400,9 @@ class RosOperator(ABC):
         }
         silent = sync.silent(watched, time.monotonic(), self.max_age_s)
         if silent:
-            raise self._silence(connection, silent, whole=len(silent) == len(watched))
+            whole = len(silent) == len(watched)
+            raise silence.explained(connection, silent, self.max_age_s, whole)
         return {name: received for name, received in newest.items() if received is not None}
-
-    def _silence(
-        self, connection: Connection, silent: Mapping[str, float | None], whole: bool
-    ) -> Stale:
-        lines, gone = [], []
-        for name, age in silent.items():
-            stream = connection.streams[name]
-            since = f"silent for {age:.2f} s" if age is not None else "never heard"
-            lines.append(f"{stream.label} is {since}")
-            if not connection.node.get_publishers_info_by_topic(stream.topic):
-                gone.append(stream.topic)
-        cause = "the device froze, or its driver was killed or hangs"
-        if whole:
-            cause = "every stream at once: the network is gone, or this machine is overloaded"
-        if gone:
-            cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
-        return Stale(
-            f"{'; '.join(lines)}; {self.max_age_s:g} s is allowed",
-            cause=cause,
-            next="look at the driver; max_age_s of the operator says how long it may be silent",
-        )
 
     def _clock_stepped(self) -> bool:
         """Whether a sender's clock stepped so recently that stamps on both sides are kept."""

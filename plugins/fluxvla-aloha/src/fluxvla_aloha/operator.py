@@ -26,6 +26,7 @@ from fluxvla_core.ros2.streams import (
     StreamSpec,
     camera_stream,
 )
+from fluxvla_core.ros2.trouble import BadMessage
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -220,7 +221,10 @@ class AlohaOperator(RosOperator):
         if not self._use_base:
             return None
         twist = messages["base"].twist.twist
-        return np.array([twist.linear.x, twist.angular.z])
+        speeds = np.array([twist.linear.x, twist.angular.z])
+        if not np.isfinite(speeds).all():
+            raise BadMessage(f"base ({self._base_topics[0]}): its speed is {speeds.tolist()}")
+        return speeds
 
     def publish_action(self, action: Array) -> None:
         for index, arm_topic in enumerate(self._arms):

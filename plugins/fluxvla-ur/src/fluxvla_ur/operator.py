@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,6 +33,8 @@ Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
 BOOL = "std_msgs.msg:Bool"
 _ARM = len(JOINTS)
+# How long, and how often, the command that holds an arm is said again if the robot ignores it.
+_HOLD_S, _AGAIN_S = 0.5, 0.01
 
 CONTROLLERS: Mapping[str, tuple[str, str]] = {
     STREAMED: ("/forward_position_controller/commands", FLOAT64_ARRAY),
@@ -254,6 +257,18 @@ class UROperator(RosOperator):
         gripper = message_class(self._gripper_message)()
         gripper.data = float(closed + action[_ARM] * (opened - closed))
         self.publish(self._gripper_command, gripper)
+
+    def publish_hold(self, target: Array, last: Array) -> None:
+        # A blocked joint is held where it is, which may be further from its last position than the
+        # robot takes; then it takes it as soon as the other joints have come to theirs.
+        until = time.monotonic() + _HOLD_S
+        while True:
+            taken = not self._streamed or is_taken(target[:_ARM], last[:_ARM])
+            taken = taken or is_taken(target[:_ARM], self.get_state()[:_ARM])
+            self.publish_action(target)
+            if taken or time.monotonic() >= until:
+                return
+            time.sleep(_AGAIN_S)
 
     def _fill_trajectory(self, command: Any, positions: Array) -> None:
         point = message_class("trajectory_msgs.msg:JointTrajectoryPoint")()

@@ -60,8 +60,7 @@ class Env:
         quiet: bool = False,
     ) -> None:
         """pip install, under the constraints if there are any; raises StepFailed."""
-        # Compiling all of torch and transformers takes a minute; Python compiles what is imported.
-        options = ["-q", "--disable-pip-version-check", "--no-compile"]
+        options = ["-q", "--disable-pip-version-check"]
         if constraints is not None:
             options += ["-c", str(constraints)]
         self.run("python", "-m", "pip", "install", *options, *words, quiet=quiet, echo=not quiet)

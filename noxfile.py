@@ -20,7 +20,7 @@ import nox
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
-from tools import envs, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
+from tools import envs, lerobot_env, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
 from tools.demo import __main__ as demo_program  # noqa: E402
 from tools.steps import Steps  # noqa: E402
 
@@ -36,13 +36,13 @@ OPTIONAL = {
     "fluxvla-libero": "libero",
     "fluxvla-metaworld": "metaworld",
 }
-# More than there are cores: tests wait for processes that they start.
-PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "3")
-SPREAD = ["--dist", "loadfile", "--durations=15"]
+PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
+SLOWEST = "--durations=15"
+FILES, TURNS = ["--dist", "loadfile", SLOWEST], ["--dist", "worksteal", SLOWEST]
 STAGES = {
-    "pytest": ["-n", PROCESSES, *SPREAD, "-m", "not network and not realtime and not slow"],
-    "pytest, over networks": ["-n", "2", *SPREAD, "-m", "network and not realtime and not slow"],
-    "pytest, in real time": ["-m", "realtime and not slow", "--durations=15"],
+    "pytest": ["-n", PROCESSES, *FILES, "-m", "not network and not realtime and not slow"],
+    "pytest, over networks": ["-n", "2", *TURNS, "-m", "network and not realtime and not slow"],
+    "pytest, in real time": [SLOWEST, "-m", "realtime and not slow"],
 }
 
 
@@ -50,14 +50,17 @@ STAGES = {
 def tests(session: nox.Session) -> None:
     """Lint, types, layers, all tests with the packaging ones, and the demo's short form."""
     with Steps(session) as step:
-        dev = dev_env(session)
         if session.posargs:
+            dev = dev_env(session)
             make_renderable(session, dev)
             step("pytest", lambda: dev.run("pytest", *session.posargs, env=rendering.VARIABLES))
             return
-        step("lint", lambda: check_lint(dev))
-        step("types", lambda: dev.run("mypy", cwd=ROOT))
-        step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
+        # pip and mypy use one core each.
+        with shell.beside([sys.executable, "-m", "nox", "-s", "environments"], cwd=ROOT):
+            dev = dev_env(session)
+            step("lint", lambda: check_lint(dev))
+            step("types", lambda: dev.run("mypy", cwd=ROOT))
+            step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
         make_renderable(session, dev)
         for name, words in STAGES.items():
             step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=rendering.VARIABLES))
@@ -73,6 +76,14 @@ def nightly(session: nox.Session) -> None:
         make_renderable(session, dev)
         words = ["-m", "slow", *session.posargs]
         step("pytest", lambda: dev.run("pytest", *words, cwd=ROOT, env=rendering.VARIABLES))
+
+
+@nox.session
+def environments(session: nox.Session) -> None:
+    """What the tests need besides .nox/dev: LeRobot to compare with, and the demo's environment."""
+    with Steps(session) as step:
+        step("LeRobot", lambda: lerobot_env.prepare(session.log))
+        step("demo", lambda: demo_env(session))
 
 
 @nox.session

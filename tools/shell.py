@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 # A training run that is interrupted writes one last checkpoint; on two slow cores that takes
 # seconds, and a minute is what a full disk or a network drive may need.
@@ -77,7 +80,32 @@ def run(
     return output or ""
 
 
-def _let_it_end(child: subprocess.Popen[str]) -> None:
+@contextmanager
+def beside(command: Sequence[str | os.PathLike[str]], *, cwd: Path) -> Iterator[None]:
+    """Run a command while the body does something else, and wait for it after that.
+
+    Its output is kept back, and shown if it fails; that is all: whoever needs what it was to do
+    finds it undone. A body that fails ends it.
+    """
+    words = [os.fspath(word) for word in command]
+    print(f"$ {shlex.join(words)} &", flush=True)
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+        child = subprocess.Popen(
+            words, cwd=cwd, env=child_environment(), stdout=output, stderr=subprocess.STDOUT
+        )
+        try:
+            yield
+            child.wait()
+        finally:
+            if child.poll() is None:
+                child.terminate()
+                _let_it_end(child)
+        if child.returncode:
+            output.seek(0)
+            print(f"exit status {child.returncode} from: {shlex.join(words)}\n{output.read()}")
+
+
+def _let_it_end(child: subprocess.Popen[Any]) -> None:
     for stop, seconds in ((None, INTERRUPT_SECONDS), (child.terminate, 10.0), (child.kill, None)):
         if stop is not None:
             stop()

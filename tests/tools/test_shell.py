@@ -79,3 +79,41 @@ def test_ctrl_c_lets_the_child_finish_what_it_must(tmp_path: Path) -> None:
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=30) == 7
     assert (tmp_path / "saved").exists()
+
+
+def test_a_command_beside_is_waited_for_and_shown_only_if_it_fails(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    program = textwrap.dedent("""
+        import pathlib, sys, time
+        while not pathlib.Path("go").exists():
+            time.sleep(0.01)
+        print("what it says")
+        pathlib.Path("done").touch()
+        sys.exit(int(sys.argv[1]))
+    """)
+    for status in (0, 3):
+        with shell.beside([sys.executable, "-c", program, str(status)], cwd=tmp_path):
+            (tmp_path / "go").touch()
+        (tmp_path / "done").unlink()
+        (tmp_path / "go").unlink()
+        said = capfd.readouterr().out
+        assert (f"exit status {status} from: " in said) == bool(status)
+        assert ("\nwhat it says\n" in said) == bool(status)
+
+
+def test_a_command_beside_a_failing_one_is_ended(tmp_path: Path) -> None:
+    program = "import os, pathlib, time; pathlib.Path(str(os.getpid())).touch(); time.sleep(600)"
+    other = shell.StepFailed(["other"], 1)
+
+    def fails() -> None:
+        with shell.beside([sys.executable, "-c", program], cwd=tmp_path):
+            while not list(tmp_path.iterdir()):
+                time.sleep(0.01)
+            raise other
+
+    with pytest.raises(shell.StepFailed, match="other"):
+        fails()
+    (begun,) = tmp_path.iterdir()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(begun.name), 0)

@@ -259,16 +259,15 @@ class UROperator(RosOperator):
         self.publish(self._gripper_command, gripper)
 
     def publish_hold(self, target: Array, last: Array) -> None:
+        self.publish_action(target)
+        taken = not self._streamed or is_taken(target[:_ARM], last[:_ARM])
+        until = time.monotonic() + _HOLD_S
         # A blocked joint is held where it is, which may be further from its last position than the
         # robot takes; then it takes it as soon as the other joints have come to theirs.
-        until = time.monotonic() + _HOLD_S
-        while True:
-            taken = not self._streamed or is_taken(target[:_ARM], last[:_ARM])
-            taken = taken or is_taken(target[:_ARM], self.get_state()[:_ARM])
-            self.publish_action(target)
-            if taken or time.monotonic() >= until:
-                return
+        while not taken and time.monotonic() < until:
             time.sleep(_AGAIN_S)
+            taken = is_taken(target[:_ARM], self.get_state()[:_ARM])
+            self.publish_action(target)
 
     def _fill_trajectory(self, command: Any, positions: Array) -> None:
         point = message_class("trajectory_msgs.msg:JointTrajectoryPoint")()

@@ -38,6 +38,7 @@ OPTIONAL = {
 }
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 SLOWEST = "--durations=15"
+# Files share what is slow to make; what waits for networks is in few files, of unequal length.
 FILES, TURNS = ["--dist", "loadfile", SLOWEST], ["--dist", "worksteal", SLOWEST]
 STAGES = {
     "pytest": ["-n", PROCESSES, *FILES, "-m", "not network and not realtime and not slow"],

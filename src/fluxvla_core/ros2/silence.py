@@ -14,7 +14,8 @@ def explained(
     """Which topics are silent and since when; a frozen device, a dead driver, or the network.
 
     Args:
-        silent: as ``sync.silent`` gives them.
+        silent: stream -> its age in seconds, as ``sync.silent`` gives them.
+        max_age_s: seconds that are allowed.
         whole: whether these are all streams that should speak.
     """
     lines, gone = [], []

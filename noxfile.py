@@ -39,10 +39,10 @@ OPTIONAL = {
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 SLOWEST = "--durations=15"
 # Files share what is slow to make; what waits for networks is in few files, of unequal length.
-FILES, TURNS = ["--dist", "loadfile", SLOWEST], ["--dist", "worksteal", SLOWEST]
+FILES, TURNS = ["--dist", "loadfile", SLOWEST], ["--dist", "loadgroup", SLOWEST]
 STAGES = {
     "pytest": ["-n", PROCESSES, *FILES, "-m", "not network and not realtime and not slow"],
-    "pytest, over networks": ["-n", "2", *TURNS, "-m", "network and not realtime and not slow"],
+    "pytest, over networks": ["-n", "3", *TURNS, "-m", "network and not realtime and not slow"],
     "pytest, in real time": [SLOWEST, "-m", "realtime and not slow"],
 }
 

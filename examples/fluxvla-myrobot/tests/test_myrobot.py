@@ -41,6 +41,19 @@ class OnASimulatedRobot(OperatorConformance):
             process.terminate()
         ears.close()
 
+    @pytest.fixture
+    def connected(self, operator):
+        """The suite's own, and both listeners have found it: commands before that go lost."""
+        operator.connect()
+        self.first_frame(operator)
+        topic = self.arguments["joint_cmd_topic"]
+        (sender,) = (p for p in operator._connection.node.publishers if p.topic_name == topic)
+        deadline = time.monotonic() + self.ready_within_s
+        while sender.get_subscription_count() < 2:
+            assert time.monotonic() < deadline, "nobody listens"
+            time.sleep(0.01)
+        return operator
+
     def commands_heard(self, operator):
         return self.heard.ring.received
 

@@ -293,12 +293,13 @@ def run_ranks(
     Returns:
         The exit code of each: 0, 1 after an exception, ``-9`` after SIGKILL.
     """
+    usual = multiprocessing.get_start_method()
     context = multiprocessing.get_context("forkserver")
     # Slow to import, so only for those who use it.
     context.set_forkserver_preload([*PRELOAD, *(n for n in ("peft",) if n in sys.modules)])
     port = _free_port() if ranks > 1 else 0
     processes = [
-        context.Process(target=_rank, args=(rank, ranks, port, function, args))
+        context.Process(target=_rank, args=(rank, ranks, port, usual, function, args))
         for rank in range(ranks)
     ]
     for process in processes:
@@ -314,8 +315,16 @@ def run_ranks(
 
 
 def _rank(
-    rank: int, ranks: int, port: int, function: Callable[..., Any], args: tuple[Any, ...]
+    rank: int,
+    ranks: int,
+    port: int,
+    start_method: str,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
 ) -> None:
+    # A process has the way of its own start as its default; loader workers are to start as in a
+    # run from the command line, and one that is not forked imports torch anew.
+    multiprocessing.set_start_method(start_method, force=True)
     torch.set_num_threads(1)
     if ranks > 1:
         os.environ.update(

@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributed.tensor import DTensor, Shard
 
+from fluxvla_core.checkpoints.dtensor import is_dtensor, splits
 from fluxvla_core.errors import CheckpointError
 
 PLACES = "DCP_SHARDING_INFO"
@@ -43,15 +43,13 @@ class Region:
             CheckpointError: it is split in a way that is no block.
         """
         offsets, sizes = [0] * tensor.ndim, list(tensor.shape)
-        if isinstance(tensor, DTensor):
-            for dim, placement in enumerate(tensor.placements):
-                if isinstance(placement, Shard):
-                    # As torch.chunk cuts: equal parts, the last ones shorter or empty.
-                    length = sizes[placement.dim]
-                    part = -(-length // tensor.device_mesh.size(dim))
-                    begin = min(tensor.device_mesh.get_local_rank(dim) * part, length)
-                    offsets[placement.dim] += begin
-                    sizes[placement.dim] = min(part, length - begin)
+        if is_dtensor(tensor):
+            for along, dim in splits(tensor).items():
+                # As torch.chunk cuts: equal parts, the last ones shorter or empty.
+                part = -(-sizes[dim] // tensor.device_mesh.size(along))
+                begin = min(tensor.device_mesh.get_local_rank(along) * part, sizes[dim])
+                offsets[dim] += begin
+                sizes[dim] = min(part, sizes[dim] - begin)
             if tuple(sizes) != tuple(tensor.to_local().shape):
                 raise CheckpointError(
                     f"a tensor that is split by {tensor.placements} cannot be saved or loaded",
@@ -82,9 +80,8 @@ class Region:
 
 def is_split(tensor: Tensor) -> bool:
     """Whether more than one rank is needed to put ``tensor`` together."""
-    return isinstance(tensor, DTensor) and any(
-        isinstance(placement, Shard) and tensor.device_mesh.size(dim) > 1
-        for dim, placement in enumerate(tensor.placements)
+    return is_dtensor(tensor) and any(
+        tensor.device_mesh.size(along) > 1 for along in splits(tensor)
     )
 
 
@@ -96,11 +93,11 @@ def own_parts(tensors: Mapping[str, Tensor], first: bool) -> dict[str, Tensor]:
     """
     found = {}
     for name, tensor in tensors.items():
-        if not isinstance(tensor, DTensor):
+        if not is_dtensor(tensor):
             mine = first
         else:
-            mesh = tensor.device_mesh
-            copies = [d for d, p in enumerate(tensor.placements) if not isinstance(p, Shard)]
+            mesh, cut = tensor.device_mesh, splits(tensor)
+            copies = [along for along in range(mesh.ndim) if along not in cut]
             mine = all(mesh.get_local_rank(dim) == 0 for dim in copies)
             region = Region.of(tensor)
             mine = mine and (prod(region.sizes) > 0 or not any(region.offsets))
@@ -114,12 +111,6 @@ def describe_parts(tensors: Mapping[str, Tensor]) -> dict[str, str]:
     places = {name: {"saved_offsets": Region.of(t).offsets} for name, t in tensors.items()}
     shapes = {name: list(t.shape) for name, t in tensors.items()}
     return {PLACES: json.dumps(places), "DCP_VERSION": "1.0", SHAPES: json.dumps(shapes)}
-
-
-def local(tensor: Tensor) -> Tensor:
-    """This rank's part of ``tensor``."""
-    tensor = tensor.detach()
-    return tensor.to_local() if isinstance(tensor, DTensor) else tensor
 
 
 class Stored:

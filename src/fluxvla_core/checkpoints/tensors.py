@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributed.tensor import DTensor
 
-from fluxvla_core.checkpoints.parts import Region, Stored, describe_parts, is_split, local
+from fluxvla_core.checkpoints.dtensor import is_dtensor, local
+from fluxvla_core.checkpoints.parts import Region, Stored, describe_parts, is_split
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
 
@@ -41,7 +41,7 @@ _ALIASES = "aliases"
 def whole(tensor: Tensor) -> Tensor:
     """The full tensor, gathered from all ranks if it is sharded: every rank must call this."""
     tensor = tensor.detach()
-    return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
+    return tensor.full_tensor() if is_dtensor(tensor) else tensor
 
 
 def copy_whole(target: Tensor, source: Tensor) -> None:
@@ -54,9 +54,9 @@ def like(target: Tensor, source: Tensor | Stored) -> Tensor:
     """The full ``source`` on the device of ``target``, sharded as it is; nothing is sent."""
     # Each rank cuts its own part: all have read the same verified files.
     part = source[Region.of(target).slices].to(target.device)
-    if not isinstance(target, DTensor):
+    if not is_dtensor(target):
         return part
-    return DTensor.from_local(
+    return type(target).from_local(
         part.contiguous(),
         target.device_mesh,
         target.placements,

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
-from torch.distributed.tensor import DTensor
 
+from fluxvla_core.checkpoints.dtensor import local
 from fluxvla_core.checkpoints.tensors import check_names, copy_whole
 
 
@@ -29,8 +29,8 @@ class Ema:
         decay = min(self.decay, (1 + step) / (10 + step))
         with torch.no_grad():
             torch._foreach_lerp_(
-                [_local(t) for t in self.shadow.values()],
-                [_local(p.detach()) for p in self._parameters.values()],
+                [local(t) for t in self.shadow.values()],
+                [local(p) for p in self._parameters.values()],
                 1.0 - decay,
             )
 
@@ -46,7 +46,7 @@ class Ema:
     def _swap(self) -> None:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
-                ours, theirs = _local(self.shadow[name]), _local(parameter.detach())
+                ours, theirs = local(self.shadow[name]), local(parameter)
                 kept = theirs.clone()
                 theirs.copy_(ours)
                 ours.copy_(kept)
@@ -60,7 +60,3 @@ class Ema:
         check_names(tensors, self.shadow, "the averaged weights", where)
         for name, average in self.shadow.items():
             copy_whole(average, tensors[name])
-
-
-def _local(tensor: Tensor) -> Tensor:
-    return tensor.to_local() if isinstance(tensor, DTensor) else tensor

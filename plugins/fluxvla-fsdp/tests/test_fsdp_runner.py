@@ -195,6 +195,7 @@ def launch(folder, settings):
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
+@pytest.mark.slow
 def test_torchrun_whose_worker_is_killed_at_a_random_moment(tmp_path):
     config = tiny_config(
         {"type": "FSDPTrainRunner", "max_steps": 120, "save_iter_interval": 10, "max_keep_ckpts": 0}

@@ -59,8 +59,11 @@ class Env:
         constraints: Path | None = None,
         quiet: bool = False,
     ) -> None:
-        """pip install, under the constraints if there are any; raises StepFailed."""
-        options = ["-q", "--disable-pip-version-check"]
+        """pip install, under the constraints if there are any; raises StepFailed.
+
+        What is imported is compiled then: most of what is installed never is.
+        """
+        options = ["-q", "--disable-pip-version-check", "--no-compile"]
         if constraints is not None:
             options += ["-c", str(constraints)]
         self.run("python", "-m", "pip", "install", *options, *words, quiet=quiet, echo=not quiet)

@@ -32,9 +32,12 @@ class StepFailed(Exception):
 
 
 def child_environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of this process without what would leak another Python into a child."""
-    env = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "PYTHONHOME"}}
-    env.pop("__PYVENV_LAUNCHER__", None)
+    """The environment of this process without what would leak another Python into a child.
+
+    Nor may it keep a child from writing bytecode: every process would compile torch anew.
+    """
+    left_out = ("PYTHONPATH", "PYTHONHOME", "PYTHONDONTWRITEBYTECODE", "__PYVENV_LAUNCHER__")
+    env = {k: v for k, v in os.environ.items() if k not in left_out}
     env["PYTHONUNBUFFERED"] = "1"
     env.update(extra or {})
     return env

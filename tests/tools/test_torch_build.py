@@ -84,7 +84,7 @@ def test_the_cpu_wheel_is_taken_where_pip_sees_it(monkeypatch: pytest.MonkeyPatc
 
 
 def test_uv_is_asked_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    shop = Shop(monkeypatch, "pip install -q --disable-pip-version-check uv", "--torch-backend=cpu")
+    shop = Shop(monkeypatch, "version-check --no-compile uv", "--torch-backend=cpu")
     assert shop.install() == "uv"
     assert "--torch-backend=cpu -c c.txt torch==2.13.0" in shop.asked[-1]
 

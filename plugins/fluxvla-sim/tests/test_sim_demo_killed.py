@@ -18,8 +18,8 @@ training = pytest.importorskip("fluxvla_core.testing.training")
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "aloha_sim_transfer.py"
 SMALL = (
-    *("train_dataloader.per_device_batch_size=4", "runner.max_steps=24"),
-    "runner.save_iter_interval=6",
+    *("train_dataloader.per_device_batch_size=4", "runner.max_steps=12"),
+    "runner.save_iter_interval=3",
 )
 
 
@@ -56,6 +56,6 @@ def test_the_demo_killed_and_resumed_equals_one_that_was_not(tmp_path):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL
-    assert not (cut / "checkpoints" / "step-000000024").exists()
+    assert not (cut / "checkpoints" / "step-000000012").exists()
     assert "resum" in finish(start(dataset, cut, "--resume", "auto"))
     assert training.differences(whole, cut) == []

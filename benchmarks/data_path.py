@@ -5,10 +5,11 @@
 Makes two datasets of version 3.0 (three cameras of 480 x 640 in mp4; and none) and reads each at
 random through both sides' loaders, in batches of 8 with chunks of 50 actions, with 0 and 2
 workers. The sides take turns, each in its own environment (``tools/lerobot_env.py`` makes
-LeRobot's) with one thread a process; figures are medians over the rounds. Where the machine is
-shared, ratios of processor time (without workers) say more than those of rates. FluxVLA's pictures
-stay uint8, LeRobot's become float32, for that is what each hands to training. Goals: 3 times
-LeRobot's rate with video, 5 times without. Writes ``benchmarks/results/data_path.json``.
+LeRobot's) with as many threads as it takes by itself: without workers, FluxVLA decodes with
+several. Figures are medians over the rounds. Where the machine is shared, ratios of processor time
+(without workers) say more than those of rates. FluxVLA's pictures stay uint8, LeRobot's become
+float32, for that is what each hands to training. Goals: 3 times LeRobot's rate with video, 5 times
+without. Writes ``benchmarks/results/data_path.json``.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def measure(
     """One run of one side. Raises SystemExit if it fails."""
     done = subprocess.run(
         [python, SIDE, side, folder, str(seconds)],
-        env={**os.environ, **env, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, **env},
         capture_output=True,
         text=True,
         check=False,

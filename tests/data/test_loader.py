@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import platform
 import random
+import resource
 import subprocess
 import sys
 import time
@@ -152,6 +154,25 @@ def test_an_error_of_the_collator_arrives_too(workers):
     loader = make_loader(Noisy(), DictCollator(["x"]), EpochSampler(4, 2), workers)
     with pytest.raises(DataError, match="'noise' is in neither keys nor meta_keys"):
         next(iter(loader))
+
+
+class Large:
+    """Each sample makes pictures, and tells how many pages of memory it took to do so."""
+
+    def get_sample(self, index, epoch):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        pictures = [np.ones(900_000, np.uint8) for _ in range(24)]
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        return {"x": np.int64(after - before), "noise": sum(int(p[0]) for p in pictures)}
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is told to glibc")
+def test_a_worker_uses_the_memory_of_a_batch_for_the_next_one():
+    """22 MB are 5300 pages; each batch got all of them anew."""
+    found = batches(6, workers=1, dataset=Large(), collate=DictCollator(["x"], ["noise"]))
+    pages = [int(batch["x"].sum()) for batch in found]
+    assert pages[0] > 4000, "the first has to get them"
+    assert max(pages[2:]) < 1000, pages
 
 
 def test_negative_workers_are_refused():

@@ -32,7 +32,12 @@ AT_HOME = {
 
 
 def modules_after(code: str) -> set[str]:
-    program = f"{code}\nimport sys; print(*{{m.split('.')[0] for m in sys.modules}})"
+    """What is imported after ``code``, by its top name."""
+    return {name.split(".")[0] for name in all_modules_after(code)}
+
+
+def all_modules_after(code: str) -> set[str]:
+    program = f"{code}\nimport sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.splitlines()[-1].split())
@@ -53,6 +58,14 @@ def test_checking_a_config_imports_nothing_heavy(config: Path) -> None:
     words = ["config", "check", str(config)]
     loaded = modules_after(f"from fluxvla_core.cli.main import main\nassert main({words}) == 0")
     assert loaded & HEAVY == set()
+
+
+@pytest.mark.parametrize("module", ["train.loop", "checkpoints.tensors"])
+def test_one_process_does_without_what_only_splits_tensors(module: str) -> None:
+    """``torch.distributed.tensor`` takes a second; a run in one process has none of its tensors."""
+    loaded = all_modules_after(f"import fluxvla_core.{module}")
+    assert "torch" in loaded
+    assert "torch.distributed.tensor" not in loaded
 
 
 def test_importing_the_package_runs_nothing() -> None:

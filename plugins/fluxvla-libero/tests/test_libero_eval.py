@@ -57,7 +57,6 @@ def act(environment, policy, seed=0, course=None, told=None, watch=None):
     return run_episode(environment, policy, task, seed, course or Course(), told, watch)
 
 
-@pytest.mark.slow
 def test_recorded_actions_replayed_give_the_recorded_success(environment, stock):
     actions = []
 
@@ -159,7 +158,6 @@ def test_the_expert_refuses_what_it_cannot_do(scene):
         Expert(scene, suite_tasks("libero_goal")[0])
 
 
-@pytest.mark.slow
 def test_a_demonstration_follows_from_its_seed_and_teaches_without_the_noise(environment):
     environment = LiberoEnvironment(tasks=[2, 4], mixed=True, begin="random")
     task = find_task(environment.spec.tasks, f"{KETCHUP}-in-scene-2")

@@ -9,12 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.data.lanes import Lanes
 from fluxvla_core.data.recording import Recorded, Track
-from fluxvla_core.data.video import VideoFiles
 from fluxvla_core.errors import DataError
 
 Image = npt.NDArray[np.uint8]
 Place = tuple[int, int]
+AT_ONCE = 128
+"""Pictures that are decoded between two words of progress; so many are in memory twice."""
 
 
 class Frames:
@@ -28,7 +30,7 @@ class Frames:
     def __init__(self, recordings: Sequence[Recorded], cache: bool) -> None:
         self._tracks = [r.tracks for r in recordings]
         self._rows = [r.rows for r in recordings]
-        self._files = VideoFiles()
+        self._lanes = Lanes()
         self._cache = cache
         self._kept: list[list[Image]] | None = None
 
@@ -60,7 +62,7 @@ class Frames:
                 kept[-1].append(self._decode_all(track, rows, reporter, done, total))
                 done += len(rows)
         self._kept = kept
-        self._files.close()
+        self._lanes.close()
 
     def read(self, places: Sequence[Place]) -> list[list[Image]]:
         """For each place one ``(3, height, width)`` uint8 array a camera (views of HWC memory).
@@ -83,8 +85,10 @@ class Frames:
             for camera, track in enumerate(self._tracks[part])
         ]
         # In the order of the files: neighbours share an open decoder, sometimes a group of frames.
-        for source, time, i, camera in sorted(wanted, key=lambda w: (str(w[0]), *w[1:])):
-            found[i][camera] = self._files.read(source, time).transpose(2, 0, 1)
+        wanted.sort(key=lambda w: (str(w[0]), *w[1:]))
+        images = self._lanes.read([(source, time) for source, time, _, _ in wanted])
+        for (_, _, i, camera), image in zip(wanted, images, strict=True):
+            found[i][camera] = image.transpose(2, 0, 1)
         return found
 
     def _decode_all(
@@ -97,17 +101,18 @@ class Frames:
     ) -> Image:
         out = np.empty((len(rows), track.height, track.width, 3), np.uint8)
         order = np.lexsort((track.time[rows], track.file[rows]))
-        for count, i in enumerate(order):
-            image = self._files.read(track.files[track.file[rows[i]]], float(track.time[rows[i]]))
-            if image.shape != out.shape[1:]:
-                raise DataError(
-                    f"{track.files[track.file[rows[i]]]}: frames of {image.shape[0]} x "
-                    f"{image.shape[1]}, info.json says {track.height} x {track.width}"
-                )
-            out[i] = image
-            if count % 200 == 0:
-                reporter.progress("decode frames", done + count, total)
-        reporter.progress("decode frames", done + len(rows), total)
+        for first in range(0, len(order), AT_ONCE):
+            some = order[first : first + AT_ONCE]
+            wanted = [(track.files[track.file[row]], float(track.time[row])) for row in rows[some]]
+            images = self._lanes.read(wanted)
+            for i, image, (source, _) in zip(some, images, wanted, strict=True):
+                if image.shape != out.shape[1:]:
+                    raise DataError(
+                        f"{source}: frames of {image.shape[0]} x {image.shape[1]}, "
+                        f"info.json says {track.height} x {track.width}"
+                    )
+                out[i] = image
+            reporter.progress("decode frames", done + first + len(some), total)
         out.flags.writeable = False  # samples are views of it
         return out
 

@@ -81,7 +81,7 @@ class VideoFile:
             raise self._missing(time, str(error)) from error
         if frame is None:
             raise self._missing(time, "there is none")
-        image: Image = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+        image: Image = self._reformatter.reformat(frame, format="rgb24", threads=1).to_ndarray()
         return image
 
     def close(self) -> None:

@@ -1,0 +1,123 @@
+"""Pictures decoded side by side are those that one thread reads."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from fluxvla_core.data.encode import EpisodeEncoder, find_codec
+from fluxvla_core.data.lanes import MOST, OPEN_FILES, Lanes, threads
+from fluxvla_core.data.video import VideoFiles
+from fluxvla_core.errors import DataError
+
+FPS = 30
+
+
+@pytest.fixture(scope="module")
+def movies(tmp_path_factory):
+    """Three files of 20 flat pictures; picture ``i`` of file ``k`` is as grey as ``60 k + 3 i``."""
+    folder = tmp_path_factory.mktemp("movies")
+    for k in range(3):
+        encoder = EpisodeEncoder(folder / f"{k}.mp4", 16, 16, FPS, find_codec("h264"))
+        for i in range(20):
+            encoder.add(np.full((16, 16, 3), 60 * k + 3 * i, np.uint8))
+        encoder.close()
+    return [folder / f"{k}.mp4" for k in range(3)]
+
+
+@pytest.fixture
+def allowed():
+    """Sets how many threads torch may use, until the test is over."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def wish(movies, count, seed=0):
+    rng = np.random.default_rng(seed)
+    drawn = sorted((int(rng.integers(3)), int(rng.integers(20))) for _ in range(count))
+    return [(movies[k], i / FPS) for k, i in drawn], [60 * k + 3 * i for k, i in drawn]
+
+
+def greys(images):
+    return [image.mean() for image in images]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, MOST, 2 * MOST])
+def test_every_picture_is_the_one_asked_for(movies, allowed, count):
+    allowed(count)
+    lanes = Lanes()
+    for size in (24, 0, 1, 2, 3, 24, 7):
+        wanted, expected = wish(movies, size, size)
+        assert greys(lanes.read(wanted)) == pytest.approx(expected, abs=1)
+    assert len(lanes._lanes) == min(count, MOST)
+    lanes.close()
+
+
+def test_threads_decode_at_the_same_time(movies, allowed, monkeypatch):
+    """Each waits until the other is there as well."""
+    allowed(2)
+    together = threading.Barrier(2, timeout=30)
+    read = VideoFiles.read
+
+    def wait_then_read(self, source, time):
+        together.wait()
+        return read(self, source, time)
+
+    monkeypatch.setattr(VideoFiles, "read", wait_then_read)
+    wanted, expected = wish(movies, 8)
+    assert greys(Lanes().read(wanted)) == pytest.approx(expected, abs=1)
+
+
+def test_they_are_as_many_as_torch_may_use_and_share_the_open_files(movies, allowed):
+    lanes = Lanes()
+    for count in (3, 1):
+        allowed(count)
+        assert threads() == count
+        lanes.read(wish(movies, 3)[0])
+        assert [files.capacity for files in lanes._lanes] == [OPEN_FILES // count] * count
+
+
+def read_in_child(lanes, wanted, answers):
+    answers.put((threads(), greys(lanes.read(wanted))))
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_a_child_reads_with_files_of_its_own(movies, allowed, context):
+    allowed(2)
+    lanes = Lanes()
+    wanted, expected = wish(movies, 12)
+    lanes.read(wanted)
+    start = multiprocessing.get_context(context)
+    answers = start.SimpleQueue()
+    child = start.Process(target=read_in_child, args=(lanes, wanted, answers))
+    child.start()
+    found = answers.get()[1]
+    child.join(60)
+    assert found == pytest.approx(expected, abs=1)
+    assert greys(lanes.read(wanted)) == pytest.approx(expected, abs=1)
+
+
+def test_what_cannot_be_read_is_told_whichever_thread_meets_it(movies, allowed, tmp_path):
+    allowed(3)
+    wanted, expected = wish(movies, 6)
+    lanes = Lanes()
+    for place in (0, 3, 6):
+        with pytest.raises(DataError, match=r"gone\.mp4: cannot be opened as video"):
+            lanes.read([*wanted[:place], (tmp_path / "gone.mp4", 0.0), *wanted[place:]])
+    assert greys(lanes.read(wanted)) == pytest.approx(expected, abs=1)
+
+
+def test_a_copy_opens_its_own(movies, allowed):
+    allowed(2)
+    lanes = Lanes()
+    wanted, expected = wish(movies, 5)
+    lanes.read(wanted)
+    copy = pickle.loads(pickle.dumps(lanes))  # noqa: S301
+    assert not any(files._open for files in copy._lanes)
+    assert greys(copy.read(wanted)) == pytest.approx(expected, abs=1)

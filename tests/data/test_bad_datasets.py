@@ -12,6 +12,7 @@ import pytest
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.data.metadata import read_metadata
+from fluxvla_core.data.mixture import DistributedRepeatingDataset
 from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError, SpecMismatch
@@ -253,3 +254,76 @@ def test_pictures_of_another_size_than_stated(dataset, capsys):
     assert "is 32 x 48, info.json says 64 x 48" in capsys.readouterr().err
     with pytest.raises(DataError, match=r"frames of 32 x 48, info\.json says 64 x 48"):
         load(dataset, cache_frames=True).prepare()
+
+
+def test_rows_that_do_not_begin_at_zero(dataset):
+    """As in a part that was cut out by hand: windows would run on into the next episode."""
+    for name in ("dataset_from_index", "dataset_to_index"):
+        edit_column(dataset, EPISODES, name, lambda v: [x + 5 for x in v])
+    text = refused(dataset)
+    assert "the rows of the data files are not those that the episode table lists" in text
+
+
+def test_an_episode_without_frames(dataset):
+    edit_column(dataset, EPISODES, "dataset_to_index", lambda v: [v[0], v[0], v[2]])
+    edit_column(dataset, EPISODES, "dataset_from_index", lambda v: [0, v[1], v[1]])
+    assert f"{dataset}: episode 1 has 0 frames" in refused(dataset)
+
+
+def test_videos_without_a_place(dataset):
+    edit_info(dataset, video_path=None)
+    assert "info.json: video_path missing" in refused(dataset)
+
+
+def test_an_instruction_that_is_no_text(dataset):
+    edit_column(dataset, "meta/tasks.parquet", "task", lambda v: [v[0], None])
+    assert f"{dataset}: task_index 1 has no instruction, but None" in refused(dataset)
+
+
+def test_episode_tables_of_several_files(dataset, shared):
+    """Written at different times, with integers of different width; or with other columns."""
+    table = pq.read_table(dataset / EPISODES)
+    second = dataset / "meta/episodes/chunk-000/file-001.parquet"
+    i = table.schema.get_field_index("episode_index")
+    narrow = table["episode_index"].cast(pa.int32())
+    pq.write_table(table.set_column(i, "episode_index", narrow).slice(0, 1), second)
+    pq.write_table(table.slice(1), dataset / EPISODES)
+    assert load(dataset).episode_ends.tolist() == load(shared).episode_ends.tolist()
+    words = pa.array(["0"])
+    pq.write_table(table.slice(0, 1).set_column(i, "episode_index", words), second)
+    assert "the files of meta/episodes are not of the same columns" in refused(dataset)
+
+
+def rename(root, names, **changes):
+    """As LeRobot's own datasets are: joints have names, and nothing else says which robot it is."""
+    (root / "meta/fluxvla_embodiment.json").unlink()
+    info = json.loads((root / "meta/info.json").read_text())
+    for feature in ("observation.state", "action"):
+        info["features"][feature]["names"] = names
+    (root / "meta/info.json").write_text(json.dumps({**info, **changes}))
+    return root
+
+
+def test_joints_in_another_order_do_not_go_together(dataset, shared, tmp_path):
+    other = shutil.copytree(shared, tmp_path / "other")
+    both = [str(rename(dataset, ["a", "b", "c"])), str(rename(other, ["c", "b", "a"]))]
+    with pytest.raises(DataError, match=r"another order: a, b, c / c, b, a"):
+        ParquetDataset(both, [], ["top"])
+    mixture = {"datasets": [{"type": "ParquetDataset", "data_root_path": b} for b in both]}
+    for table in mixture["datasets"]:
+        table.update(transforms=[], img_keys=["top"])
+    with pytest.raises(DataError, match="another order"):
+        DistributedRepeatingDataset(**mixture)
+
+
+def test_joints_of_other_names_are_doubted(dataset, shared, tmp_path):
+    other = shutil.copytree(shared, tmp_path / "other")
+    both = [str(rename(dataset, ["a", "b", "c"])), str(rename(other, ["x", "b", "c"]))]
+    doubts = ParquetDataset(both, [], ["top"]).doubts()
+    assert [d for d in doubts if "states have other names: a, b, c / x, b, c" in d]
+    tables = [
+        {"type": "ParquetDataset", "data_root_path": b, "transforms": [], "img_keys": ["top"]}
+        for b in both
+    ]
+    assert DistributedRepeatingDataset(tables).doubts() == doubts
+    assert ParquetDataset([both[0], both[0]], [], ["top"]).doubts() == []

@@ -241,3 +241,42 @@ def test_statistics_of_version_2_are_not_written(tmp_path, takes, fluxvla):
     assert "v2.1 keeps its statistics by episode, without quantiles" in err
     assert f"next: fluxvla data convert {root} OUT" in err
     assert fluxvla("stats", root)[0] == 0
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def test_validate_names_every_damaged_video_of_a_camera(tmp_path, recorder, fluxvla):
+    root = recorder(tmp_path / "split", video_file_mb=0.0005)
+    files = sorted(root.glob(f"videos/{TOP}/*/*.mp4"))
+    assert len(files) == 3
+    truncate(files[0])
+    files[1].unlink()
+    blank(files[2])
+    code, _, err = fluxvla("validate", root)
+    assert code == 2
+    assert "3 findings" in err
+    for path in files:
+        assert str(path) in err
+
+
+def test_validate_names_every_damaged_table(tmp_path, recorder, fluxvla):
+    root = recorder(tmp_path / "split", data_file_mb=0.0001)
+    files = sorted(root.glob("data/*/*.parquet"))
+    assert len(files) == 3
+    truncate(files[0])
+    files[2].unlink()
+    code, _, err = fluxvla("validate", root)
+    assert code == 2
+    assert "2 findings" in err
+    assert str(files[0]) in err
+    assert str(files[2]) in err
+
+
+def test_validate_refuses_instructions_that_are_not_there(tmp_path, takes, fluxvla):
+    root = write_v2(tmp_path / "old", takes)
+    (root / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "x"}\n')
+    code, _, err = fluxvla("validate", root)
+    assert code == 2
+    assert "task_index runs from 0 to 1, meta/tasks.jsonl lists 1 tasks" in err

@@ -203,3 +203,34 @@ def test_a_full_disk(old, tmp_path, monkeypatch):
     assert caught.value.exit_code == 1
     assert f"{old} is as it was" in str(caught.value)
     assert not (tmp_path / "new").exists()
+
+
+def test_instructions_keep_their_index_even_if_two_are_the_same(broken, tmp_path):
+    path = broken / "meta/tasks.jsonl"
+    path.write_text('{"task_index": 1, "task": "hold"}\n{"task_index": 0, "task": "hold"}\n')
+    out = convert(broken, tmp_path / "new")
+    assert read_metadata(out).tasks == ("hold", "hold")
+    same_samples(broken, out)
+
+
+def test_what_has_gaps_in_one_episode_has_no_statistics(broken, tmp_path):
+    """``next.done`` empty in one row; lists of unequal lengths whose numbers would fill a table."""
+    info = json.loads((broken / "meta/info.json").read_text())
+    info["features"]["touched"] = {"dtype": "int64", "shape": [2], "names": None}
+    (broken / "meta/info.json").write_text(json.dumps(info))
+    for i in range(3):
+        path = broken / f"data/chunk-{i // 2:03d}/episode_{i:06d}.parquet"
+        table = pq.read_table(path)
+        rows = table.num_rows
+        lists = pa.array([[1, 2, 3], [4], *[[0, 0]] * (rows - 2)], pa.list_(pa.int64()))
+        table = table.append_column("touched", lists)
+        if i == 1:
+            done = pa.array([None, *[False] * (rows - 1)], pa.bool_())
+            table = table.set_column(table.schema.get_field_index("next.done"), "next.done", done)
+        pq.write_table(table, path)
+    out = convert(broken, tmp_path / "new")
+    stats = json.loads((out / "meta/stats.json").read_text())
+    assert "action" in stats
+    assert {"next.done", "touched"}.isdisjoint(stats)
+    assert validate(out)
+    same_samples(broken, out)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from fluxvla_core.data import lanes as lanes_module
 from fluxvla_core.data.encode import EpisodeEncoder, find_codec
 from fluxvla_core.data.lanes import MOST, OPEN_FILES, Lanes, threads
 from fluxvla_core.data.video import VideoFiles
@@ -71,6 +72,15 @@ def test_threads_decode_at_the_same_time(movies, allowed, monkeypatch):
 
     monkeypatch.setattr(VideoFiles, "read", wait_then_read)
     wanted, expected = wish(movies, 8)
+    assert greys(Lanes().read(wanted)) == pytest.approx(expected, abs=1)
+
+
+def test_nothing_to_share_out_starts_no_thread(movies, allowed, monkeypatch):
+    """Without cameras, every batch had threads started for it."""
+    allowed(4)
+    monkeypatch.setattr(lanes_module, "ThreadPoolExecutor", None)
+    wanted, expected = wish(movies, 1)
+    assert Lanes().read([]) == []
     assert greys(Lanes().read(wanted)) == pytest.approx(expected, abs=1)
 
 

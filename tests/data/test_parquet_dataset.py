@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from fluxvla_core import build_dataset_from_cfg
-from fluxvla_core.data import frames
+from fluxvla_core.data import frames, lanes
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
+from fluxvla_core.data.video import VideoFile
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
 
 STARTS = (0, 7, 19)
@@ -388,3 +389,40 @@ def test_joints_that_hardly_move_are_called_by_their_names(tmp_path, recorder, t
     assert ": state elbow (range 0, divided by 1e-06);" in said
     assert load(root, TRANSFORMS).doubts() == []
     assert load(root).doubts() == []
+
+
+def test_files_stay_open_and_are_read_in_their_order(shared, monkeypatch):
+    """What a decoder costs: opening its file, and seeking."""
+    opened, read = [], []
+    begin, take = VideoFile.__init__, VideoFile.read
+
+    def count(self, path):
+        opened.append(path)
+        begin(self, path)
+
+    def note(self, time):
+        read.append((str(self.path), time))
+        return take(self, time)
+
+    monkeypatch.setattr(VideoFile, "__init__", count)
+    monkeypatch.setattr(VideoFile, "read", note)
+    monkeypatch.setattr(lanes, "MOST", 1)
+    dataset = ParquetDataset(str(shared), [], ["wrist", "top"])
+    opened.clear()  # opening a dataset looks into its files
+    keys = [SampleKey(0, int(i)) for i in np.random.default_rng(0).permutation(28)[:12]]
+    for _ in range(3):
+        read.clear()
+        dataset.get_samples(keys)
+        assert len(read) == 24
+        assert read == sorted(read)
+    assert len(opened) == 2
+
+
+@pytest.mark.parametrize("size", [1, 5])
+def test_statistics_of_each_step_fit_windows_of_that_length_only(shared, size):
+    made = load(shared, action_window_size=10, per_step_statistics=True).statistics
+    normalise = {"type": "NormalizeStatesAndActions"}
+    dataset = load(shared, [normalise], action_window_size=size)
+    dataset.use_statistics(made["private"])
+    with pytest.raises(ConfigError, match=f"actions of {size} steps, .* describe 10 steps"):
+        dataset[0]

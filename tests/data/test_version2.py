@@ -122,3 +122,9 @@ def test_episodes_and_tasks_that_are_not_there(broken):
     path.write_text(lines)
     (broken / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "hold"}\n')
     assert "task_index runs from 0 to 1, meta/tasks.jsonl lists 1 tasks" in refused(broken)
+
+
+@pytest.mark.parametrize("line", ['{"task_index": 1}', '{"task_index": 1, "instruction": "hold"}'])
+def test_a_line_without_instruction_is_not_taken_for_the_word_none(broken, line):
+    (broken / "meta/tasks.jsonl").write_text(f'{{"task_index": 0, "task": "hold"}}\n{line}\n')
+    assert "task_index 1 has no instruction, but None" in refused(broken)

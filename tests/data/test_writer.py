@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -273,6 +274,38 @@ def test_a_crash_leaves_no_dataset_and_the_saved_episodes(tmp_path, spec, takes)
         takes[1].record(writer)
     assert len(ParquetDataset(str(root), [], ["top"])) == 19
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fps": 20}, r"another fps: 10\.0 / 20\.0"),
+        ({"video_codec": "libsvtav1"}, "another video_codec: h264 / libsvtav1"),
+        ({"turned": True}, "another embodiment$"),
+    ],
+)
+def test_a_recording_does_not_go_on_with_what_is_read_otherwise(
+    changes, message, tmp_path, spec, takes
+):
+    """AV1 joined to h264, or joints in another order, would be one dataset and no error."""
+    root = tmp_path / "d"
+    settings = {"fps": 10, "embodiment": spec()}
+
+    def crash():
+        with LeRobotWriter(root, **settings) as writer:
+            takes[0].record(writer)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        crash()
+    if changes.pop("turned", False):
+        changes["embodiment"] = spec(joints=spec().joints[::-1])
+    with pytest.raises(DataError) as caught:
+        LeRobotWriter(root, **{**settings, **changes}, recover=True)
+    assert re.search(message, caught.value.what)
+    with LeRobotWriter(root, **settings, recover=True) as writer:
+        assert writer.episodes == 1
+    assert len(ParquetDataset(str(root), [], ["top"])) == 7
 
 
 def test_dying_in_the_middle_of_a_file_leaves_the_one_before(tmp_path, spec, takes, monkeypatch):

@@ -13,7 +13,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 
 def check_alike(recordings: Sequence[Recorded]) -> None:
-    """Refuse datasets of different robots, rates or widths.
+    """Refuse datasets of different robots, rates, widths, or orders of the joints.
 
     Raises:
         SpecMismatch, DataError: naming both datasets and what differs.
@@ -32,6 +32,34 @@ def check_alike(recordings: Sequence[Recorded]) -> None:
                 raise DataError(
                     f"{one.root} and {two.root} do not go together: {what}: {left} / {right}"
                 )
+        for what, here, there in _names(first, other):
+            if here != there and sorted(here) == sorted(there):
+                raise DataError(
+                    f"{one.root} and {two.root} do not go together: {what}: the same names in "
+                    f"another order: {', '.join(here)} / {', '.join(there)}",
+                    next="write one of them anew with its columns in the order of the other",
+                )
+
+
+def doubts(recordings: Sequence[Recorded]) -> list[str]:
+    """What datasets that are used together call differently: it may be another robot."""
+    first = recordings[0]
+    return [
+        f"{first.meta.root} and {other.meta.root} are used as one robot's, but {what} have other "
+        f"names: {', '.join(here)} / {', '.join(there)}"
+        for other in recordings[1:]
+        for what, here, there in _names(first, other)
+        if here != there
+    ]
+
+
+def _names(one: Recorded, two: Recorded) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+    """What states and actions are called in both, where both say."""
+    pairs = (
+        ("states", one.state_names, two.state_names),
+        ("actions", one.action_names, two.action_names),
+    )
+    return [pair for pair in pairs if pair[1] and pair[2]]
 
 
 def find_embodiment(

@@ -90,7 +90,7 @@ def assemble(episodes: Sequence[Episode], out: Path, recording: Recording) -> No
         write_videos(key, clips, groups, rows, out, recording.fps)
     for row, episode, column in zip(rows, episodes, columns, strict=True):
         row.update(flat_statistics(statistics_of(episode.histograms, column)))
-    write_tables(rows, out, tasks)
+    write_tables(rows, out, list(tasks))
     _write_extras(episodes, out)
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     totals = {
@@ -224,8 +224,8 @@ def flat_statistics(stats: Mapping[str, Stats]) -> dict[str, Any]:
     }
 
 
-def write_tables(rows: Sequence[dict[str, Any]], out: Path, tasks: Mapping[str, int]) -> None:
-    """The tables of episodes and of instructions (text -> ``task_index``)."""
+def write_tables(rows: Sequence[dict[str, Any]], out: Path, tasks: Sequence[str]) -> None:
+    """The tables of episodes and of instructions, these by their ``task_index``."""
     pa = arrow()
     pq = parquet()
 
@@ -233,7 +233,7 @@ def write_tables(rows: Sequence[dict[str, Any]], out: Path, tasks: Mapping[str, 
     path.parent.mkdir(parents=True, exist_ok=True)
     # Integers and lists of one episode have the types of all: the rows are alike.
     pq.write_table(pa.Table.from_pylist(list(rows)), path)
-    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": list(tasks)})
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": list(tasks)})
     pq.write_table(table.replace_schema_metadata({"pandas": v3.pandas_schema()}), out / v3.TASKS)
 
 

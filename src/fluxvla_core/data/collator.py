@@ -24,8 +24,8 @@ class DictCollator:
     and without ``embodiment_ids``.
 
     Raises:
-        DataError: a sample has a key in neither list, lacks one that the first sample has, or
-            its value cannot be stacked.
+        DataError: a sample has a key in neither list or one that another sample lacks, or its
+            value cannot be stacked.
     """
 
     def __init__(
@@ -38,11 +38,13 @@ class DictCollator:
         if not samples:
             raise DataError("there are no samples to make a batch of")
         batch: dict[str, Any] = {}
+        for sample in samples:
+            _check_keys(samples[0], sample)
         for key in samples[0]:
             if key in self.keys or key == SCALE:
-                batch[key] = _stack(key, [_get(sample, key) for sample in samples])
+                batch[key] = _stack(key, [sample[key] for sample in samples])
             elif key in self.meta_keys:
-                batch[key] = [_get(sample, key) for sample in samples]
+                batch[key] = [sample[key] for sample in samples]
             else:
                 raise DataError(
                     f"sample key {key!r} is in neither keys nor meta_keys of the collator",
@@ -51,12 +53,15 @@ class DictCollator:
         return batch
 
 
-def _get(sample: Mapping[str, Any], key: str) -> Any:
-    if key not in sample:
+def _check_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    differing = sorted(one.keys() ^ other.keys())
+    if differing:
+        without = other if differing[0] in one else one
         raise DataError(
-            f"sample key {key!r} is missing in one sample of the batch; it has {sorted(sample)}"
+            f"sample key {differing[0]!r} is missing in one sample of the batch; it has "
+            f"{sorted(without)}",
+            cause="datasets of a mixture that do not give the same, embodiment_id for example",
         )
-    return sample[key]
 
 
 def _stack(key: str, values: list[Any]) -> Any:

@@ -53,7 +53,7 @@ def read_columns(meta: Metadata, vectors: Sequence[str]) -> dict[str, Array]:
 def _check_rows(meta: Metadata, episode_of_row: Array) -> None:
     episodes = meta.episodes
     expected = np.repeat(np.arange(len(episodes)), episodes.lengths)
-    inside = np.array_equal(episodes.first_row[1:], episodes.end_row[:-1])
+    inside = np.array_equal(episodes.first_row, np.append(0, episodes.end_row[:-1]))
     if not inside or not np.array_equal(episode_of_row, expected):
         raise DataError(
             f"{meta.root}: the rows of the data files are not those that the episode table lists",
@@ -82,7 +82,7 @@ def _vectors(column: Any, width: int, where: str) -> Array:
     else:
         flat = column.flatten()
     rows = len(column)
-    if len(flat) != rows * width or not _all_of(column, width):
+    if len(flat) != rows * width or not all_of(column, width):
         raise DataError(
             f"{where} does not hold {width} numbers in every row, as info.json says; "
             f"it is {column.type}"
@@ -101,7 +101,8 @@ def _vectors(column: Any, width: int, where: str) -> Array:
     return array if pa.types.is_integer(flat.type) else array.astype(np.float32, copy=False)
 
 
-def _all_of(column: Any, width: int) -> bool:
+def all_of(column: Any, width: int) -> bool:
+    """Whether every list of a column is ``width`` long."""
     pa = arrow()
 
     if not pa.types.is_list(column.type):

@@ -25,7 +25,7 @@ from fluxvla_core.data.assemble import (
     write_tables,
     write_videos,
 )
-from fluxvla_core.data.columns import read_columns
+from fluxvla_core.data.columns import all_of, read_columns
 from fluxvla_core.data.encode import Clip, whole_clip
 from fluxvla_core.data.files import read_table, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
@@ -101,7 +101,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
             write_videos(key, clips, groups, rows, out, meta.fps)
     for row, counts, values in zip(rows, histograms, columns, strict=True):
         row.update(flat_statistics(statistics_of(counts, values)))
-    write_tables(rows, out, {task: i for i, task in enumerate(meta.tasks)})
+    write_tables(rows, out, meta.tasks)
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in meta.cameras}
     stats = statistics_of(totals, whole)
@@ -152,7 +152,9 @@ def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> lis
             rows[i].update({"data/chunk_index": chunk, "data/file_index": file})
             columns.append(_numbers(table))
         writer.close()
-    return columns
+    # What has gaps in one episode has no statistics in any.
+    known = [name for name in columns[0] if all(name in found for found in columns)]
+    return [{name: found[name] for name in known} for found in columns]
 
 
 def _rows(path: Path, names: Sequence[str], start: int) -> Any:
@@ -177,7 +179,9 @@ def _numbers(table: Any) -> Columns:
         number = (
             pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
         )
-        if number and not flat.null_count and len(flat) % len(column) == 0:
+        width = len(flat) // len(column)
+        whole = not flat.null_count and len(flat) == len(column) * width
+        if number and whole and (not lists or all_of(column, width)):
             values = flat.to_numpy(zero_copy_only=False)
             found[name] = values.reshape(len(column), -1) if lists else values
     return found

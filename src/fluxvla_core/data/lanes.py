@@ -34,10 +34,10 @@ class Lanes:
             DataError: a frame is missing or cannot be decoded.
         """
         lanes = self._prepared(threads())
+        if len(lanes) == 1 or len(wanted) < 2:
+            return _read(lanes[0], wanted)
         ends = [len(wanted) * i // len(lanes) for i in range(len(lanes) + 1)]
         stretches = [wanted[a:b] for a, b in pairwise(ends)]
-        if len(lanes) == 1:
-            return _read(lanes[0], stretches[0])
         # Threads that end are nothing that a fork for loader workers could lose.
         with ThreadPoolExecutor(len(lanes)) as pool:
             return [image for images in pool.map(_read, lanes, stretches) for image in images]

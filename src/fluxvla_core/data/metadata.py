@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data import tables_v2, tables_v3
 from fluxvla_core.data.episodes import Episodes, FileId
@@ -140,6 +142,9 @@ def read_metadata(root: Path) -> Metadata:
     tables = tables_v3 if info["codebase_version"] == v3.VERSION else tables_v2
     episodes = tables.read_episodes(root, info)
     numbered = tables.read_tasks(root)
+    for index, text in numbered.items():
+        if not isinstance(text, str):
+            raise DataError(f"{root}: task_index {index} has no instruction, but {text!r}")
     tasks = tuple(numbered.get(i, "") for i in range(max(numbered, default=-1) + 1))
     frames = int(episodes.lengths.sum())
     for what, stated, found in (
@@ -151,6 +156,12 @@ def read_metadata(root: Path) -> Metadata:
                 f"{root}: {v3.INFO} states {stated} {what}, the episode table lists {found}",
                 cause="a part of the dataset is missing, or its writer was stopped",
             )
+    empty = np.flatnonzero(episodes.lengths < 1)
+    if len(empty):
+        raise DataError(
+            f"{root}: episode {empty[0]} has {episodes.lengths[empty[0]]} frames",
+            cause="it was never recorded, or the episode table was edited",
+        )
     return Metadata(root, info, tasks, episodes, read_embodiment(root))
 
 
@@ -187,6 +198,8 @@ def _read_info(root: Path) -> dict[str, Any]:
             next="convert a copy with the LeRobot that reads it",
         )
     missing = sorted({"fps", "features", "data_path", "total_episodes", "total_frames"} - set(info))
+    if any(f["dtype"] == "video" for f in info.get("features", {}).values()):
+        missing += [] if info.get("video_path") else ["video_path"]
     if missing:
         raise DataError(f"{path}: {', '.join(missing)} missing")
     if info["total_episodes"] == 0 or info["total_frames"] == 0:

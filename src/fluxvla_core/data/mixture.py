@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.data.agreement import check_alike
+from fluxvla_core.data.agreement import check_alike, doubts
 from fluxvla_core.data.parquet_dataset import ParquetDataset, pooled_statistics
 from fluxvla_core.data.rng import DEFAULT_SEED, mixture_rng
 from fluxvla_core.data.sampler import SampleKey
@@ -124,7 +124,11 @@ class DistributedRepeatingDataset:
             ConfigError: see ``ParquetDataset.doubts``.
         """
         asked = [d for d in self.datasets if hasattr(d, "doubts")]
-        return list(dict.fromkeys(doubt for dataset in asked for doubt in dataset.doubts()))
+        found = [doubt for dataset in asked for doubt in dataset.doubts()]
+        for group in self._groups().values():
+            recordings = [r for d in group for r in getattr(d, "recordings", ())]
+            found += doubts(recordings) if recordings else []
+        return list(dict.fromkeys(found))
 
     def use_seed(self, seed: int) -> None:
         """Draw by the run's seed from now on, here and in every dataset, but for given ones."""
@@ -198,14 +202,18 @@ class DistributedRepeatingDataset:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_drawn": {}}
 
-    def _share_statistics(self) -> None:
+    def _groups(self) -> dict[str, list[Any]]:
+        """The datasets by what their statistics are called."""
         groups: dict[str, list[Any]] = {}
         for dataset in self.datasets:
             # Asking for its statistics would compute them, only to replace them below.
             own = isinstance(dataset, ParquetDataset)
             for name in [dataset.statistic_name] if own else dataset.statistics:
                 groups.setdefault(name, []).append(dataset)
-        for name, group in groups.items():
+        return groups
+
+    def _share_statistics(self) -> None:
+        for name, group in self._groups().items():
             if len(group) > 1:
                 _check_group(name, group)
                 entry = pooled_statistics(group)

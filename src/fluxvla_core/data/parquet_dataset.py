@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.data.agreement import check_alike, find_embodiment
+from fluxvla_core.data.agreement import check_alike, doubts, find_embodiment
 from fluxvla_core.data.frames import Frames
 from fluxvla_core.data.recording import load_recorded
 from fluxvla_core.data.rng import DEFAULT_SEED, sample_rng
@@ -162,15 +162,16 @@ class ParquetDataset:
         return {self.statistic_name: pooled_statistics([self])}
 
     def doubts(self) -> list[str]:
-        """What somebody should know before training begins: what transforms say of the statistics.
+        """What somebody should know before training begins: of its folders and the statistics.
 
         Raises:
             ConfigError: numbers would be normalised to what nothing can be learnt from.
         """
-        meta, stats = self.recordings[0].meta, self.statistics[self.statistic_name]
-        names = meta.names(self.state_key), meta.names(self.action_key)
+        first, stats = self.recordings[0], self.statistics[self.statistic_name]
+        names = first.state_names, first.action_names
         asked = [t for t in self.pipeline.transforms if hasattr(t, "doubts")]
-        return [doubt for transform in asked for doubt in transform.doubts(stats, *names)]
+        found = [doubt for transform in asked for doubt in transform.doubts(stats, *names)]
+        return [*doubts(self.recordings), *found]
 
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
         """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""

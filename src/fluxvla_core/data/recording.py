@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,8 @@ class Track:
 class Recorded:
     """A dataset's rows, ``N`` over all its episodes, and which of them are used.
 
-    ``states`` and ``actions`` are ``(N, D)`` float32; ``start`` and ``end`` ``(N,)`` are the rows
+    ``states`` and ``actions`` are ``(N, D)`` float32, with a name for each of the D if they have
+    names; ``start`` and ``end`` ``(N,)`` are the rows
     that a row's episode begins at and ends before; ``chosen`` are the rows of the chosen episodes,
     ``rows`` those of them that a sample can be made of.
     """
@@ -46,6 +47,8 @@ class Recorded:
     meta: Metadata
     states: Floats
     actions: Floats
+    state_names: tuple[str, ...]
+    action_names: tuple[str, ...]
     timestamp: Floats
     task: npt.NDArray[np.int64]
     episode: npt.NDArray[np.int64]
@@ -93,12 +96,14 @@ def load_recorded(
             if episodes is None
             else "episodes=[] chooses none",
         )
-    _check_tasks(meta, columns["task_index"])
+    check_tasks(meta, columns["task_index"])
     tracks = tuple(make_track(meta, key, columns["timestamp"], chosen) for key in keys)
     return Recorded(
         meta=meta,
         states=columns[state_key],
         actions=columns[action_key],
+        state_names=tuple(meta.names(state_key)),
+        action_names=tuple(meta.names(action_key)),
         timestamp=columns["timestamp"],
         task=columns["task_index"],
         episode=columns["episode_index"],
@@ -122,7 +127,12 @@ def _choose(meta: Metadata, episodes: Sequence[int] | None) -> npt.NDArray[np.bo
     return chosen
 
 
-def _check_tasks(meta: Metadata, index: npt.NDArray[Any]) -> None:
+def check_tasks(meta: Metadata, index: npt.NDArray[Any]) -> None:
+    """Refuse rows of an instruction that the dataset does not list.
+
+    Raises:
+        DataError: there are some.
+    """
     known = len(meta.tasks)
     if index.min() < 0 or index.max() >= known:
         raise DataError(
@@ -131,8 +141,18 @@ def _check_tasks(meta: Metadata, index: npt.NDArray[Any]) -> None:
         )
 
 
-def make_track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[np.bool_]) -> Track:
-    """Where the frames of camera ``key`` are; ``chosen`` are the episodes to find, ``(E,)``.
+def make_track(
+    meta: Metadata,
+    key: str,
+    timestamp: Floats,
+    chosen: npt.NDArray[np.bool_],
+    check: Callable[[Path, int], None] = check_video,
+) -> Track:
+    """Where the frames of camera ``key`` are.
+
+    Args:
+        chosen: the episodes to find, ``(E,)``.
+        check: is given each video file and how many frames must be in it.
 
     Raises:
         DataError: a file of a chosen episode is missing or too short.
@@ -149,7 +169,7 @@ def make_track(meta: Metadata, key: str, timestamp: Floats, chosen: npt.NDArray[
     for start, length, place in zip(places.starts[chosen], lengths[chosen], wanted, strict=True):
         ends[numbers[place]] = max(ends[numbers[place]], round(start * meta.fps) + int(length))
     for path, end in zip(files, ends, strict=True):
-        check_video(path, end)
+        check(path, end)
     file = [numbers.get(f, -1) for f in places.files]
     height, width = meta.picture_size(key)
     return Track(

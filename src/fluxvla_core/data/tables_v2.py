@@ -25,14 +25,14 @@ EPISODES = "meta/episodes.jsonl"
 CHUNK_EPISODES = 1000
 
 
-def read_tasks(root: Path) -> dict[int, str]:
+def read_tasks(root: Path) -> dict[int, Any]:
     """``task_index`` -> instruction; the order of the lines means nothing.
 
     Raises:
-        DataError: the file is missing, damaged, or a line is none of a task.
+        DataError: the file is missing, damaged, or a line has no ``task_index``.
     """
     path = root / TASKS
-    return {_whole(path, row, "task_index"): str(row.get("task")) for row in read_json_lines(path)}
+    return {_whole(path, row, "task_index"): row.get("task") for row in read_json_lines(path)}
 
 
 def read_episodes(root: Path, info: Mapping[str, Any]) -> Episodes:

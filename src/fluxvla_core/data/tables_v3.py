@@ -15,7 +15,7 @@ from fluxvla_core.data.optional import arrow
 from fluxvla_core.errors import DataError
 
 
-def read_tasks(root: Path) -> dict[int, str]:
+def read_tasks(root: Path) -> dict[int, Any]:
     """``task_index`` -> instruction.
 
     Raises:
@@ -49,8 +49,13 @@ def read_episodes(root: Path, info: Mapping[str, Any]) -> Episodes:
             for n in ("chunk_index", "file_index", "from_timestamp")
         ),
     ]
-    table = pa.concat_tables([read_table(path, columns) for path in paths])
-    table = table.sort_by("episode_index")
+    parts = [read_table(path, columns) for path in paths]
+    try:
+        table = pa.concat_tables(parts, promote_options="permissive").sort_by("episode_index")
+    except pa.ArrowException as error:
+        raise DataError(
+            f"{root}: the files of meta/episodes are not of the same columns ({error})"
+        ) from error
     check_numbering(root, table["episode_index"].to_numpy())
 
     def files(prefix: str) -> list[FileId]:

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data.columns import read_columns
-from fluxvla_core.data.files import read_json
+from fluxvla_core.data.files import read_json, read_table
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.recording import Track, make_track
+from fluxvla_core.data.recording import Track, check_tasks, make_track
 from fluxvla_core.data.statistics import column_statistics
-from fluxvla_core.data.video import open_source
+from fluxvla_core.data.video import check_video, open_source
 from fluxvla_core.errors import DataError, FluxError
 
 LISTED = 20
@@ -38,41 +38,75 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
     """
     say = reporter or SilentReporter()
     meta = read_metadata(root)
-    columns = read_columns(meta, meta.vectors)
+    columns = _read_columns(meta)
     frames = len(columns["timestamp"])
     say.info(
         f"{root}: LeRobot {meta.version}, {len(meta.episodes)} episodes, "
         f"{frames} frames at {meta.fps:g} Hz"
     )
     wrong = _wrong_times(meta, columns["timestamp"])
+    try:
+        check_tasks(meta, columns["task_index"])
+    except DataError as error:
+        wrong.append(str(error))
+    damaged: set[Path] = set()
+
+    def check(path: Path, expected: int) -> None:
+        try:
+            check_video(path, expected)
+        except DataError as error:
+            wrong.append(str(error))
+            damaged.add(path)
+
     tracks: list[Track] = []
     for camera in meta.cameras:
         try:
             every = np.ones(len(meta.episodes), np.bool_)
-            tracks.append(make_track(meta, camera, columns["timestamp"], every))
+            tracks.append(make_track(meta, camera, columns["timestamp"], every, check))
         except FluxError as error:
             wrong.append(str(error))
     done, total = 0, frames * len(tracks)
     for track in tracks:
         before = len(wrong)
-        for number in range(len(track.files)):
+        for number, source in enumerate(track.files):
             try:
-                _decode(track, number, say, done, total)
+                if source not in damaged:
+                    _decode(track, number, say, done, total)
             except FluxError as error:
                 wrong.append(str(error))
             done += int((track.file == number).sum())
-        if len(wrong) == before:
+        if len(wrong) == before and damaged.isdisjoint(track.files):
             say.info(f"{track.key}: {frames} frames in {len(track.files)} files")
     say.progress("decode frames", total, total)
-    if len(wrong) == 1:
-        raise DataError(wrong[0])
-    if wrong:
-        more = f"\n… and {len(wrong) - LISTED} more" if len(wrong) > LISTED else ""
-        raise DataError(f"{root}: {len(wrong)} findings\n" + "\n".join(wrong[:LISTED]) + more)
+    _raise(meta, wrong)
     doubts = _doubts(meta, columns)
     for doubt in doubts:
         say.warn(doubt)
     return doubts
+
+
+def _read_columns(meta: Metadata) -> dict[str, npt.NDArray[Any]]:
+    """All rows. If a table is damaged, all that are: without rows no frame can be looked for."""
+    try:
+        return read_columns(meta, meta.vectors)
+    except DataError as error:
+        wrong = []
+        for file in dict.fromkeys(meta.episodes.files):
+            try:
+                read_table(meta.data_file(file))
+            except DataError as other:
+                wrong.append(str(other))
+        if len(wrong) > 1:
+            _raise(meta, wrong)
+        raise error
+
+
+def _raise(meta: Metadata, wrong: list[str]) -> None:
+    if len(wrong) == 1:
+        raise DataError(wrong[0])
+    if wrong:
+        more = f"\n… and {len(wrong) - LISTED} more" if len(wrong) > LISTED else ""
+        raise DataError(f"{meta.root}: {len(wrong)} findings\n" + "\n".join(wrong[:LISTED]) + more)
 
 
 def _decode(track: Track, number: int, say: Reporter, done: int, total: int) -> None:
@@ -114,7 +148,7 @@ def _doubts(meta: Metadata, columns: dict[str, npt.NDArray[Any]]) -> list[str]:
             f"{v3.EMBODIMENT} is missing: a policy acts only if its config says embodiment="
         )
     used = np.unique(columns["task_index"])
-    empty = [int(i) for i in used if i >= len(meta.tasks) or not meta.tasks[i].strip()]
+    empty = [int(i) for i in used if not meta.tasks[i].strip()]
     if empty:
         found.append(f"{meta.tasks_file}: no instruction for task_index {empty}")
     path = meta.root / v3.STATS

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from fluxvla_core.data import lerobot_v3 as v3
 from fluxvla_core.data.assemble import Recording, assemble
 from fluxvla_core.data.draft import EpisodeDraft, Sizes, load_episode
 from fluxvla_core.data.encode import find_codec
-from fluxvla_core.data.files import write_json
+from fluxvla_core.data.files import read_json, write_json
 from fluxvla_core.errors import DataError, RunFailed
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -47,7 +48,8 @@ class LeRobotWriter:
         recover: go on with the episodes of a recording that was interrupted.
 
     Raises:
-        DataError: there is a dataset, or an interrupted recording, already.
+        DataError: there is a dataset, or an interrupted recording, already; with ``recover``, that
+            one is of another robot, rate or codec.
         ConfigError: the codec is unknown or not available.
     """
 
@@ -131,7 +133,7 @@ class LeRobotWriter:
         number = len(self._saved)
         final = self._staging / f"episode-{number:06d}"
         try:
-            write_json(self._staging / _RECORDING, {"sizes": self._sizes})
+            write_json(self._staging / _RECORDING, {"sizes": self._sizes, **self._settings()})
             self._draft.save(final, key)
         except OSError as error:
             raise self._disk(error) from error
@@ -191,11 +193,34 @@ class LeRobotWriter:
                 f"{len(saved)} saved episodes in {self._staging}",
                 next="LeRobotWriter(..., recover=True) goes on with them; or delete that folder",
             )
-        file = self._staging / _RECORDING
-        if file.is_file():
-            sizes = json.loads(file.read_text(encoding="utf-8"))["sizes"]
-            self._sizes = {camera: (size[0], size[1]) for camera, size in sizes.items()}
+        if saved:
+            said = read_json(self._staging / _RECORDING)
+            self._check_settings(said)
+            self._sizes = {camera: (size[0], size[1]) for camera, size in said["sizes"].items()}
         self._saved = saved
+
+    def _settings(self) -> dict[str, Any]:
+        """What all episodes of a recording share, as JSON values."""
+        about = self._recording
+        settings = {
+            "fps": about.fps,
+            "video_codec": about.video_codec,
+            "embodiment": about.embodiment.to_dict(),
+        }
+        return dict(json.loads(json.dumps(settings)))
+
+    def _check_settings(self, said: Mapping[str, Any]) -> None:
+        """Refuse to go on with episodes of another robot, rate or codec."""
+        here = self._settings()
+        other = [key for key in here if key not in said or said[key] != here[key]]
+        if not other:
+            return
+        listed = [k if k == "embodiment" else f"{k}: {said.get(k)} / {here[k]}" for k in other]
+        raise DataError(
+            f"{self.root}: the recording that was interrupted has another {', '.join(listed)}",
+            cause="what was saved and what is to come would not be read alike",
+            next="record with the settings of then, or into another folder",
+        )
 
     def _new_draft(self) -> EpisodeDraft:
         spec, fps = self._recording.embodiment, self._recording.fps

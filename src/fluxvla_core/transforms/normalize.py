@@ -28,7 +28,8 @@ class NormalizeStatesAndActions:
         state_key, action_key: entries of the statistics, usually ``proprio`` and ``action``.
         action_dim, state_dim: widths that the model wants; the data's own if None.
         norm_type: ``mean_std``, ``quantile``, ``min_max`` or ``none``.
-        action_norm_mask: ``(D,)``, D being the data's own width; False leaves a dimension as is.
+        action_norm_mask: ``(D,)``, D being the data's own width; False neither shifts nor scales
+            a dimension (relative ones are counted from the state all the same).
         std_floor: no dimension is divided by less than this, in the data's units.
 
     Raises:
@@ -68,6 +69,7 @@ class NormalizeStatesAndActions:
         if "actions" in sample:
             actions = sample["actions"]
             _check_width("actions", actions, action_scale.dim, self.action_key)
+            _check_steps(actions, action_scale, self.action_key)
             scaled = action_scale.forward(actions, states)
             out["actions"] = self._pad(scaled, self.action_dim, "action")
         return out
@@ -267,6 +269,18 @@ def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:
     if not isinstance(entry, Mapping):
         raise ConfigError(f"{who}: the statistics' entry {key!r} is no table")
     return entry
+
+
+def _check_steps(actions: Any, scale: Affine, key: str) -> None:
+    """Statistics of every step of a window fit windows of that length only."""
+    steps = np.shape(actions)[-2] if np.ndim(actions) > 1 else 1
+    if scale.offset.ndim > 1 and len(scale.offset) != steps:
+        raise ConfigError(
+            f"NormalizeStatesAndActions: actions of {steps} steps, the statistics {key!r} "
+            f"describe {len(scale.offset)} steps one by one",
+            cause="per_step_statistics of a window of another length",
+            next="make action_window_size that of the statistics, or compute them anew",
+        )
 
 
 def _check_width(what: str, values: Any, dim: int, key: str) -> None:

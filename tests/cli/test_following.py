@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -109,3 +110,54 @@ def test_under_torchrun_the_first_rank_evaluates_and_is_no_rank_then(
     assert words[words.index("--section") + 1] == following.SECTION
     assert "runner.max_epochs=3" in words
     assert not {"RANK", "WORLD_SIZE", "MASTER_PORT"} & set(environment)
+
+
+TINY = """\
+from fluxvla_core import COLLATORS, DATASETS, RUNNERS, VLAS
+from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.testing import training
+
+for registry, made in (
+    (COLLATORS, DictCollator),
+    (DATASETS, training.TinyDataset),
+    (RUNNERS, training.OneProcessRunner),
+    (VLAS, training.TinyVLA),
+):
+    registry.register_module(force=True)(made)
+"""
+TRAINS = """\
+model = dict(type="TinyVLA")
+train_dataloader = dict(per_device_batch_size=2, dataset=dict(type="TinyDataset"))
+runner = dict(type="OneProcessRunner", max_steps=9, learning_rate=1e-2, collator=dict(
+    type="DictCollator", keys=["states", "actions", "noise", "sample_ids"]))
+eval = dict(type="ToyEvalRunner", operator=dict(type="ToyOperator"))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_nothing_is_evaluated_after_a_stop_during_the_last_save(
+    run: Fluxvla, write: Write, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    pytest.importorskip("torch")
+    from fluxvla_core.train.running import TrainRun
+
+    settle = TrainRun.settle_saves
+
+    def settled(run: TrainRun, wait: bool = True) -> None:
+        settle(run, wait)
+        if wait:  # not after a step
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(TrainRun, "settle_saves", settled)
+    monkeypatch.setattr(os, "execve", lambda *words: pytest.fail("it is evaluated"))
+    write("tiny.py", TINY)
+    config = write("t.py", TRAINS)
+    words = ("--config", str(config), "--plugin", "tiny.py", "--set", "runner.max_steps=2")
+    ended = run(*words, "--section", "runner", "--eval-after-train")
+    assert (ended.code, ended.err) == (
+        0,
+        f"training is complete and saved, but not evaluated: {number.name} came at its end\n"
+        "  next: fluxvla run --config t.py --section eval --work-dir work_dirs/t --log-format text "
+        "--set runner.max_steps=2 --plugin toy.py --plugin tiny.py\n",
+    )
+    assert Path("work_dirs/t/checkpoints/step-000000002/manifest.json").exists()

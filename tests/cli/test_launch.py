@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 
 from fluxvla_core.cli import launch, ranks
 from fluxvla_core.cli.ranks import Failure, root_cause
+from fluxvla_core.errors import RunFailed
 
 from .conftest import Fluxvla, Write
 from .test_run import said
@@ -246,6 +249,73 @@ def test_a_launched_rank_leaves_its_error_to_the_launcher(
     monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path / "gone"))
     ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
     assert "a.mp4: bad data" in ended.err
+
+
+def test_a_launched_rank_that_is_done_says_so(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
+    Path("work_dirs/c").mkdir(parents=True)
+    assert run("--config", "c.py", "--section", "runner").code == 0
+    assert (ranks.done(tmp_path), ranks.failures(tmp_path)) == ({1: 0}, {})
+
+
+def test_a_signal_after_all_ranks_were_done_is_no_failure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def ended(rank: str, attempt: str) -> None:
+        monkeypatch.setenv("RANK", rank)
+        monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", attempt)
+        ranks.record_done(signal.SIGTERM)
+
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    assert ranks.record("a.mp4: bad data", 2, expected=True)
+    ended("0", "1")
+    with pytest.raises(RunFailed, match=r"^1 of 2 ranks were killed"):
+        launch._signalled(signal.SIGTERM, tmp_path, 2, tmp_path, 5)
+    ended("1", "1")
+    assert launch._signalled(signal.SIGTERM, tmp_path, 2, tmp_path, 5) == (0, signal.SIGTERM)
+
+
+def test_a_record_that_a_full_disk_cut_off_hides_no_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
+    assert ranks.record("a.mp4: bad data", 2, expected=True)
+
+    def cut(path: Path, *args: object, **settings: object) -> None:
+        path.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setenv("RANK", "1")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", cut)
+        assert not ranks.record("rank 1 says it on the terminal", 1, expected=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["rank-0.0.json"]
+    (tmp_path / "rank-2.0.json").touch()
+    assert list(ranks.failures(tmp_path)) == [0]
+
+
+@torch
+def test_a_full_disk_before_there_are_ranks(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    command = ("--config", "c.py", "--section", "runner", "--nproc", "2")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    ended = run(*command)
+    assert ended.code == 1
+    assert ended.err.startswith("no temporary folder can be made for the ranks: No such file")
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "ranks.log")
+
+    monkeypatch.setattr(launch, "launch", full)
+    ended = run(*command)
+    assert ended.code == 1
+    assert ended.err.startswith("no space left on the disk while writing ranks.log\n  next: make")
 
 
 def test_a_rank_that_lost_another_is_no_cause(

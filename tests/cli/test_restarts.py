@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from fluxvla_core.cli import ranks
+from fluxvla_core.cli import launch, ranks
 
 from .conftest import Fluxvla, Write
 
@@ -161,15 +162,103 @@ def test_a_config_that_resumes_needs_no_option(tiny: None) -> None:
 
 
 def test_what_a_restart_resumes_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent(monkeypatch)
+    ranks.begin(tmp_path)
     assert ranks.resume(None, tmp_path) is None
     assert ranks.resume("there", tmp_path) == "there"
-    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    agent(monkeypatch, attempt=1)
     assert ranks.resume(None, tmp_path) == "auto"
     assert ranks.resume("there", tmp_path) == "there"
     saved = tmp_path / "checkpoints" / "step-000000003"
     saved.mkdir(parents=True)
     (saved / "manifest.json").write_text("{}")
     assert ranks.resume("there", tmp_path) == "auto"
+    (tmp_path / ranks.JOB).unlink()
+    assert ranks.resume(None, tmp_path) is None, "this job had not begun here"
+    assert ranks.resume("there", tmp_path) == "there"
+
+
+def agent(
+    patch: pytest.MonkeyPatch, name: str = "a", job: str = "none", host: str = "h", attempt: int = 0
+) -> None:
+    """The environment of a rank that the agent ``name`` of torchrun started on ``host``."""
+    patch.setenv("TORCHELASTIC_RUN_ID", job)
+    patch.setenv("TORCHELASTIC_RESTART_COUNT", str(attempt))
+    patch.setenv("TORCHELASTIC_ERROR_FILE", f"/tmp/{name}/attempt_{attempt}/0/error.json")
+    patch.setattr(socket, "gethostname", lambda: host)
+
+
+@pytest.mark.parametrize(
+    ("later", "goes_on"),
+    [
+        ({}, True),
+        ({"name": "b"}, False),
+        ({"name": "b", "host": "other"}, False),
+        ({"job": "7"}, False),
+        ({"first": "7", "job": "7"}, True),
+        # Another machine of the job has the first rank now.
+        ({"first": "7", "job": "7", "name": "b", "host": "other"}, True),
+        # The next job by the same name.
+        ({"first": "7", "job": "7", "name": "b"}, False),
+        ({"first": "7", "job": "8", "name": "b", "host": "other"}, False),
+    ],
+)
+def test_only_the_job_that_had_begun_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, later: dict[str, str], goes_on: bool
+) -> None:
+    agent(monkeypatch, job=later.pop("first", "none"))
+    ranks.begin(tmp_path)
+    agent(monkeypatch, **later, attempt=1)
+    assert ranks.resume(None, tmp_path) == ("auto" if goes_on else None)
+
+
+def test_the_work_dir_is_the_last_ones_that_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(monkeypatch)
+    ranks.begin(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.delenv("TORCHELASTIC_RUN_ID")
+        ranks.begin(tmp_path)
+    agent(monkeypatch, attempt=1)
+    assert ranks.resume(None, tmp_path) is None
+    monkeypatch.setenv("RANK", "1")
+    ranks.begin(tmp_path)
+    assert not (tmp_path / ranks.JOB).exists(), "the first rank speaks for all"
+    (tmp_path / ranks.JOB).write_text("[")
+    assert ranks.resume(None, tmp_path) is None
+
+
+def test_without_its_folder_an_agent_is_the_parent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(monkeypatch)
+    monkeypatch.setenv("TORCHELASTIC_ERROR_FILE", "")
+    ranks.begin(tmp_path)
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert ranks.resume(None, tmp_path) == "auto"
+    monkeypatch.setattr(os, "getppid", lambda: 1)
+    assert ranks.resume(None, tmp_path) is None
+
+
+@pytest.mark.parametrize("words", [(), ("--resume", "elsewhere")])
+def test_a_refused_training_is_refused_again_after_a_restart(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
+    saved = Path("work_dirs/c/checkpoints/step-000000003")
+    saved.mkdir(parents=True)
+    (saved / "manifest.json").write_text("{}")
+    Path("elsewhere").mkdir()
+    for attempt in range(3):
+        agent(monkeypatch, attempt=attempt)
+        ended = run("--config", "c.py", "--section", "runner", *words)
+        assert ended.code == 2
+        assert "the work dir already holds checkpoints, up to step 3" in ended.err
+    agent(monkeypatch, attempt=0)
+    assert run("--config", "c.py", "--section", "runner", "--resume", "auto").code == 0
+    agent(monkeypatch, attempt=1)
+    assert run("--config", "c.py", "--section", "runner").code == 0, "it had begun"
 
 
 def test_why_there_was_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
+import signal
 import sys
-from typing import NoReturn
 
 from fluxvla_core.cli.plan import Plan
 from fluxvla_core.config import check_config
@@ -42,8 +43,19 @@ def plan_evaluation(args: argparse.Namespace, plan: Plan) -> list[str]:
     return words
 
 
-def evaluate(words: list[str]) -> NoReturn:
-    """Become the process that evaluates: it keeps this one's id, terminal and signals."""
+def evaluate(words: list[str], late: int = 0) -> None:
+    """Become the process that evaluates: it keeps this one's id, terminal and signals.
+
+    Args:
+        late: a signal that asked to stop when training was done: then nothing new is begun.
+    """
+    if late:
+        print(
+            f"training is complete and saved, but not evaluated: {signal.Signals(late).name} came "
+            f"at its end\n  next: fluxvla {shlex.join(words)}",
+            file=sys.stderr,
+        )
+        return
     environment = {
         name: value
         for name, value in os.environ.items()

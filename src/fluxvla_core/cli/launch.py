@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.cli import ranks
-from fluxvla_core.errors import EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
+from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
 
 _STOP_S = 30
 """What torch's agent gives the others when a rank has failed: they have nothing left to save."""
@@ -24,7 +24,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 def launch(
     nproc: int, words: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = ranks.GRACE_S
-) -> int:
+) -> tuple[int, int]:
     """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
 
     Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped. Up to
@@ -32,9 +32,12 @@ def launch(
     the exit code of the one that failed first are this command's. Asked to stop, they have
     ``grace`` seconds to save in ``work_dir``; then they are killed.
 
+    Returns:
+        The exit code, and the signal that asked to stop when all was done, or 0.
+
     Raises:
         UsageError: torch is not installed, or this process is itself a rank.
-        RunFailed: a rank was killed, or this command was.
+        RunFailed: a rank was killed, or this command was; there is no temporary folder.
         KeyboardInterrupt: Ctrl-C.
     """
     if ranks.world_size() is not None:
@@ -57,7 +60,7 @@ def launch(
     # Its agent reports failures in its own way; ours are in the ranks' own words.
     logging.disable(logging.CRITICAL)
     try:
-        with tempfile.TemporaryDirectory(prefix="fluxvla-ranks-") as folder:
+        with _scratch() as folder:
             os.environ[ranks.ERROR_DIR] = folder
             os.environ[ranks.LAUNCHER] = str(os.getpid())
             config = LaunchConfig(
@@ -74,15 +77,32 @@ def launch(
             )
             agent = elastic_launch(config, sys.executable)
             try:
-                return _watch(agent, words, Path(folder), ChildFailedError)
+                code = _watch(agent, words, Path(folder), ChildFailedError)
+                return code, max(ranks.done(Path(folder)).values(), default=0)
             except SignalException as error:
-                said = list(ranks.failures(Path(folder)).values())
-                unsaved = _unsaved(nproc - len(said), nproc, work_dir, grace)
-                return _stopped(signal.Signals(error.sigval), said, unsaved)
+                number = signal.Signals(error.sigval)
+                return _signalled(number, Path(folder), nproc, work_dir, grace)
     finally:
         for name in (ranks.ERROR_DIR, ranks.LAUNCHER):
             os.environ.pop(name, None)
         logging.disable(logging.NOTSET)
+
+
+def _scratch() -> tempfile.TemporaryDirectory[str]:
+    """Where ranks leave their words.
+
+    Raises:
+        RunFailed: there is no place for it.
+    """
+    try:
+        return tempfile.TemporaryDirectory(prefix="fluxvla-ranks-")
+    except OSError as error:
+        # tempfile says "no such file" where all places are full.
+        raise RunFailed(
+            f"no temporary folder can be made for the ranks: {error.strerror or error}",
+            cause="the disk of the temporary files is full or cannot be written",
+            next="make room there, or name another place: export TMPDIR=DIR",
+        ) from error
 
 
 def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) -> int:
@@ -91,6 +111,17 @@ def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) ->
     except failed as error:
         return _tell(ranks.root_cause(_all(error.failures, ranks.failures(folder))))
     return 0
+
+
+def _signalled(
+    number: signal.Signals, folder: Path, nproc: int, work_dir: Path, grace: int
+) -> tuple[int, int]:
+    """How this command ends after a signal: well, if all ranks had done all by then."""
+    done, said = ranks.done(folder), list(ranks.failures(folder).values())
+    if len(done) == nproc:
+        return EXIT_DONE, number
+    unsaved = _unsaved(nproc - len(done) - len(said), nproc, work_dir, grace)
+    return _stopped(number, said, unsaved), 0
 
 
 def _stopped(number: signal.Signals, said: list[ranks.Failure], unsaved: RunFailed | None) -> int:

@@ -11,12 +11,16 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 ERROR_DIR = "FLUXVLA_ERROR_DIR"
 LAUNCHER = "FLUXVLA_LAUNCHER_PID"
+JOB = "run.job"
+"""In a work dir: which job of several processes began to train there last."""
+_NO_ID = "none"  # torchrun's --rdzv-id, of any job that was given none
 GRACE_S = 600
 """Seconds for a checkpoint, between asking ranks to stop and killing them."""
 
@@ -38,12 +42,53 @@ def attempt() -> int:
 
 
 def resume(asked: str | None, work_dir: Path) -> str | None:
-    """What a training goes on from: ``--resume``, and after a restart what there is by then."""
-    if attempt() == 0:
+    """What a training goes on from: ``--resume``, and after a restart what there is by then.
+
+    That only where this job had begun: an attempt that was refused is refused again, and does not
+    go on with what others left.
+    """
+    if attempt() == 0 or not _began(work_dir):
         return asked
     from fluxvla_core.checkpoints.checkpoint import folders
 
     return "auto" if asked is None or folders(work_dir) else asked
+
+
+def begin(work_dir: Path) -> None:
+    """Leave word that this job trains in ``work_dir``; to be called when nothing refused it."""
+    from fluxvla_core.atomic import write_text
+
+    if rank() != 0:
+        return
+    if has_agent():
+        write_text(work_dir / JOB, json.dumps(_job()))
+    else:  # nothing restarts this process, and the place is no longer the earlier job's
+        (work_dir / JOB).unlink(missing_ok=True)
+
+
+def _began(work_dir: Path) -> bool:
+    """Whether it is this job that began last in ``work_dir``."""
+    ours = _job()
+    try:
+        theirs = json.loads((work_dir / JOB).read_text(encoding="utf-8"))
+        # Of several machines another may have the first rank now. On the same one, a name that
+        # is used again and again is another job's.
+        moved = theirs["id"] == ours["id"] != _NO_ID and theirs["host"] != ours["host"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return bool(theirs == ours or moved)
+
+
+def _job() -> dict[str, str]:
+    """What stays over a job's restarts, and tells it from others."""
+    import socket
+
+    # AGENT/attempt_N/RANK/error.json: the agent makes that folder once, with a name of its own.
+    # The parent is it too, but in containers all have the same number, and a script may be between.
+    file = os.environ.get("TORCHELASTIC_ERROR_FILE", "")
+    agent = str(Path(file).parents[2]) if file.count(os.sep) > 2 else str(os.getppid())
+    job = os.environ.get("TORCHELASTIC_RUN_ID", _NO_ID)
+    return {"id": job, "host": socket.gethostname(), "agent": agent}
 
 
 def restarted() -> list[str]:
@@ -109,21 +154,54 @@ def record(text: str, code: int, *, expected: bool) -> bool:
     # that is gone.
     asked = "stopped by SIGTERM" in text or "lost another rank" in text
     failure = Failure(rank(), time.monotonic(), text, code, expected, asked)
-    path = Path(os.environ[ERROR_DIR]) / f"rank-{failure.rank}.{attempt()}.json"
+    return _leave("rank", asdict(failure))
+
+
+def record_done(late: int) -> None:
+    """Leave word that this rank did all it had to.
+
+    Args:
+        late: the signal that asked it to stop when there was nothing left to stop, or 0.
+    """
+    if launched():
+        _leave("done", [rank(), late])
+
+
+def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
+    """What ranks recorded, by rank, in the ``which``-th attempt; in the last one by default."""
+    found = [Failure(**said) for said in _left(folder, "rank", which)]
+    return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
+
+
+def done(folder: Path) -> dict[int, int]:
+    """The ranks that did all they had to in the last attempt, with the signal that came late."""
+    return dict(_left(folder, "done"))
+
+
+def _leave(kind: str, said: object) -> bool:
+    """Write a record for the launcher; False if that cannot be."""
+    from fluxvla_core.atomic import write_text
+
     try:
-        path.write_text(json.dumps(asdict(failure)))
+        path = Path(os.environ[ERROR_DIR]) / f"{kind}-{rank()}.{attempt()}.json"
+        write_text(path, json.dumps(said))
     except OSError:  # the launcher is gone, or the disk is full: the terminal is what is left
         return False
     return True
 
 
-def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
-    """What ranks recorded, by rank, in the ``which``-th attempt; in the last one by default."""
-    paths = {path: int(path.name.split(".")[1]) for path in folder.glob("rank-*.*.json")}
+def _left(folder: Path, kind: str, which: int | None = None) -> list[Any]:
+    """The records of an attempt, the last one by default."""
+    paths = {path: int(path.name.split(".")[1]) for path in folder.glob("*-*.*.json")}
     if which is None:
         which = max(paths.values(), default=0)
-    found = [Failure(**json.loads(p.read_text())) for p, n in paths.items() if n == which]
-    return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
+    found = []
+    for path, number in paths.items():
+        if number == which and path.name.startswith(kind):
+            # A disk that is full, or fails, must not hide what the other ranks said.
+            with suppress(OSError, ValueError):
+                found.append(json.loads(path.read_text(encoding="utf-8")))
+    return found
 
 
 def root_cause(found: Sequence[Failure]) -> Failure:

@@ -100,14 +100,16 @@ class Run:
             from fluxvla_core.cli.launch import launch
 
             grace = args.grace or ranks.GRACE_S
-            with _terminable():
-                code = launch(args.nproc, _words(args), plan.work_dir, args.max_restarts, grace)
+            with _terminable(), _disk_full(plan.work_dir):
+                words, restarts = _words(args), args.max_restarts
+                code, late = launch(args.nproc, words, plan.work_dir, restarts, grace)
         else:
             with _terminable(), _disk_full(plan.work_dir):
-                _execute(plan, args)
+                late = _execute(plan, args)
+                ranks.record_done(late)
             code = 0
         if code == 0 and after is not None and ranks.rank() == 0:
-            following.evaluate(after)
+            following.evaluate(after, late)
         return code
 
 
@@ -168,8 +170,12 @@ def _words(args: argparse.Namespace) -> list[str]:
     return [*words, "--log-format", args.log_format]
 
 
-def _execute(plan: Plan, args: argparse.Namespace) -> None:
-    """Build the section's runner and run it, reporting."""
+def _execute(plan: Plan, args: argparse.Namespace) -> int:
+    """Build the section's runner and run it, reporting.
+
+    Returns:
+        The signal that asked to stop it when it was done, or 0.
+    """
     from fluxvla_core.build import RunContext, build_runner_from_cfg
     from fluxvla_core.cli.reporters import make_reporter
     from fluxvla_core.config import freeze
@@ -187,8 +193,8 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
         nproc=ranks.world_size() or args.nproc,
     )
     if ranks.rank() != 0:
-        _run_section(plan, build_runner_from_cfg, replace(context, reporter=SilentReporter()))
-        return
+        context = replace(context, reporter=SilentReporter())
+        return _run_section(plan, build_runner_from_cfg, context)[1]
     reporter = make_reporter(args.log_format)
     try:
         with _owned(plan, reporter):
@@ -197,7 +203,7 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
             for text in ranks.restarted():
                 reporter.warn(text)
             context = replace(context, reporter=reporter)
-            result = _run_section(plan, build_runner_from_cfg, context)
+            result, late = _run_section(plan, build_runner_from_cfg, context)
         if isinstance(result, Mapping):
             for name, value in result.items():
                 if isinstance(value, (bool, int, float, str)):
@@ -206,6 +212,7 @@ def _execute(plan: Plan, args: argparse.Namespace) -> None:
                     )
             reporter.event("result", section=plan.section, result=result)
         reporter.artifact("work dir", plan.work_dir)
+        return late
     except Exception as error:
         reporter.event("error", type=type(error).__name__, text=str(error))
         raise
@@ -223,21 +230,26 @@ def _owned(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
     return closing(claim(plan.work_dir, reporter.warn))
 
 
-def _run_section(plan: Plan, build: Any, context: Any) -> Any:
-    """The call order of the specification: construct, ``run_setup``, ``run``."""
+def _run_section(plan: Plan, build: Any, context: Any) -> tuple[Any, int]:
+    """The call order of the specification: construct, ``run_setup``, ``run``.
+
+    Returns:
+        What the section gave, and the signal that asked to stop it when it was done, or 0.
+    """
     from fluxvla_core.contracts.check import is_train_runner
 
     runner = build(context.config[plan.section], context)
     if not is_train_runner(type(runner)):
         runner.run_setup()
-        return runner.run()
+        return runner.run(), 0
     from fluxvla_core.build import build_dataset_from_cfg
 
     dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
     try:
         runner.run_setup(n_train_examples=len(dataset))
-        return runner.run(dataset)
-    except (RuntimeError, MemoryError) as error:
+        ranks.begin(plan.work_dir)
+        return runner.run(dataset), getattr(runner, "late_stop", 0)
+    except (RuntimeError, MemoryError, OSError) as error:
         from fluxvla_core.train.memory import explain
 
         known = explain(error)

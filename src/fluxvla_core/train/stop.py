@@ -20,9 +20,10 @@ _SECOND_S = 1.0
 class StopRequest:
     """Notices SIGINT and SIGTERM while it is entered as a context manager.
 
-    The first signal asks for a stop at the end of a step; a second SIGINT more than a second later
-    ends at once (a terminal and a launcher may both pass on the first one). Ranks compare notes
-    every few steps, often enough to notice within about half a second.
+    The first signal asks for a stop at the end of a step, or of a batch that is validated; a second
+    SIGINT more than a second later ends at once (a terminal and a launcher may both pass on the
+    first one). Ranks compare notes every few steps, often enough to notice within about half a
+    second.
     """
 
     def __init__(self, world: World) -> None:
@@ -65,7 +66,11 @@ class StopRequest:
 
     def wanted(self, step: int) -> int:
         """The signal that some rank got, or 0; every rank gets the same answer."""
-        return agree(self._world, self._signal) if self.due(step) else 0
+        return self.asked() if self.due(step) else 0
+
+    def asked(self) -> int:
+        """As :meth:`wanted`, at once: all ranks call it at the same place."""
+        return agree(self._world, self._signal)
 
 
 def stopped(number: int, place: str) -> BaseException:

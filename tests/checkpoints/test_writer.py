@@ -12,7 +12,13 @@ import pytest
 
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.checkpoints.disk import Disk
-from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, rotate, set_aside_later
+from fluxvla_core.checkpoints.shelf import (
+    clear_leftovers,
+    name_best,
+    prepare,
+    rotate,
+    set_aside_later,
+)
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import RunFailed, UsageError
 
@@ -222,6 +228,17 @@ def test_later_checkpoints_are_set_aside_and_never_overwritten(tmp_path):
         "step-000000030.set-aside-2",
     ]
     assert latest(tmp_path).step == 10
+
+
+def test_best_names_a_checkpoint_that_is_there_or_nothing(tmp_path):
+    """A link left behind would name whatever is saved under its target's name next."""
+    best = tmp_path / "checkpoints/best"
+    write(tmp_path, 10)
+    assert name_best(tmp_path, 10)
+    assert os.readlink(best) == "step-000000010"
+    assert not name_best(tmp_path, 20)
+    assert not best.is_symlink()
+    assert not name_best(tmp_path, -1)
 
 
 def test_a_work_dir_that_cannot_be_written_is_refused_before_training(tmp_path):

@@ -48,6 +48,20 @@ def test_tensorboard(tmp_path):
     assert said.lines == []
 
 
+def test_tensorboard_of_a_run_that_begins_anew(tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    for loss, steps in ((1.0, (1, 2)), (5.0, (1,))):
+        tracker = open_tracker("tensorboard", Said(), tmp_path, "run", 0, {})
+        for step in steps:
+            tracker.log(step, {"loss": loss})
+        tracker.close()
+    found = EventAccumulator(str(tmp_path / "tensorboard"))
+    found.Reload()
+    assert [(e.step, e.value) for e in found.Scalars("train/loss")] == [(1, 5.0)]
+
+
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -60,7 +74,7 @@ class Loud(SilentReporter):
 
 for first in (0, 2):
     tracker = open_tracker(sys.argv[1], Loud(), Path("."), "night", first, {"model": {"type": "X"}})
-    for step in (first + 1, first + 2):
+    for step in (first + 1, first + 2, first + 3):
         tracker.log(step, {"loss": 1.0 / step})
     tracker.sync()
     tracker.close()
@@ -68,7 +82,7 @@ for first in (0, 2):
 
 
 def track(name: str, folder: Path, **environment: str) -> str:
-    """What a program that tracks four steps in two runs prints."""
+    """What a program prints that tracks five steps in two runs, the third in both."""
     ended = subprocess.run(
         [sys.executable, "-c", PROGRAM, name],
         cwd=folder,
@@ -95,6 +109,7 @@ def test_trackio(tmp_path):
         (name, 2, 0.5),
         (name, 3, 1 / 3),
         (name, 4, 0.25),
+        (name, 5, 0.2),
     ]
 
 

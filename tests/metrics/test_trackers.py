@@ -178,6 +178,9 @@ def test_tensorboard_purges_the_steps_that_are_done_again(tmp_path, monkeypatch)
     tracker.log(8, {"loss": 0.5})
     tracker.sync()
     tracker.close()
+    # One that was killed before its first checkpoint begins anew.
+    open_tracker("tensorboard", Said(), tmp_path, "run", 0, {})
+    assert calls.pop() == (str(tmp_path / "tensorboard"), 1)
     assert calls == [
         (str(tmp_path / "tensorboard"), 8),
         ("train/loss", 0.5, 8),

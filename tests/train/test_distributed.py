@@ -119,3 +119,44 @@ def test_a_lost_rank_is_explained_and_other_errors_are_not():
     )
     assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), TWO, 12) is None
     assert explain(error, ONE, 12) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[../gloo/transport/tcp/pair.cc:547] Read error [127.0.0.1]:1: Connection reset by peer",
+        "[../gloo/transport/tcp/unbound_buffer.cc:78] Timed out waiting 1800000ms for recv "
+        "operation to complete",
+        "[../gloo/transport/tcp/pair.cc:534] Socket closed [127.0.0.1]:1",
+        "Application timeout caused pair closure",
+        "failed to recv, got 0 bytes. Connection was likely closed. Did the remote server shutdown "
+        "or crash?",
+        "The client socket has timed out after 60000ms while trying to connect to (localhost, 1).",
+        "Socket Timeout",
+        "wait timeout after 300000ms, keys: /worker/1",
+        "Timed out after 61 seconds waiting for clients. 1/2 clients joined.",
+        "NCCL error in: ProcessGroupNCCL.cpp:3356, remote process exited or there was a network "
+        "error",
+        "NCCL communicator was aborted on rank 1.",
+        "[Rank 0] Watchdog caught collective operation timeout: WorkNCCL(SeqNum=3) ran for 600000 "
+        "milliseconds before timing out.",
+    ],
+)
+def test_what_gloo_c10d_and_nccl_say_of_a_lost_rank(text):
+    assert explain(RuntimeError(text), TWO, 12) is not None
+
+
+WORKER = "Caught RuntimeError in DataLoader worker process 0.\nOriginal Traceback …\nRuntimeError: "
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError(WORKER + "the camera's Connection reset by peer"),
+        RuntimeError("could not decode /data/peg_in_socket/ep.mp4"),
+        RuntimeError("DataLoader timed out after 5 seconds"),
+        BrokenPipeError(32, "Broken pipe"),
+    ],
+)
+def test_what_is_of_this_rank_is_not_blamed_on_another(error):
+    assert explain(error, TWO, 12) is None

@@ -69,7 +69,8 @@ class Case:
             table["sharding_strategy"] = strategy
         if self.lora:
             table.update(lora=LORA, init_from=str(base))
-        return tiny_config(table, batch=6 // (self.parts * self.ranks) or 1, workers=self.workers)
+        batch = 6 // (self.parts * self.ranks) or 1
+        return tiny_config(table, batch, self.workers, centred=True)
 
     @property
     def forwards(self) -> tuple[int, int]:
@@ -103,9 +104,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights for adapters to stand beside."""
     place = tmp_path_factory.mktemp("base")
     with unflushed():
-        train(
-            {"config": tiny_config({"type": "OneProcessRunner", "max_steps": 1}), "work_dir": place}
-        )
+        table = {"type": "OneProcessRunner", "max_steps": 1}
+        train({"config": tiny_config(table, centred=True), "work_dir": place})
     return place
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
+from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -21,7 +23,7 @@ from fluxvla_core.testing.training import (
 from fluxvla_core.train import lora
 from fluxvla_core.train.export import export
 from fluxvla_core.train.lora import LoraOptions
-from fluxvla_core.train.weights import load_for_inference, start_from
+from fluxvla_core.train.weights import base_of, base_to_note, load_for_inference, start_from
 
 pytest.importorskip("peft")
 
@@ -191,7 +193,7 @@ def test_the_bases_own_run_may_go_on(tmp_path, base, monkeypatch, place):
     best.symlink_to("step-000000002")
     run("run", init_from=place, lora=LORA, max_steps=2)
     run("base", "auto", max_steps=3)
-    best.unlink()
+    best.unlink(missing_ok=True)
     best.symlink_to("step-000000003")
     run("run", "auto", init_from=place, lora=LORA, max_steps=4)
     monkeypatch.chdir("/")
@@ -216,6 +218,53 @@ def test_a_base_is_found_again_where_all_folders_have_moved_or_where_it_is_said_
     run("run", "auto", init_from="foundation", lora=LORA, max_steps=4)
     found = latest("run").json("trainer.json")["left_out"]["sources"]
     assert found == {"": f"{tmp_path}/there/foundation/checkpoints/step-000000002"}
+
+
+def test_a_run_that_goes_on_names_the_base_that_it_had(tmp_path, base, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    shutil.copytree(base, "base")
+    settings = {"lora": LORA, "save_iter_interval": 1, "max_keep_ckpts": 1}
+    run("run", init_from="base", **settings, max_steps=2)
+    run("run", "auto", **settings, max_steps=4)
+    run("other", str(latest("run").path), **settings, max_steps=5)
+    run("other", "auto", **settings, init_from="base", max_steps=6)
+    monkeypatch.chdir((tmp_path / "here").rename(tmp_path / "there"))
+    plain = TinyVLA()
+    start_from(plain, "base")
+    for place, step in (("run", 4), ("other", 6)):
+        found, acts = latest(place), TinyVLA()
+        assert found.step == step
+        assert found.json(lora.CONFIG)["base_model_name_or_path"] == "base"
+        load_for_inference(acts, found)
+        assert torch.equal(acts.encoder.weight, plain.encoder.weight)
+
+
+def test_what_a_model_brings_itself_is_no_base(tmp_path):
+    left_out = {"sources": {"": "package:words 1.0"}, "sha256": "0"}
+    with CheckpointWriter(tmp_path, 1, 0) as writer:
+        writer.write_json(lora.CONFIG, LoraOptions.read(LORA, None).for_peft())
+        writer.write_json("trainer.json", {"left_out": left_out})
+        found = Checkpoint.open(writer.commit())
+    assert base_of(found) is base_of(found, "elsewhere") is None
+    assert base_to_note(found, None) is base_to_note(found, "elsewhere") is None
+
+
+def test_going_on_with_another_base_names_both(tmp_path, base):
+    run(tmp_path / "run", init_from=str(base), lora=LORA, max_steps=2)
+    run(tmp_path / "base", max_steps=3, seed=1)
+    with pytest.raises(CheckpointError) as caught:
+        run(tmp_path / "run", "auto", init_from=str(tmp_path / "base"), lora=LORA)
+    before, now = latest(base).path, latest(tmp_path / "base").path
+    assert (
+        f"was trained with (the model from {now}; then from {before})\n"
+        "  likely cause: init_from was changed, or that place has other weights by now\n"
+        f"  next: set init_from to where the weights of {before} are, or resume without it"
+    ) in str(caught.value)
+    shutil.copytree(base, tmp_path / "copy")
+    run(tmp_path / "run", "auto", init_from=str(tmp_path / "copy"), lora=LORA)
+    found = latest(tmp_path / "run").json(lora.CONFIG)["base_model_name_or_path"]
+    assert found == str(tmp_path / "copy")
 
 
 def test_without_an_adapter_a_run_that_goes_on_needs_no_base(tmp_path, base):
@@ -313,6 +362,131 @@ def test_modules_that_are_not_there(tmp_path, table, message):
         runner.run_setup(37)
     assert message in str(caught.value)
     assert "next: the model has encoder, blocks.0.norm, blocks.0.linear" in str(caught.value)
+
+
+class Tied(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.words, self.body, self.logits = nn.Embedding(4, 2), nn.Linear(2, 2), nn.Linear(2, 4)
+        self.logits.weight = self.words.weight
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "other"),
+    [
+        ("target_modules", "logits", "words"),
+        ("target_modules", "words", "logits"),
+        ("target_modules", r"log\w+", "words"),
+        ("target_modules", "all-linear", "words"),
+        ("modules_to_save", "logits", "words"),
+    ],
+)
+def test_a_weight_that_two_modules_share_gets_no_adapter(key, name, other):
+    names = (name,) if name in ("words", "logits") else name
+    options = LoraOptions(**{"rank": 1, "target_modules": ("body",), key: names})
+    module = name if name == "words" else "logits"
+    with pytest.raises(ConfigError) as caught:
+        lora.attach(Tied(), options)
+    assert str(caught.value) == (
+        f"lora.{key}: {module!r} has a weight that another module uses too: "
+        f"{module}.weight and {other}.weight are one\n"
+        "  likely cause: the one cannot be trained, nor get an adapter, without the other\n"
+        f"  next: leave {module!r} out, or give it a weight of its own in the model"
+    )
+
+
+def test_weights_shared_inside_or_beside_what_is_trained_are_fine():
+    lora.attach(Tied(), LoraOptions(1, ("body",)))
+    model = nn.ModuleDict({"body": nn.Linear(2, 2), "tied": Tied()})
+    lora.attach(model, LoraOptions(1, r"body", modules_to_save=("tied",)))
+
+
+class Heads(nn.Module):
+    def __init__(self, *names):
+        super().__init__()
+        self.linear = nn.Linear(2, 2)
+        for name in names:
+            *folders, last = name.split(".")
+            parent = self
+            for folder in folders:
+                if not hasattr(parent, folder):
+                    parent.add_module(folder, nn.Module())
+                parent = getattr(parent, folder)
+            parent.add_module(last, nn.Linear(2, 2))
+
+
+def trained_whole(model):
+    names = {n for n, p in model.named_parameters() if p.requires_grad}
+    return {n.partition(".modules_to_save.")[0] for n in names if ".lora_" not in n}
+
+
+@pytest.mark.parametrize(
+    ("names", "end", "others", "instead", "tell"),
+    [
+        (
+            ["vla.head", "vla.action_head"],
+            "head",
+            "vla.action_head",
+            ["vla.head"],
+            "write 'vla.head' instead, or name those too",
+        ),
+        (
+            ["a.0.out", "a.10.out"],
+            "out",
+            "peft's own lora_dropout",
+            ["a.0.out", "10.out"],
+            "write 'a.0.out', '10.out' instead",
+        ),
+        (
+            ["vla.layer"],
+            "layer",
+            "peft's own base_layer",
+            ["vla.layer"],
+            "write 'vla.layer' instead",
+        ),
+        (
+            ["head", "action_head"],
+            "head",
+            "action_head",
+            [],
+            "no name tells 'head' apart: give it another one in the model, or name those too",
+        ),
+    ],
+)
+def test_a_name_that_hits_the_middle_of_another(names, end, others, instead, tell):
+    with pytest.raises(ConfigError) as caught:
+        lora.attach(Heads(*names), LoraOptions(1, ("linear",), modules_to_save=(end,)))
+    assert str(caught.value) == (
+        f"lora.modules_to_save: {end!r} would also hit {others}\n"
+        "  likely cause: peft trains every module whose name ends in these letters\n"
+        f"  next: {tell}"
+    )
+    for name in instead:
+        model = Heads(*names)
+        lora.attach(model, LoraOptions(1, ("linear",), modules_to_save=(name,)))
+        assert trained_whole(model) == {n for n in names if n.endswith(name)}
+        assert len(trained_whole(model)) == 1
+
+
+def test_a_name_may_hit_what_is_named_too():
+    model = Heads("head", "action_head")
+    lora.attach(model, LoraOptions(1, ("linear",), modules_to_save=("head", "action_head")))
+    assert trained_whole(model) == {"head", "action_head"}
+
+
+def test_a_checkpoint_that_was_trained_with_such_a_name_still_loads():
+    options = LoraOptions(1, ("linear",), modules_to_save=("head",))
+    model = Heads("head", "action_head")
+    lora.attach(model, options, trained=True)
+    assert "action_head.modules_to_save.default.bias" in lora.adapter_names(model)
+
+
+def test_a_module_that_cannot_be_trained_as_a_whole(tmp_path):
+    runner = make(
+        tmp_path, lora={**LORA, "target_modules": ["head"], "modules_to_save": ["blocks"]}
+    )
+    with pytest.raises(ConfigError, match=r"lora\.modules_to_save: .*ModuleList"):
+        runner.run_setup(37)
 
 
 def test_a_regular_expression_and_the_default_alpha(tmp_path):

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+from fluxvla_core import build
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
+from fluxvla_core.cli import run as cli
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -46,6 +50,8 @@ def make(work_dir, resume=None):
         torch.OutOfMemoryError(CUDA),
         RuntimeError("CUDA error: out of memory\nCUDA kernel errors might be …"),
         RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate`"),
+        RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),
+        RuntimeError("cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED"),
     ],
 )
 def test_a_gpu(error):
@@ -55,6 +61,53 @@ def test_a_gpu(error):
     assert "lower train_dataloader.per_device_batch_size and raise runner.grad_acc" in told.next
     assert "--resume auto" in told.next
     assert told.exit_code == 1
+
+
+@pytest.mark.parametrize("failure", ["Cuda failure 2 'out of memory'",
+                                     "Cuda failure 'out of memory'"])  # fmt: skip
+def test_nccl_on_a_gpu(failure):
+    error = RuntimeError(
+        "NCCL error in: /pytorch/torch/csrc/distributed/c10d/ProcessGroupNCCL.cpp:3356, unhandled "
+        "cuda error (run with NCCL_DEBUG=INFO for details), NCCL version 2.27.3\n"
+        f"ncclUnhandledCudaError: Call to CUDA function failed.\nLast error:\n{failure}"
+    )
+    told = explain(error, 7)
+    assert told.what == "the GPU ran out of memory at step 7"
+    assert told.cause == failure
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (
+            RuntimeError(
+                "Caught _ArrayMemoryError in DataLoader worker process 0.\nOriginal Traceback …\n"
+                "numpy._core._exceptions._ArrayMemoryError: Unable to "
+                "allocate 1.00 TiB for an array with shape (1,) and data type uint8"
+            ),
+            "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 1.00 TiB for an array "
+            "with shape (1,) and data type uint8",
+        ),
+        (
+            RuntimeError("Caught MemoryError in pin memory thread for device 0.\n  …\nMemoryError"),
+            "Caught MemoryError in pin memory thread for device 0.",
+        ),
+        (
+            RuntimeError("unable to mmap 9 bytes from file </t_1>: Cannot allocate memory (12)"),
+            "unable to mmap 9 bytes from file </t_1>: Cannot allocate memory (12)",
+        ),
+        (OSError(errno.ENOMEM, "no room"), "[Errno 12] no room"),
+        (
+            OSError("Caught OSError in DataLoader worker process 0.\nOSError: [Errno 12] Cannot "
+                    "allocate memory"),
+            "OSError: [Errno 12] Cannot allocate memory",
+        ),
+    ],
+)  # fmt: skip
+def test_the_machine_as_a_worker_or_the_system_says_it(error, cause):
+    told = explain(error, 7)
+    assert told.what == "this machine ran out of memory at step 7"
+    assert told.cause == cause
 
 
 @pytest.mark.parametrize(
@@ -96,6 +149,13 @@ SHM = (
         ),
         (
             "unable to write to file </torch_1_2_3>: No space left on device (28)",
+            "a data worker ran out of shared memory at step 7",
+            "/dev/shm is full",
+            "per_device_num_workers=0",
+        ),
+        (
+            "unable to allocate shared memory(shm) for file </torch_1_2_3>: No space left on "
+            "device (28)",
             "a data worker ran out of shared memory at step 7",
             "/dev/shm is full",
             "per_device_num_workers=0",
@@ -158,6 +218,33 @@ def test_torch_itself_runs_out_of_memory():
 
 def test_other_errors_are_left_alone():
     assert explain(RuntimeError("shape mismatch")) is None
+    assert explain(OSError(errno.ENOSPC, "No space left on device")) is None
+    loading = "/lib/libgomp.so.1: cannot allocate memory in static TLS block"
+    assert explain(OSError(loading)) is None
+
+
+def refuse():
+    raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+
+def test_a_worker_that_the_system_cannot_start_is_told_of(tmp_path, monkeypatch):
+    config = tiny_config({"type": "OneProcessRunner", "max_steps": 2}, workers=1)
+    context = RunContext(config=config, section="runner", work_dir=tmp_path)
+    runner = build_runner_from_cfg(config["runner"], context)
+    runner.run_setup(37)
+    monkeypatch.setattr(os, "fork", refuse)
+    with pytest.raises(RunFailed, match="this machine ran out of memory at step 1"):
+        runner.run(TinyDataset())
+
+
+def test_a_setup_that_the_system_has_no_memory_for_is_told_of(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "build_dataset_from_cfg", lambda cfg, context: TinyDataset())
+    runner = make(tmp_path)
+    monkeypatch.setattr(runner, "run_setup", lambda n_train_examples: refuse())
+    config = {"runner": {}, "train_dataloader": {"dataset": {}}}
+    plan, context = SimpleNamespace(section="runner"), SimpleNamespace(config=config)
+    with pytest.raises(RunFailed, match="this machine ran out of memory"):
+        cli._run_section(plan, lambda cfg, context: runner, context)
 
 
 def test_a_run_keeps_what_it_saved_and_goes_on(tmp_path, monkeypatch):

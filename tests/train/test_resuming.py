@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
 from fluxvla_core.checkpoints import owner
@@ -233,6 +235,25 @@ def test_another_batch_size_goes_on_at_the_same_sample_and_says_so(tmp_path):
         "stays, the result will differ"
     )
     assert runner.progress.cursor.samples == 2 * 4 + 8
+
+
+@pytest.mark.parametrize(("before", "after"), [(4, 8), (8, 4)])
+def test_the_rate_follows_the_part_of_the_epochs_that_is_done(tmp_path, before, after):
+    """Counted in the old steps, larger ones were past the schedule's end: a rate of 0."""
+    schedule = {"lr_scheduler_type": "linear-warmup+cosine-decay", "max_epochs": 4}
+    schedule["log_iter_interval"] = 1
+    run(tmp_path, batch=before, **{**schedule, "max_epochs": 3})
+    runner = run(tmp_path, resume="auto", batch=after, **schedule)
+    rows = map(json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines())
+    rates = {row["step"]: row["lr"] for row in rows}
+    first = -(-37 // before) * 3
+    steps = -(-37 // after)
+    assert list(rates)[first:] == list(range(first + 1, first + steps + 1))
+    peak = runner.options.learning_rate
+    done = (3 * steps + np.arange(steps)) / (4 * steps)
+    expected = 0.5 * peak * (1 + np.cos(np.pi * done))
+    np.testing.assert_allclose(list(rates.values())[first:], expected, rtol=1e-6)
+    assert runner.total_steps == first + steps
 
 
 def other_run(work_dir, left):

@@ -58,6 +58,13 @@ def test_step_based_takes_the_rates_as_they_are():
     assert found == [3e-4] * 5 + [1e-4] * 4 + [1e-5]
 
 
+@pytest.mark.parametrize("percent", range(1, 100))
+def test_step_based_changes_at_the_very_step(percent):
+    """0.07 * 100 is 7.000000000000001: the rate changed a step late."""
+    found = rates("step-based", total=100, lr_schedule={0: 1.0, percent / 100: 2.0})
+    assert found == [1.0] * percent + [2.0] * (100 - percent)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -68,6 +75,8 @@ def test_step_based_takes_the_rates_as_they_are():
         ({"kind": "step-based", "lr_schedule": {0.5: 1}}, r"0 among them, got \[0\.5\]"),
         ({"kind": "step-based", "lr_schedule": {}}, r"0 among them, got \[\]"),
         ({"kind": "step-based", "lr_schedule": {"x": 1}}, "maps ratios to rates"),
+        ({"kind": "step-based", "lr_schedule": {0: -0.1}}, r"rates from 0 up, got \[-0\.1\]"),
+        ({"kind": "step-based", "lr_schedule": {0: 1, 1: math.nan}}, "rates from 0 up"),
         (
             {"kind": "step-based", "lr_schedule": {0: 1}, "warmup_ratio": 0.1},
             "'step-based' has no warm-up",

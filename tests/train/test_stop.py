@@ -94,13 +94,14 @@ def ranks(folder):
     world = distributed.start("cpu")
     with StopRequest(world) as request:
         seen = [request.wanted(1)]
+        request.pace(stop.NOTICE_S / 3)
         if world.rank == 1:
             os.kill(os.getpid(), signal.SIGTERM)
-        seen.append(request.wanted(2))
+        seen += [request.wanted(2), request.asked(), request.wanted(3)]
     (folder / str(world.rank)).write_text(str(seen))
     distributed.stop(world)
 
 
 def test_all_ranks_stop_when_one_is_asked(tmp_path):
     assert run_ranks(2, ranks, tmp_path) == [0, 0]
-    assert [(tmp_path / str(r)).read_text() for r in range(2)] == ["[0, 15]", "[0, 15]"]
+    assert [(tmp_path / str(r)).read_text() for r in range(2)] == ["[0, 0, 15, 15]"] * 2

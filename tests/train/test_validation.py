@@ -28,7 +28,7 @@ from fluxvla_core.testing.training import (
     train_all,
     unflushed,
 )
-from fluxvla_core.train.validation import share_statistics
+from fluxvla_core.train.validation import Validation, share_statistics
 from fluxvla_core.train.weights import load_for_inference
 
 
@@ -156,6 +156,117 @@ def test_a_stop_does_not_wait_for_it_and_the_run_that_goes_on_makes_up_for_it(tm
     assert (tmp_path / "cut/metrics.jsonl").read_text().count("\n") == before == 8
 
 
+class Faulty(Held):
+    """Does ``fault`` at the ``nth`` sample that is read on ``rank``; fits in five batches of 4."""
+
+    def __init__(self, fault=None, nth=0, rank=0):
+        super().__init__(20)
+        self.fault, self.nth, self.rank, self.read = fault, nth, rank, 0
+
+    def __repr__(self):
+        return "Faulty"
+
+    def get_sample(self, index, epoch):
+        mine = self.rank == int(os.environ.get("RANK", "0"))
+        sample = super().get_sample(index, epoch)
+        self.read += mine
+        if self.read == self.nth and mine:
+            self.fault(sample)
+        return sample
+
+
+def terminate(sample):
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def unreadable(sample):
+    raise OSError(5, "Input/output error")
+
+
+def spoil(sample):
+    sample["states"][:] = np.nan
+
+
+def owed(work_dir):
+    return latest(work_dir).json("trainer.json")["validation"].get("owed")
+
+
+@pytest.mark.parametrize("step", [4, 8])
+def test_a_stop_ends_it_after_a_batch_and_the_run_that_goes_on_is_the_same(tmp_path, step):
+    settings = {"val_iter_interval": 4, "ema_decay": 0.9, "save_iter_interval": 2}
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    run(whole, val={"dataset": Faulty()}, **settings)
+    held = Faulty(terminate, (6 if step == 4 else 20 + 6))
+    with pytest.raises(RunFailed, match=f"step {step} in"):
+        run(cut, val={"dataset": held}, **settings)
+    assert held.read == (8 if step == 4 else 20 + 8)
+    assert (latest(cut).step, owed(cut)["global_step"]) == (step, step)
+    again = Faulty(terminate, 1)
+    with pytest.raises(RunFailed, match=f"step {step} in"):
+        run(cut, "auto", val={"dataset": again}, **settings)
+    assert again.read == 4
+    assert (latest(cut).step, owed(cut)["global_step"]) == (step, step)
+    run(cut, "auto", val={"dataset": Faulty()}, **settings)
+    # The checkpoint of the stop tells that it was one; nothing else differs.
+    assert differences(whole, cut) == [f"step-{step:09d}/trainer.json"]
+    links = [os.readlink(d / "checkpoints/best") for d in (whole, cut)]
+    assert links[0] == links[1]
+
+
+@pytest.mark.parametrize("kind", ["DDPTrainRunner", "FSDPTrainRunner"])
+def test_a_stop_of_one_rank_ends_it_on_all(tmp_path, kind):
+    table = {"type": kind, "max_steps": 4, "ema_decay": 0.9, "max_keep_ckpts": 0}
+    config = tiny_config({**table, "val_iter_interval": 2, "save_iter_interval": 2}, batch=2)
+
+    def settings(name, dataset, resume=None, **other):
+        runner = {**config["runner"], **other}
+        held = {**config, "runner": runner, "val_dataloader": {"dataset": dataset}}
+        return {"config": held, "work_dir": str(tmp_path / name), "resume": resume}
+
+    assert run_ranks(2, train, settings("cut", Faulty(terminate, 3, rank=1))) == [1, 1]
+    assert owed(tmp_path / "cut")["global_step"] == 2
+    # Elsewhere the ranks have to agree on what there is to save: with this rate nothing gets
+    # better, so that the best is the first one that they know of there.
+    rare = {"val_iter_interval": 3, "save_iter_interval": 9, "learning_rate": 9.0, "ema_decay": 0.1}
+    first = [str(tmp_path / name / "checkpoints/step-000000002") for name in ("whole", "cut")]
+    rest = [
+        settings("whole", Faulty()),
+        settings("cut", Faulty(), "auto"),
+        settings("known", Faulty(), first[0], **rare),
+        settings("owed", Faulty(), first[1], **rare),
+    ]
+    assert run_ranks(2, train_all, *rest, timeout=120.0) == [0, 0]
+    assert differences(tmp_path / "whole", tmp_path / "cut") == ["step-000000002/trainer.json"]
+    assert os.readlink(tmp_path / "known/checkpoints/best") == "step-000000003"
+    assert os.readlink(tmp_path / "owed/checkpoints/best") == "step-000000002"
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"), [(spoil, "the validation loss is nan at step 8"), (unreadable, "Input/out")]
+)
+def test_one_that_fails_takes_no_checkpoint_with_it(tmp_path, fault, error):
+    settings = {"val_iter_interval": 4, "ema_decay": 0.9}
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    run(whole, val={"dataset": Faulty()}, **settings)
+    with pytest.raises((RunFailed, OSError), match=error):
+        run(cut, val={"dataset": Faulty(fault, 20 + 6)}, **settings)
+    assert owed(cut)["global_step"] == 8
+    run(cut, "auto", val={"dataset": Faulty()}, **settings)
+    assert differences(whole, cut) == ["step-000000008/trainer.json"]
+    links = [os.readlink(d / "checkpoints/best") for d in (whole, cut)]
+    assert links[0] == links[1]
+
+
+@pytest.mark.parametrize(("fault", "saved"), [(spoil, 1), (unreadable, 0)])
+def test_one_that_fails_on_one_rank_keeps_no_other_waiting(tmp_path, fault, saved):
+    """All ranks find a loss that is not finite; of a sample that one cannot read none saves."""
+    config = tiny_config({"type": "DDPTrainRunner", "max_steps": 2}, batch=2)
+    config["val_dataloader"] = {"dataset": Faulty(fault, 3, rank=1)}
+    settings = {"config": config, "work_dir": str(tmp_path)}
+    assert run_ranks(2, train, settings, timeout=90.0) == [1, 1]
+    assert len(folders(tmp_path)) == saved
+
+
 @VLAS.register_module()
 class NoisyVLA(TinyVLA):
     """Draws noise in its forward pass, in training and in validation."""
@@ -219,6 +330,77 @@ def test_a_run_that_goes_on_knows_the_best_one(tmp_path):
     assert links[0] == links[1]
 
 
+def says(monkeypatch, **losses):
+    """Let the validation of ``step_N`` say its loss."""
+    monkeypatch.setattr(Validation, "loss", lambda _, run: losses[f"step_{run.progress.step}"])
+
+
+def test_a_best_one_that_was_lost_is_no_longer_the_one_to_beat(tmp_path, monkeypatch):
+    """Removed in favour of step 6, which is damaged: neither that name nor that loss counts."""
+    settings = {"val_iter_interval": 2, "save_iter_interval": 2, "max_keep_ckpts": 2}
+    says(monkeypatch, step_2=1.0, step_4=2.0, step_6=0.5)
+    run(tmp_path, max_steps=6, **settings)
+    damaged = folders(tmp_path)[-1] / "model.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    says(monkeypatch, step_6=8.0, step_8=9.0, step_10=9.5)
+    again = run(tmp_path, "auto", max_steps=10, **settings)
+    assert os.readlink(tmp_path / "checkpoints/best") == "step-000000006"
+    assert (again.progress.best_step, again.progress.best) == (6, 8.0)
+    assert [p.name for p in folders(tmp_path)] == [f"step-{n:09d}" for n in (6, 8, 10)]
+
+
+def test_no_best_one_is_named_before_there_is_one(tmp_path, monkeypatch):
+    """Of the run that was left behind the link would be, and then name this run's step 4."""
+    says(monkeypatch, step_4=1.0)
+    run(tmp_path, max_steps=4, save_iter_interval=2, val_iter_interval=4)
+    earlier = str(folders(tmp_path)[0])
+    again = run(tmp_path, earlier, max_steps=4, val_iter_interval=4)
+    assert os.readlink(tmp_path / "checkpoints/best") == "step-000000004"
+    assert latest(tmp_path).path.resolve() == (tmp_path / "checkpoints/best").resolve()
+    plain = make(tmp_path, earlier, max_steps=4)
+    plain.val_options = None
+    plain.run_setup(37)
+    plain.run(TinyDataset())
+    assert not (tmp_path / "checkpoints/best").is_symlink()
+    assert again.progress.best_step == 4
+
+
+def test_what_was_set_aside_does_not_know_the_ones_that_took_its_place(tmp_path, monkeypatch):
+    settings = {"val_iter_interval": 2, "save_iter_interval": 2}
+    says(monkeypatch, step_2=1.0, step_4=0.5, step_6=2.0, step_8=3.0)
+    run(tmp_path, max_steps=6, **settings)
+    run(tmp_path, str(folders(tmp_path)[0]), max_steps=6, **settings)
+    aside = tmp_path / "checkpoints/step-000000006.set-aside"
+    run(tmp_path, str(aside), max_steps=8, **settings)
+    assert os.readlink(tmp_path / "checkpoints/best") == "step-000000008"
+
+
+def test_in_another_work_dir_the_best_one_is_one_of_its_own(tmp_path, monkeypatch):
+    settings = {"val_iter_interval": 2, "save_iter_interval": 2}
+    says(monkeypatch, step_2=1.0, step_4=2.0)
+    run(tmp_path / "a", max_steps=4, **settings)
+    says(monkeypatch, step_6=3.0, step_8=4.0)
+    again = run(tmp_path / "b", str(latest(tmp_path / "a").path), max_steps=8, **settings)
+    assert os.readlink(tmp_path / "b/checkpoints/best") == "step-000000006"
+    assert again.progress.best_step == 6
+
+
+def test_one_that_is_made_up_for_in_another_work_dir_is_kept_there(tmp_path, monkeypatch):
+    settings = {"val_iter_interval": 4, "learning_rate": 0.3}
+    cut = make(tmp_path / "a", **settings)
+    cut.run_setup(37)
+    with pytest.raises(RunFailed, match="step 4 in"):
+        cut.run(Stopping(4))
+    place = str(latest(tmp_path / "a").path)
+    with pytest.raises(RunFailed, match="step 4 in"):
+        run(tmp_path / "b", place, val={"dataset": Faulty(terminate, 1)}, **settings)
+    assert owed(tmp_path / "b")["global_step"] == 4
+    says(monkeypatch, step_4=1.0, step_8=2.0)
+    run(tmp_path / "c", place, **settings)
+    assert os.readlink(tmp_path / "c/checkpoints/best") == "step-000000004"
+    Checkpoint.open(tmp_path / "c/checkpoints/best").verify()
+
+
 def test_no_better_loss_for_long_enough_ends_the_run(tmp_path):
     """O3 of the field notes: no early stop."""
     settings = {"val_iter_interval": 1, "learning_rate": 3.0, "early_stop_patience": 2}
@@ -236,6 +418,7 @@ def test_no_better_loss_for_long_enough_ends_the_run(tmp_path):
 def test_a_loss_that_is_not_finite_is_told(tmp_path):
     with pytest.raises(RunFailed, match="the validation loss is nan at step 3"):
         run(tmp_path, val_iter_interval=3, model={"bad_sample": 104})
+    assert folders(tmp_path) == []
 
 
 def test_workers_and_a_batch_size_of_its_own(tmp_path):

@@ -169,3 +169,28 @@ def test_aliases_header_is_plain_json(tmp_path):
     data = (saved.path / "model.safetensors").read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     assert header["__metadata__"] == {"format": "pt", "aliases": "{}"}
+
+
+class Tied(nn.Module):
+    """Words that go in and come out by the same weights."""
+
+    def __init__(self, seed=0):
+        super().__init__()
+        torch.manual_seed(seed)
+        self.embed = nn.Linear(4, 4, bias=False)
+        self.head = nn.Linear(4, 4, bias=False)
+        self.head.weight = self.embed.weight
+
+
+def test_averages_of_tied_weights_act_under_both_names(tmp_path):
+    """The averages have their first name only; under the second stood what was not averaged."""
+    model = Tied()
+    ema = Ema(dict(model.named_parameters()), 0.5)
+    with torch.no_grad():
+        model.embed.weight.add_(1.0)
+    ema.update(1)
+    acts = Tied(seed=1)
+    load_for_inference(acts, checkpoint(tmp_path, model, left_out(model), ema))
+    assert acts.head.weight is acts.embed.weight
+    assert torch.equal(acts.head.weight, ema.shadow["embed.weight"])
+    assert not torch.equal(acts.head.weight, model.head.weight)

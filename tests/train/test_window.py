@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import types
+
 import pytest
 import torch
 
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import run_ranks
 from fluxvla_core.train import distributed
+from fluxvla_core.train import window as window_module
 from fluxvla_core.train.distributed import World
 from fluxvla_core.train.window import Window
 
@@ -30,15 +33,64 @@ def test_losses_are_means_over_the_batches_of_a_step():
     assert window.fetch() == []
 
 
-def test_times_add_up_and_a_save_is_left_out():
+class Clock:
+    """Stands still unless a test moves it."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        fixed = types.SimpleNamespace(perf_counter=lambda: self.now)
+        monkeypatch.setattr(window_module, "time", fixed)
+
+
+def test_times_add_up_and_a_save_is_left_out(monkeypatch):
+    clock = Clock(monkeypatch)
     window = Window(ONE, began=0.0)
-    window._pending.clear()
-    add(window, 1, 1.0, wait=0.25)
-    window._pending[0].ended = 2.0
-    (record,) = window.fetch()
-    assert (record.step_time, record.data_wait, record.samples_per_s) == (2.0, 0.25, 4.0)
+    for step, seconds, wait in ((1, 2.0, 0.25), (2, 4.0, 0.0)):
+        clock.now += seconds
+        add(window, step, 1.0, wait=wait)
+    clock.now += 1.0  # what fetching takes is the last step's
+    first, second = window.fetch()
+    assert (first.step_time, first.data_wait, first.samples_per_s) == (2.0, 0.25, 4.0)
+    assert (second.step_time, second.data_wait, second.samples_per_s) == (5.0, 0.0, 1.6)
+    clock.now += 100.0
     window.restart_clock()
-    assert window.began > 2.0
+    clock.now += 2.0
+    add(window, 3, 1.0)
+    assert window.fetch()[0].step_time == 2.0
+
+
+class OnDevice(torch.Tensor):
+    """Of a device that computes while the host goes on; fetching it waits."""
+
+    clock: Clock
+    done = 0.0
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        if func is torch.Tensor.cpu:
+            cls.clock.now = max(cls.clock.now, cls.done)
+        return super().__torch_function__(func, types, args, kwargs or {})
+
+
+def test_a_host_that_runs_ahead_of_its_device_tells_the_devices_time(monkeypatch):
+    """The host takes 1 s for a step, the device 10 s."""
+    clock = OnDevice.clock = Clock(monkeypatch)
+    OnDevice.done = 0.0
+    window = Window(World(0, 1, 0, torch.device("meta")), began=0.0)
+    found = []
+    for step in range(1, 9):
+        clock.now += 1.0
+        OnDevice.done = max(OnDevice.done, clock.now) + 10.0
+        loss = torch.tensor(1.0).as_subclass(OnDevice)
+        wait = 1.0 if step == 1 else 0.0
+        window.add(step, 0.0, 1e-3, [loss], [None], torch.tensor(1.0), 8, wait)
+        if step % 4 == 0:
+            found += window.fetch()
+            window.restart_clock()  # as after a save
+    assert sum(record.step_time for record in found) == clock.now == 82.0
+    assert {record.step_time for record in found} == {10.25}
+    assert {record.samples_per_s for record in found} == {8 / 10.25}
+    assert [record.data_wait for record in found] == [0.25] * 4 + [0.0] * 4
 
 
 def test_a_strategy_that_tells_no_norm_has_none():

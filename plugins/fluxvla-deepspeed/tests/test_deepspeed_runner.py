@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from importlib.util import find_spec
 
 import pytest
@@ -33,7 +34,7 @@ class TestDeepSpeedTrainRunner(TrainRunnerConformance):
     entry_point = "DeepSpeedTrainRunner"
 
 
-def config(batch=2, **settings):
+def config(batch=2, centred=False, **settings):
     table = {
         "max_steps": 6,
         "save_iter_interval": 3,
@@ -43,7 +44,7 @@ def config(batch=2, **settings):
         "lr_scheduler_type": "linear-warmup+cosine-decay",
         **settings,
     }
-    return tiny_config(table, batch, dropout=0.0)
+    return tiny_config(table, batch, dropout=0.0, centred=centred)
 
 
 def every_stage(work_dir, stages=STAGES):
@@ -56,6 +57,10 @@ def every_stage(work_dir, stages=STAGES):
             resume = None if before is None else str(folders(work_dir / before)[0])
             run = {"config": config(**table), "work_dir": str(work_dir / name), "resume": resume}
             train(run)
+        for part, before in {"centred": None, "centred-on": "centred"}.items():
+            resume = before and str(folders(work_dir / f"{stage}-{before}")[0])
+            run = {"config": config(centred=True, **table), "resume": resume}
+            train({**run, "work_dir": str(work_dir / f"{stage}-{part}")})
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +75,29 @@ def runs(tmp_path_factory):
     return work_dir
 
 
+def alone(work_dir):
+    """One process that nobody launched, on from a run with a layer that never had a gradient."""
+    for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE"):
+        os.environ.pop(name, None)
+    resume = str(folders(work_dir / "spare")[0])
+    config = spared(type="DeepSpeedTrainRunner")
+    run = {"config": config, "work_dir": str(work_dir / "spare-on"), "resume": resume}
+    train(run)
+
+
+def spared(**table):
+    settings = {"max_steps": 6, "save_iter_interval": 3, **table}
+    return tiny_config(settings, 4, dropout=0.0, spare=True)
+
+
+@installed
+def test_one_process_that_nobody_launched_goes_on_with_what_state_there_is(tmp_path):
+    """``fluxvla run`` as it is; ``spare`` has no moments in the checkpoint of the run before."""
+    train({"config": spared(type="OneProcessRunner"), "work_dir": str(tmp_path / "spare")})
+    assert run_ranks(1, alone, tmp_path) == [0]
+    assert gap(tmp_path / "spare", tmp_path / "spare-on") < 1e-5
+
+
 def gap(a, b):
     ours, theirs = (latest(d).tensors("model.safetensors") for d in (a, b))
     assert ours.keys() == theirs.keys()
@@ -78,8 +106,10 @@ def gap(a, b):
 
 @installed
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_goes_on_bit_for_bit(runs, stage):
-    whole, on = (latest(runs / d).path for d in (f"{stage}", f"{stage}-on"))
+@pytest.mark.parametrize("kind", ["", "-centred"])
+def test_a_stage_goes_on_bit_for_bit(runs, stage, kind):
+    """With buffers that every process changes by its own batches too."""
+    whole, on = (latest(runs / d).path for d in (f"{stage}{kind}", f"{stage}{kind}-on"))
     assert checkpoint_differences(whole, on) == []
 
 

@@ -52,15 +52,20 @@ def rotate(
     return removed
 
 
-def name_best(work_dir: Path, step: int) -> None:
-    """Let ``checkpoints/best`` point to the checkpoint of ``step``, if that is there."""
+def name_best(work_dir: Path, step: int) -> bool:
+    """Let ``checkpoints/best`` point to the checkpoint of ``step``; whether that is there.
+
+    Without it there is no ``best``: an old link would name whatever takes its target's name next.
+    """
     link = work_dir / FOLDER / BEST
     if not (link.parent / step_name(step)).is_dir():
-        return
+        link.unlink(missing_ok=True)
+        return False
     aside = link.with_name(f".{BEST}.{os.getpid()}")
     aside.unlink(missing_ok=True)
     aside.symlink_to(step_name(step))
     os.replace(aside, link)
+    return True
 
 
 def set_aside_later(work_dir: Path, step: int, disk: Disk | None = None) -> list[Path]:

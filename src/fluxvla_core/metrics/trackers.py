@@ -64,8 +64,9 @@ class TensorboardTracker:
         from torch.utils.tensorboard import SummaryWriter
 
         place = os.environ.get("TENSORBOARD_LOG_PATH") or str(run_dir / "tensorboard")
-        # Steps that a resumed run does again replace what was shown for them.
-        self._writer: Any = SummaryWriter(place, purge_step=step + 1 if step else None)
+        # Steps that a resumed run does again, or one that begins anew in the folder of a run that
+        # was killed before its first checkpoint, replace what was shown for them.
+        self._writer: Any = SummaryWriter(place, purge_step=step + 1)
 
     def log(self, step: int, values: Values) -> None:
         for name, value in values.items():
@@ -116,7 +117,7 @@ class TrackioTracker:
             import trackio
 
             self._trackio: Any = trackio
-            trackio.init(
+            run: Any = trackio.init(
                 project=os.environ.get("TRACKIO_PROJECT", "fluxvla"),
                 name=f"{run_id}-{_identity('trackio', run_dir, step)}",
                 config=json.loads(json.dumps(dict(hparams), default=str)),
@@ -125,8 +126,13 @@ class TrackioTracker:
                 auto_log_cpu=False,
                 auto_log_gpu=False,
             )
+        # It cannot replace a step, and would show one that a resumed run does again twice. Only it
+        # knows what it has kept of the steps before a kill.
+        self._first: int = getattr(run, "_next_step", 0)
 
     def log(self, step: int, values: Values) -> None:
+        if step < self._first:
+            return
         self._trackio.log({f"train/{name}": value for name, value in values.items()}, step=step)
 
     def sync(self) -> None:

@@ -62,10 +62,17 @@ class TinyVLA(nn.Module):
     Args:
         bad_sample: id of a sample whose loss is NaN; -1 for none.
         spare: have a layer that the forward pass does not use.
+        centred: subtract a running mean of the states, a buffer that follows from the batches of
+            its own process: how samples are shared between processes then shows in the loss.
     """
 
     def __init__(
-        self, width: int = 8, dropout: float = 0.1, bad_sample: int = -1, spare: bool = False
+        self,
+        width: int = 8,
+        dropout: float = 0.1,
+        bad_sample: int = -1,
+        spare: bool = False,
+        centred: bool = False,
     ) -> None:
         super().__init__()
         self.encoder = nn.Linear(STATES, width).requires_grad_(False)
@@ -75,12 +82,14 @@ class TinyVLA(nn.Module):
         self.bad_sample = bad_sample
         self.batches: Tensor
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
+        self.mean: Tensor | None
+        self.register_buffer("mean", torch.zeros(STATES) if centred else None)
 
     def forward(
         self, states: Tensor, actions: Tensor, noise: Tensor, sample_ids: Tensor
     ) -> dict[str, Tensor]:
         """``(B, 6)``, ``(B, 2, 3)``, ``(B, 2, 3)``, ``(B,)`` -> ``{"loss": scalar}``."""
-        x = self.encoder(states)
+        x = self.encoder(states if self.mean is None else self._centre(states, self.mean))
         for block in self.blocks:
             x = block(x)
         found = self.head(x).unflatten(1, (HORIZON, ACTIONS))
@@ -90,6 +99,12 @@ class TinyVLA(nn.Module):
         if self.training:
             self.batches += 1
         return {"loss": loss}
+
+    def _centre(self, states: Tensor, mean: Tensor) -> Tensor:
+        if self.training:
+            with torch.no_grad():
+                mean.lerp_(states.mean(0), 0.1)
+        return states - mean
 
     @property
     def action_shape(self) -> tuple[int, int]:

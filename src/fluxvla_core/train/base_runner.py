@@ -193,8 +193,9 @@ class BaseTrainRunner(TrainRun):
     def _build_vla(self) -> nn.Module:
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
         from fluxvla_core.train import flops, forward, lora
+        from fluxvla_core.train.distributed import on_first
         from fluxvla_core.train.state import seed_all
-        from fluxvla_core.train.weights import base_of, start_from
+        from fluxvla_core.train.weights import base_of, base_to_note, exact_place, start_from
 
         self._prepare()
         if "model" not in self.cfg:
@@ -209,10 +210,13 @@ class BaseTrainRunner(TrainRun):
         # A run that goes on finds all weights in its checkpoint, but for an adapter's base.
         place = base_of(before, options.init_from) if before is not None else options.init_from
         if place is not None:
-            found = start_from(vla, place)
+            # Found once: ranks that looked one after the other could find different ones.
+            wanted = place
+            found = start_from(vla, on_first(self.world, lambda: exact_place(wanted)))
             if self.lora is not None:
                 vla.__dict__["frozen_source"] = str(found)
         if self.lora is not None:
+            self.adapter_base = base_to_note(before, options.init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
         self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:

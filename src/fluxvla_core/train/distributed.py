@@ -15,21 +15,34 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributed import PrefixStore  # type: ignore[attr-defined]
 from torch.distributed.rendezvous import rendezvous
 
 from fluxvla_core import errors
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 
+# As gloo, c10d's store and NCCL's process group word it; the system's own words come through them.
 _LOST = (
-    "connection closed",
-    "connection reset",
+    "connection closed by peer",
+    "connection was likely closed",
+    "connection reset by peer",
     "connection refused",
+    "connection timed out",
     "broken pipe",
-    "timed out",
+    "socket closed",
+    "socket unexpectedly closed",
+    "socket timeout",
+    "client socket has timed out",
+    "client socket has failed to connect",
+    "timed out waiting",
+    "operation timed out",
+    "seconds waiting for clients",
+    "wait timeout after",
+    "application timeout caused pair closure",
+    "collective operation timeout",
+    "nccl communicator was aborted",
     "nccl error",
-    "socket",
 )
 
 
@@ -203,10 +216,35 @@ def on_first(world: World, work: Callable[[], str]) -> str:
     return str(told["answer"])
 
 
+def share_buffers(world: World, model: nn.Module) -> None:
+    """Let all ranks have the first one's saved buffers; for a strategy's ``_update`` to end with.
+
+    Each rank changes them by its own batches (batch-norm statistics, a running normaliser), and a
+    run goes on with the first one's. Once the step is done they are the same for what may come
+    next: another step, a validation, a checkpoint. DDP does so by itself.
+    """
+    if world.size == 1:
+        return
+    # By name each time: a model may put another tensor in a buffer's place.
+    buffers = [
+        buffer.detach()
+        for module in model.modules()
+        for name, buffer in module.named_buffers(recurse=False)
+        if name not in module._non_persistent_buffers_set
+    ]
+    for buffer in buffers:
+        sent = buffer.contiguous()
+        dist.broadcast(sent, 0)
+        if sent is not buffer:
+            buffer.copy_(sent)
+
+
 def explain(error: Exception, world: World, step: int) -> RunFailed | None:
     """What a broken collective operation means; None if ``error`` is about something else."""
-    text = str(error).lower()
-    if world.size == 1 or not any(sign in text for sign in _LOST):
+    text = str(error).strip().lower()
+    # A loader worker's error comes with its traceback; an OSError is of this machine's own.
+    elsewhere = text.startswith("caught ") or isinstance(error, OSError)
+    if world.size == 1 or elsewhere or not any(sign in text for sign in _LOST):
         return None
     return RunFailed(
         f"rank {world.rank} of {world.size} lost another rank during step {step}",

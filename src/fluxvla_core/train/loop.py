@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from typing import Any
 
+import torch.distributed as dist
+
+from fluxvla_core.checkpoints.checkpoint import FOLDER, step_name
 from fluxvla_core.checkpoints.shelf import name_best
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.train.batches import StepSampler
+from fluxvla_core.train.distributed import agree
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.forward import IDS, ForwardArguments, to_device
 from fluxvla_core.train.memory import GB, peak_bytes
@@ -21,7 +25,7 @@ from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.state import take_seed
 from fluxvla_core.train.stop import StopRequest
 from fluxvla_core.train.strategy import Strategy
-from fluxvla_core.train.validation import Validation
+from fluxvla_core.train.validation import NotFinite, Validation
 from fluxvla_core.train.weights import left_out
 from fluxvla_core.train.window import StepRecord, Window
 
@@ -44,9 +48,9 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     if options.ema_decay is not None:
         run.ema = Ema(trainable(run.model), options.ema_decay)
     run.resume()
-    validation = None if run.val_options is None else Validation(run)
+    take_stock(run)
+    validation = None if run.val_options is None else Validation(run, stop)
     if world.first:
-        name_best(context.work_dir, run.progress.best_step)
         told = run.progress.step - (run.progress.owed is not None)
         run.metric.start(told, context.config)
     sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
@@ -65,6 +69,24 @@ def begin(run: Strategy, dataset: Any, stop: StopRequest) -> StepLoop:
     # Last, so that nothing above has drawn from the generators that are restored.
     restore_rng(world, run._checkpoint, options.seed)
     return loop
+
+
+def take_stock(run: Strategy) -> None:
+    """Forget checkpoints that the resumed one tells of and this work dir does not have.
+
+    The best one may have been removed in favour of a better one that was lost since. Of a
+    checkpoint from elsewhere, neither itself nor the best one before it is here.
+    """
+    progress, world, work_dir = run.progress, run.world, run.context.work_dir
+    elsewhere = lost = False
+    if world.first:
+        here = work_dir / FOLDER / step_name(progress.step)
+        elsewhere = run._checkpoint is None or run._checkpoint.path.resolve() != here.resolve()
+        lost = not name_best(work_dir, -1 if elsewhere else progress.best_step)
+    if agree(world, elsewhere):
+        progress.saved = -1
+    if agree(world, lost):
+        progress.best, progress.best_step = None, -1
 
 
 class StepLoop:
@@ -96,9 +118,8 @@ class StepLoop:
         Returns:
             The signal that asked for a stop, 0 if none did.
         """
-        run, stopped = self._run, 0
-        self._catch_up()
-        if not (finished() or self._enough()):
+        run, stopped = self._run, self._catch_up()
+        if not (stopped or finished() or self._enough()):
             self._look_ahead()
         self._window.restart_clock()
         while not (stopped or finished() or self._enough()):
@@ -115,12 +136,13 @@ class StepLoop:
                 or step == 1
                 or step % run.options.log_iter_interval == 0
             ):
-                found = self._fetch()
-                if stopped and validate:
+                found, better = self._fetch(), False
+                if validate and not stopped:
+                    stopped, better = self._try_validation(found, save)
+                if validate and stopped:
                     # Whoever asks for a stop may kill soon. The run that goes on makes up for it,
                     # and tells of this step then.
                     run.progress.owed = found.pop()
-                better = validate and not stopped and self._validate(found[-1])
                 self._report(found)
                 save = save or better or bool(stopped) or self._enough()
             if save:
@@ -129,15 +151,24 @@ class StepLoop:
                 run.settle_saves(wait=False)
         return stopped
 
-    def _catch_up(self) -> None:
-        """Validate where a stop has left that out, as if there had been no stop."""
+    def _catch_up(self) -> int:
+        """Validate where that was left out, as if it had not been; the signal that ended it."""
         run, owed = self._run, self._run.progress.owed
         if owed is None:
-            return
+            return 0
+        better = False
+        if self._validation is not None:
+            stopped, better = self._validate(owed)
+            if stopped:
+                return stopped
         run.progress.owed = None
-        if self._validation is not None and self._validate(owed) and run.world.first:
-            name_best(run.context.work_dir, run.progress.step)
         self._report([owed])
+        if better:
+            # There already, unless it was another work dir's.
+            self.save()
+            if run.world.first:
+                name_best(run.context.work_dir, run.progress.step)
+        return 0
 
     def _look_ahead(self) -> None:
         """Show the first batch to whoever has to see one before the first step."""
@@ -161,11 +192,33 @@ class StepLoop:
         every = self._run.options.val_iter_interval
         return last or (save if every is None else self._run.progress.step % every == 0)
 
-    def _validate(self, record: dict[str, Any]) -> bool:
-        """Add the validation loss to a step's ``record``; whether it is the best so far."""
+    def _try_validation(self, found: list[dict[str, Any]], save: bool) -> tuple[int, bool]:
+        """Validate the last step of ``found``; if that fails, first do the ``save`` that is due."""
+        run = self._run
+        try:
+            return self._validate(found[-1])
+        except Exception as error:
+            # In a process group the other ranks may know nothing of it, or wait in an exchange,
+            # and sharding may have left the model half gathered.
+            if save and (isinstance(error, NotFinite) or not dist.is_initialized()):
+                run.progress.owed = found.pop()
+                self._report(found)
+                self.save()
+                run.settle_saves()
+            raise
+
+    def _validate(self, record: dict[str, Any]) -> tuple[int, bool]:
+        """Add the validation loss to a step's ``record``.
+
+        Returns:
+            The signal that ended it before there was one, and whether it is the best so far.
+        """
         run = self._run
         assert self._validation is not None
-        loss = record["val_loss"] = self._validation.loss(run)
+        loss = self._validation.loss(run)
+        if loss is None:
+            return self._stop.asked(), False
+        record["val_loss"] = loss
         better = run.progress.validated(loss)
         if self._enough() and run.world.first:
             run.context.reporter.info(
@@ -173,7 +226,7 @@ class StepLoop:
                 f"{run.progress.best_step}) in {run.progress.worse} validations: training ends"
             )
         self._window.restart_clock()
-        return better
+        return 0, better
 
     def close(self) -> None:
         """End the loader's workers now; left to the garbage collector it takes them seconds."""

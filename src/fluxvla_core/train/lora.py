@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.errors import ConfigError
@@ -25,6 +26,7 @@ WEIGHTS = f"{FOLDER}/adapter_model.safetensors"
 CONFIG = f"{FOLDER}/adapter_config.json"
 _PREFIX = "base_model.model."
 _OURS = re.compile(r"\.(?:modules_to_save|lora_\w+)\.default(?=\.|$)")
+_PEFTS = ("base_layer", "lora_dropout")  # what peft puts into every layer that gets an adapter
 
 
 @dataclass(frozen=True)
@@ -135,35 +137,122 @@ def check_installed(where: str | None) -> None:
         )
 
 
-def attach(model: nn.Module, options: LoraOptions, where: str | None = None) -> None:
+def attach(
+    model: nn.Module, options: LoraOptions, where: str | None = None, trained: bool = False
+) -> None:
     """Freeze ``model`` and put trainable adapters into it, drawn from torch's generator.
 
+    Args:
+        trained: the adapter is a checkpoint's: what its names hit in training they hit again.
+
     Raises:
-        ConfigError: no module has such a name, or one is of a kind that takes no adapter.
+        ConfigError: no module has such a name, one is of a kind that takes no adapter or shares
+            its weights with another, or a name hits more than is meant.
     """
     from peft import LoraConfig, inject_adapter_in_model
 
+    _check_found(model, options, where)
+    if not trained:
+        _check_told_apart(model, options.modules_to_save, where)
+    settings = {k: v for k, v in options.for_peft().items() if k != "inference_mode"}
+    tied = _tied(model)
+    try:
+        inject_adapter_in_model(LoraConfig(**settings), model)
+    except (ValueError, TypeError) as error:
+        # Only a module that cannot be trained as a whole is a TypeError to peft.
+        key = "modules_to_save" if isinstance(error, TypeError) else "target_modules"
+        raise ConfigError(
+            f"lora.{key}: {str(error).splitlines()[0]}",
+            where=where,
+            next=f"the model has {_some(model)}",
+        ) from error
+    _check_untied(model, tied, where)
+
+
+def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> None:
     targets = options.target_modules
     for key, ends in (
         ("target_modules", () if isinstance(targets, str) else targets),
         ("modules_to_save", options.modules_to_save),
     ):
         for end in ends:
-            if not any(f".{name}".endswith(f".{end}") for name, _ in model.named_modules()):
+            if not any(_ends(name, end) for name, _ in model.named_modules()):
                 raise ConfigError(
                     f"lora.{key}: no module's name ends in {end!r}",
                     where=where,
                     next=f"the model has {_some(model)}",
                 )
-    settings = {k: v for k, v in options.for_peft().items() if k != "inference_mode"}
-    try:
-        inject_adapter_in_model(LoraConfig(**settings), model)
-    except ValueError as error:
-        raise ConfigError(
-            f"lora.target_modules: {str(error).splitlines()[0]}",
-            where=where,
-            next=f"the model has {_some(model)}",
-        ) from error
+
+
+def _check_told_apart(model: nn.Module, saved: Sequence[str], where: str | None) -> None:
+    # peft takes any module whose name ends so, also in the middle of a part, and its own ones.
+    names = [name for name, _ in model.named_modules(remove_duplicate=False)]
+    for end in saved:
+        others = [n for n in _hit_too(names, end) if not any(_ends(n, meant) for meant in saved)]
+        if others:
+            too = ", or name those too" if set(others) <= set(names) else ""
+            raise ConfigError(
+                f"lora.modules_to_save: {end!r} would also hit {_listed(others)}",
+                where=where,
+                cause="peft trains every module whose name ends in these letters",
+                next=_instead(names, end) + too,
+            )
+
+
+def _hit_too(names: Iterable[str], end: str) -> list[str]:
+    """Modules that peft takes for ``end`` though it is no whole part of their names."""
+    pefts = (f"peft's own {name}" for name in _PEFTS if name.endswith(end))
+    return [*(n for n in names if n.endswith(end) and not _ends(n, end)), *pefts]
+
+
+def _instead(names: Sequence[str], end: str) -> str:
+    """What to write for ``end``: as much of each name as no other module's name ends in."""
+    telling: list[str] = []
+    for name in (n for n in names if _ends(n, end)):
+        parts = name.split(".")
+        tails = (".".join(parts[i:]) for i in reversed(range(len(parts))))
+        tail = next((tail for tail in tails if not _hit_too(names, tail)), None)
+        if tail is None:
+            return f"no name tells {name!r} apart: give it another one in the model"
+        telling.append(repr(tail))
+    return f"write {_listed(telling)} instead"
+
+
+def _check_untied(model: nn.Module, tied: Iterable[tuple[str, str]], where: str | None) -> None:
+    # Merging would change the other layer too, and what is trained as a whole is a copy, which is
+    # no longer the other's when it is loaded. Looked at afterwards: only peft knows what it takes.
+    from peft.tuners.tuners_utils import BaseTunerLayer
+    from peft.utils import ModulesToSaveWrapper
+
+    for name, module in model.named_modules():
+        if not isinstance(module, BaseTunerLayer | ModulesToSaveWrapper):
+            continue
+        for one, other in tied:
+            if _inside(one, name) and not _inside(other, name):
+                whole = isinstance(module, ModulesToSaveWrapper)
+                raise ConfigError(
+                    f"lora.{'modules_to_save' if whole else 'target_modules'}: {name!r} has a "
+                    f"weight that another module uses too: {one} and {other} are one",
+                    where=where,
+                    cause="the one cannot be trained, nor get an adapter, without the other",
+                    next=f"leave {name!r} out, or give it a weight of its own in the model",
+                )
+
+
+def _tied(model: nn.Module) -> list[tuple[str, str]]:
+    """Every two names that one parameter has, both ways round."""
+    named: dict[int, list[str]] = {}
+    for name, parameter in model.named_parameters(remove_duplicate=False):
+        named.setdefault(id(parameter), []).append(name)
+    return [pair for names in named.values() for pair in permutations(names, 2)]
+
+
+def _inside(name: str, module: str) -> bool:
+    return name.startswith(f"{module}.")
+
+
+def _ends(name: str, end: str) -> bool:
+    return f".{name}".endswith(f".{end}")
 
 
 def adapter_names(model: nn.Module) -> dict[str, str]:
@@ -213,7 +302,11 @@ def _peft_name(name: str) -> str:
 
 def _some(model: nn.Module) -> str:
     leaves = [n for n, m in model.named_modules() if n and not any(True for _ in m.children())]
-    return ", ".join(leaves[:8]) + (" …" if len(leaves) > 8 else "")
+    return _listed(leaves)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
 
 
 def _whole(value: object) -> bool:

@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import sys
 
 from fluxvla_core.errors import RunFailed
 
 GB = 1e9
-_DEVICE = ("cuda error: out of memory", "cublas_status_alloc_failed", "cuda out of memory")
-_HOST = ("can't allocate memory", "not enough memory: you tried to allocate")
+_DEVICE = (
+    "cuda error: out of memory",
+    "cuda out of memory",
+    "cuda failure 2 'out of memory'",  # NCCL
+    "cuda failure 'out of memory'",  # NCCL of old
+    "cublas_status_alloc_failed",
+    "cudnn_status_alloc_failed",
+    "cudnn_status_internal_error_device_allocation_failed",  # cuDNN 9
+)
+_HOST = (
+    "can't allocate memory",
+    "cannot allocate memory",
+    "not enough memory: you tried to allocate",
+    "caught memoryerror",  # a loader worker's
+    "unable to allocate",  # numpy, whose error torch cannot make again in the trainer
+)
+# The loader's of shared libraries, about a space of its own.
+_NOT_HOST = "cannot allocate memory in static tls block"
 # torch's words for a loader worker that is gone; signals as strsignal(3) has them.
 _WORKER = re.compile(
     r"dataloader worker \(pid(?:\(s\))? ([\d, ]+)\) "
     r"(?:is killed by signal: ([\w ]+)|exited unexpectedly)"
 )
-_SHARED = ("killed by signal: bus error", "out of shared memory", "unable to write to file </torch")
+_SHARED = (
+    "killed by signal: bus error",
+    "out of shared memory",
+    "unable to write to file </torch",
+    "unable to allocate shared memory(shm)",
+)
 _LESS_HOST = (
     "lower train_dataloader.per_device_num_workers or per_device_batch_size, or set "
     "cache_frames=False in the dataset"
@@ -36,11 +58,9 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
         return _worker_gone(worker, shared, when)
     # By name: the class is torch's, and moved between its versions.
     device = type(error).__name__ == "OutOfMemoryError" or any(s in lower for s in _DEVICE)
-    host = isinstance(error, MemoryError) or any(s in lower for s in _HOST)
-    if not (device or host):
+    if not (device or _of_host(error, lower)):
         return None
     what = "the GPU ran" if device else "this machine ran"
-    cause = text.splitlines()[0][:300] if text else None
     if device:
         advice = (
             "lower train_dataloader.per_device_batch_size and raise runner.grad_accumulation_steps "
@@ -51,9 +71,23 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
         advice = _LESS_HOST
     return RunFailed(
         f"{what} out of memory{when}",
-        cause=cause,
+        cause=_telling(text),
         next=f"{advice}; {_GO_ON}",
     )
+
+
+def _of_host(error: BaseException, lower: str) -> bool:
+    # The system refuses a fork, or to map a file, with an errno.
+    refused = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    said = any(s in lower.replace(_NOT_HOST, "") for s in _HOST)
+    return refused or said or isinstance(error, MemoryError)
+
+
+def _telling(text: str) -> str | None:
+    """The line of an error that says what there was no room for: a worker's ends with it."""
+    lines = text.splitlines()
+    found = [line for line in lines if any(s in line.lower() for s in (*_DEVICE, *_HOST))]
+    return (found[-1:] or lines[:1] or [""])[0].strip()[:300] or None
 
 
 def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFailed:

@@ -23,6 +23,7 @@ from fluxvla_core.train.batches import StepPlan
 from fluxvla_core.train.changes import changed_settings, changed_statistics, plain
 from fluxvla_core.train.distributed import World, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
+from fluxvla_core.train.optim import ScheduledLR
 from fluxvla_core.train.progress import Progress
 from fluxvla_core.train.saving import rng_file
 from fluxvla_core.train.state import rank_seed, seed_all, seeds_of, set_rng_state
@@ -261,11 +262,23 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
         raise CheckpointError(
             f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
         )
-    run.lr_scheduler.load_state_dict(saved["scheduler"])
     if run.ema is not None:
         run.ema.load(checkpoint.tensors(EMA), where)
     run.metric.load_state_dict(saved["metric"])
     run.progress = Progress.from_dict(saved)
+    run.lr_scheduler.load_state_dict(_schedule_state(run, saved))
+
+
+def _schedule_state(run: Strategy, saved: Mapping[str, Any]) -> Any:
+    """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller now.
+
+    The rate follows the part of the run that is done. A count of the old steps would be past the
+    end of fewer, larger ones, and train the rest at a rate of 0.
+    """
+    same = saved["step_samples"] == run.plan.step_samples
+    if same or not isinstance(run.lr_scheduler, ScheduledLR):
+        return saved["scheduler"]
+    return {"step": run.planned_step}
 
 
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:

@@ -53,6 +53,7 @@ class TrainRun:
     dataset: Any = None
     ema: Ema | None = None
     left_out: LeftOut | None = None
+    adapter_base: str | None = None
     flops: Meter | None = None
     sample_losses: Tensor | None = None
     _world: World | None = None
@@ -95,8 +96,10 @@ class TrainRun:
                 number = self._run_step_based() if steps else self._run_epoch_based()
                 self.loop.save()
                 self.settle_saves()
+                # Too late to leave anything out here, but nothing is to be begun after this.
+                self.late_stop = stop.asked()
             outcome = "interrupted" if number else "ok"
-        except (RuntimeError, MemoryError) as error:
+        except (RuntimeError, MemoryError, OSError) as error:
             step = self.progress.step + 1
             known = memory.explain(error, step) or distributed.explain(error, self.world, step)
             if known is None:
@@ -167,8 +170,14 @@ class TrainRun:
 
     @property
     def total_steps(self) -> int:
-        """Optimizer steps of the whole run."""
-        return self._total(self.plan)
+        """Optimizer steps of the whole run: those done, which may have been of another size, and
+        those left."""
+        return self.progress.step + self._steps_left()
+
+    @property
+    def planned_step(self) -> int:
+        """Which of the steps that the schedule was made for comes next."""
+        return self._total(self.plan) - self._steps_left()
 
     def _prepare(self) -> None:
         """Join the other ranks, take over the work dir, choose a checkpoint to go on from."""
@@ -219,6 +228,14 @@ class TrainRun:
 
     def _total(self, plan: StepPlan) -> int:
         return self.max_steps or plan.steps_per_epoch * (self.max_epochs or 0)
+
+    def _steps_left(self) -> int:
+        if self.max_steps is not None:
+            return max(0, self.max_steps - self.progress.step)
+        cursor = self.progress.cursor
+        epochs = (self.max_epochs or 0) - cursor.epoch
+        after = (epochs - 1) * self.plan.steps_per_epoch
+        return self.plan.steps_left(cursor) + after if epochs > 0 else 0
 
     def _steps_due(self) -> bool:
         every = self.options.save_steps

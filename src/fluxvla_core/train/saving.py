@@ -165,7 +165,7 @@ def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool)
     elsewhere = {*without.names, *adapter}
     documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
     if run.lora is not None:
-        documents[lora.CONFIG] = run.lora.for_peft(run.options.init_from)
+        documents[lora.CONFIG] = run.lora.for_peft(run.adapter_base)
     trainer = {
         **run.progress.to_dict(),
         "train_loss": train_loss,

@@ -35,7 +35,8 @@ def make_schedule(
         lr_schedule: for ``step-based``: part of the run done -> rate from there on; has 0.
 
     Raises:
-        ConfigError: an unknown kind, a ratio out of 0..1, or ``lr_schedule`` without 0.
+        ConfigError: an unknown kind, a ratio out of 0..1, ``lr_schedule`` without 0 or with a
+            rate that is negative or no number.
     """
     if kind not in TYPES:
         raise ConfigError(f"lr_scheduler_type {kind!r} is none of {', '.join(map(repr, TYPES))}")
@@ -85,8 +86,11 @@ def _stepped(table: Mapping[Any, float], total: int) -> Schedule:
         raise ConfigError(
             f"lr_schedule needs ratios from 0 to 1 with 0 among them, got {[p[0] for p in points]}"
         )
+    if not all(math.isfinite(lr) and lr >= 0 for _, lr in points):
+        raise ConfigError(f"lr_schedule needs rates from 0 up, got {[p[1] for p in points]}")
 
     def rate(step: int) -> float:
-        return next(lr for ratio, lr in reversed(points) if step >= ratio * total)
+        # 0.07 * 100 is a little more than 7.
+        return next(lr for ratio, lr in reversed(points) if step >= round(ratio * total, 6))
 
     return rate

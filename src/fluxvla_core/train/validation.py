@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,9 +17,14 @@ from fluxvla_core.train.distributed import total
 from fluxvla_core.train.forward import to_device
 from fluxvla_core.train.pictures import source
 from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
+from fluxvla_core.train.stop import StopRequest
 
 if TYPE_CHECKING:
     from fluxvla_core.train.strategy import Strategy
+
+
+class NotFinite(RunFailed):
+    """A validation loss that is no number; every rank raises it at the same place."""
 
 
 class Validation:
@@ -28,11 +34,16 @@ class Validation:
     time. They are normalised by the statistics of the training data. The ranks share them; as in
     training, the last batch is filled up with the first samples. What the model itself draws is
     the same every time too: it follows from the run's seed and the rank.
+
+    Args:
+        run: whose weights it is of.
+        stop: asked after every batch.
     """
 
-    def __init__(self, run: Strategy) -> None:
+    def __init__(self, run: Strategy, stop: StopRequest) -> None:
         options = run.val_options
         assert options is not None
+        self._stop = stop
         table = run.context.config["val_dataloader"]["dataset"]
         self._dataset = build_dataset_from_cfg(table, run.context)
         share_statistics(run.dataset, self._dataset)
@@ -55,34 +66,47 @@ class Validation:
             seed=run.options.seed,
         )
 
-    def loss(self, run: Strategy) -> float:
+    def loss(self, run: Strategy) -> float | None:
         """Mean loss over the samples and all ranks, of the averaged weights if they are kept.
 
-        Leaves weights and random generators as they were.
+        None if a stop was asked for meanwhile. Leaves weights and random generators as they were,
+        also when it fails.
 
         Raises:
-            RunFailed: it is not finite.
+            NotFinite: it is not finite.
         """
-        drawn = rng_state()
-        seed_all(rank_seed(run.options.seed, run.world.rank))
-        run.vla.eval()
-        with run.ema.in_place() if run.ema is not None else nullcontext(), torch.no_grad():
-            losses = [
-                run._training_step(to_device(batch, run.world.device)) for batch in self._loader
-            ]
+        losses = []
+        with acting(run):
+            # Every rank has as many batches, so all ask equally often.
+            for batch in self._loader:
+                losses.append(run._training_step(to_device(batch, run.world.device)))
+                if self._stop.asked():
+                    return None
             found = torch.stack(losses).double().cpu()
-            reshard(run.vla)
-        run.vla.train()
-        set_rng_state(drawn)
         summed = total(run.world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
         mean = float(summed[0] / summed[1])
         if not torch.isfinite(summed).all():
-            raise RunFailed(
+            raise NotFinite(
                 f"the validation loss is {mean} at step {run.progress.step}",
                 cause="a sample of val_dataloader with wrong or huge values, or a learning rate "
                 "that is too high",
             )
         return mean
+
+
+@contextmanager
+def acting(run: Strategy) -> Iterator[None]:
+    """Inside, the model acts: with the weights that are for it, and the same draws every time."""
+    drawn = rng_state()
+    seed_all(rank_seed(run.options.seed, run.world.rank))
+    run.vla.eval()
+    try:
+        with run.ema.in_place() if run.ema is not None else nullcontext(), torch.no_grad():
+            yield
+            reshard(run.vla)
+    finally:
+        run.vla.train()
+        set_rng_state(drawn)
 
 
 def reshard(model: nn.Module) -> None:

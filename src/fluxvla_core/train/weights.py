@@ -102,8 +102,22 @@ def check_model_tensors(
         CheckpointError: lists what differs.
     """
     brings = brings if saved.get("sha256") else LeftOut()
+    if lora.adapter_names(model):
+        _check_base(brings, saved, where)
     check_left_out(brings, saved, where)
     check_names(tensors, model_tensors(model, brings.names), "the weights", where)
+
+
+def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
+    now, before = ours.sources.get(""), saved.get("sources", {}).get("")
+    if ours.sha256 != saved.get("sha256", "") and now and before and now != before:
+        raise CheckpointError(
+            "frozen weights differ from those that the checkpoint was trained with (the model from "
+            f"{now}; then from {before})",
+            where=where,
+            cause="init_from was changed, or that place has other weights by now",
+            next=f"set init_from to where the weights of {before} are, or resume without it",
+        )
 
 
 def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
@@ -139,10 +153,10 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
         if base is not None:
             start_from(model, base)
             model.__dict__["frozen_source"] = base
-        lora.attach(model, options)
+        lora.attach(model, options, trained=True)
     tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
     if checkpoint.has(EMA):
-        tensors.update(checkpoint.tensors(EMA))
+        tensors |= _by_all_names(model, checkpoint.tensors(EMA))
     check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
     put_model_tensors(model, tensors)
     if options is not None:
@@ -150,6 +164,14 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
         model.__dict__.pop("frozen_source", None)
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(trained[name])
+
+
+def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """``tensors``, and tied weights under their other names too: averages have the first alone."""
+    state = model_tensors(model)
+    known = {id(state[name]): tensor for name, tensor in tensors.items() if name in state}
+    others = {name: known[id(own)] for name, own in state.items() if id(own) in known}
+    return {**tensors, **others}
 
 
 def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
@@ -161,15 +183,46 @@ def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     Args:
         init_from: the place that is asked for now, which goes first when it is a new one.
     """
+    noted = _noted_base(checkpoint)
+    if noted is None:
+        return None
+    asked, found = noted
+    if init_from not in (None, asked):
+        return init_from
+    return next((place for place in (found, asked) if Path(place).exists()), found)
+
+
+def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None:
+    """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
+
+    Args:
+        before: what the run goes on from; where it is asked for no other base, it keeps that one.
+    """
+    if before is None:
+        return init_from
+    noted = _noted_base(before)
+    return None if noted is None else init_from or noted[0]
+
+
+def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
+    """Where a checkpoint's base was asked for, and found."""
     if not checkpoint.has(lora.CONFIG):
         return None
     asked = checkpoint.json(lora.CONFIG)["base_model_name_or_path"]
     found = checkpoint.json(TRAINER)["left_out"].get("sources", {}).get("")
-    if asked is None or found is None:
-        return None
-    if init_from not in (None, asked):
-        return init_from
-    return next((place for place in (found, asked) if Path(place).exists()), str(found))
+    return None if asked is None or found is None else (asked, found)
+
+
+def exact_place(place: str | Path) -> str:
+    """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
+
+    Which one is a work dir's newest, or its ``best``, changes while that run goes on.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    path = Path(place).resolve()
+    return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
 
 
 def start_from(model: nn.Module, place: str | Path) -> Path:

@@ -26,7 +26,8 @@ class StepRecord:
 
     ``by_dataset`` is the mean loss of the samples of each dataset that the step used.
 
-    ``data_wait`` and ``step_time`` are seconds, means over the ranks; ``lr`` is the rate used.
+    ``data_wait`` (the host's) and ``step_time`` are seconds, means over the ranks, and off the CPU
+    over the steps fetched together; ``lr`` is the rate used.
     """
 
     step: int
@@ -105,11 +106,9 @@ class Window:
         losses = torch.stack([torch.stack(s.losses).double().mean() for s in steps]).cpu()
         zero = torch.zeros((), device=self.world.device)
         norms = torch.stack([zero if s.norm is None else s.norm.detach() for s in steps]).cpu()
-        ends = [self.began, *(s.ended for s in steps)]
-        self.began = ends[-1]
-        times = torch.tensor([b - a for a, b in pairwise(ends)], dtype=torch.float64)
-        waits = torch.tensor([s.wait for s in steps], dtype=torch.float64)
-        mean = total(self.world, torch.stack([losses, norms.double(), times, waits]).clone())
+        # Only now has the device done the steps.
+        clocked = self._clocked(steps, time.perf_counter())
+        mean = total(self.world, torch.cat([torch.stack([losses, norms.double()]), clocked]))
         mean /= self.world.size
         if not bool(torch.isfinite(mean[:2]).all()):
             raise self._not_finite(steps, mean)
@@ -130,6 +129,17 @@ class Window:
                 steps, shares, *mean.tolist(), strict=True
             )
         ]
+
+    def _clocked(self, steps: list[_Pending], now: float) -> Tensor:
+        """Step times and data waits ``(2, steps)``; the times add up to what went by until now."""
+        ends = [self.began, *(s.ended for s in steps[:-1]), now]
+        self.began = now
+        times = [b - a for a, b in pairwise(ends)]
+        clocked = torch.tensor([times, [s.wait for s in steps]], dtype=torch.float64)
+        if self.world.device.type == "cpu":
+            return clocked
+        # The host runs ahead: its times are of launching steps, and only their sum is true.
+        return clocked.mean(dim=1, keepdim=True).expand_as(clocked)
 
     def _by_dataset(self, steps: list[_Pending]) -> list[dict[str, float]]:
         if len(self.parts) < 2:

@@ -35,6 +35,8 @@ def start(
     """
     if world.device.type == "cpu":
         os.environ.setdefault("DS_ACCELERATOR", "cpu")
+    # DeepSpeed insists on it, and a process that nobody launched has none.
+    os.environ.setdefault("LOCAL_RANK", str(world.local_rank))
     import deepspeed
 
     if world.device.type == "cpu":
@@ -122,27 +124,33 @@ def put_state(
     parameters: Mapping[str, nn.Parameter],
     tensors: Mapping[str, Tensor | Stored],
 ) -> None:
-    """The inverse of :func:`read_state`, before the first step."""
+    """The inverse of :func:`read_state`, before the first step.
+
+    A parameter that never had a gradient may have no state yet: it begins with zeros.
+    """
     from deepspeed.utils import safe_set_full_optimizer_state
 
     shapes = {name: _shape(parameter) for name, parameter in parameters.items()}
-    keys = {place.rpartition("/")[2] for place in tensors}
+    # By key, then by parameter: what is of the parameters' shapes is split, a count is not.
+    state: dict[str, dict[str, Tensor | Stored]] = {}
+    for place in sorted(tensors):
+        name, _, key = place.rpartition("/")
+        state.setdefault(key, {})[name] = tensors[place]
     split = {
-        key
-        for key in keys
-        if all(tensors[f"{name}/{key}"].shape == shape for name, shape in shapes.items())
+        key: found
+        for key, found in state.items()
+        if all(value.shape == shapes[name] for name, value in found.items())
     }
-    name = next(iter(parameters))
     for flat in _flats(engine):
         inner.state[flat] = {
             key: torch.zeros_like(flat)
             if key in split
-            else _whole(tensors[f"{name}/{key}"]).to(flat.device)
-            for key in sorted(keys)
+            else _whole(next(iter(found.values()))).to(flat.device)
+            for key, found in state.items()
         }
     _link(engine, inner)
     for name, parameter in parameters.items():
-        for key in sorted(split):
+        for key in (key for key, found in split.items() if name in found):
             value = _whole(tensors[f"{name}/{key}"]).to(parameter.device)
             safe_set_full_optimizer_state(parameter, value, key)
 

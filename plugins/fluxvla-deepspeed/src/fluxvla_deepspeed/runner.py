@@ -96,7 +96,11 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         """
         import torch
 
+        from fluxvla_core.train.distributed import share_buffers
+
         self.vla.step()
+        # DeepSpeed leaves buffers to every process.
+        share_buffers(self.world, self.model)
         return torch.as_tensor(self.vla.get_global_grad_norm(), device=self.world.device).float()
 
     def _trained(self) -> dict[str, nn.Parameter]:

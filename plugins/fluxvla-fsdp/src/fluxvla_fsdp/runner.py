@@ -10,7 +10,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.train.base_runner import BaseTrainRunner
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
     from torch.distributed.device_mesh import DeviceMesh
 
 STRATEGIES = ("full-shard", "shard-grad-op", "hybrid-shard", "no-shard")
@@ -20,8 +20,8 @@ class FSDPTrainRunner(BaseTrainRunner):
     """Fully sharded data-parallel training with torch's ``fully_shard`` (FSDP2).
 
     The blocks of the model's ``fsdp_units()`` are gathered one by one, those in a tuple together;
-    frozen parameters stay whole on every process. In mixed precision blocks are gathered in
-    bf16, which halves the traffic; gradients are reduced in fp32.
+    frozen parameters and buffers stay whole on every process. In mixed precision blocks are
+    gathered in bf16, which halves the traffic; gradients are reduced in fp32.
 
     Args:
         sharding_strategy: ``full-shard``; ``shard-grad-op`` (weights stay gathered from the
@@ -30,7 +30,7 @@ class FSDPTrainRunner(BaseTrainRunner):
         kwargs: the settings of ``BaseTrainRunner``.
 
     Raises:
-        ConfigError: an unknown strategy.
+        ConfigError: an unknown strategy; later, in ``run_setup``, a weight in two units.
     """
 
     api: ClassVar[str] = "1.0"
@@ -51,7 +51,9 @@ class FSDPTrainRunner(BaseTrainRunner):
         from torch.distributed.fsdp import fully_shard
 
         from fluxvla_core.train.units import units_of
+        from fluxvla_fsdp.ties import check_ties
 
+        check_ties(vla, self.context.where("model"))
         frozen = {p for p in vla.parameters() if not p.requires_grad}
         shared: dict[str, Any] = {
             "mesh": self._mesh(),
@@ -101,3 +103,11 @@ class FSDPTrainRunner(BaseTrainRunner):
     def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         self.vla.set_requires_gradient_sync(last)
         return nullcontext()
+
+    def _update(self) -> Tensor | None:
+        from fluxvla_core.train.distributed import share_buffers
+
+        norm = super()._update()
+        # fully_shard leaves buffers to every process.
+        share_buffers(self.world, self.model)
+        return norm

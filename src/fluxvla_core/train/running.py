@@ -56,6 +56,8 @@ class TrainRun:
     adapter_base: str | None = None
     flops: Meter | None = None
     sample_losses: Tensor | None = None
+    late_stop: int = 0
+    """The signal that asked for a stop when training was complete: nothing new is to begin."""
     _world: World | None = None
     _claim: Claim | None = None
     _checkpoint: Checkpoint | None = None
@@ -96,7 +98,6 @@ class TrainRun:
                 number = self._run_step_based() if steps else self._run_epoch_based()
                 self.loop.save()
                 self.settle_saves()
-                # Too late to leave anything out here, but nothing is to be begun after this.
                 self.late_stop = stop.asked()
             outcome = "interrupted" if number else "ok"
         except (RuntimeError, MemoryError, OSError) as error:

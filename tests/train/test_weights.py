@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.testing.training import run_ranks, tiny_config, train
 from fluxvla_core.train.ema import Ema
 from fluxvla_core.train.weights import (
     check_model_tensors,
@@ -20,6 +22,7 @@ from fluxvla_core.train.weights import (
     model_tensors,
     put_model_tensors,
 )
+from tests.train.runs import run
 
 
 class Encoder(nn.Module):
@@ -194,3 +197,26 @@ def test_averages_of_tied_weights_act_under_both_names(tmp_path):
     assert acts.head.weight is acts.embed.weight
     assert torch.equal(acts.head.weight, ema.shadow["embed.weight"])
     assert not torch.equal(acts.head.weight, model.head.weight)
+
+
+def begin_from(work_dir, base):
+    """Leaves word if the second rank looks for the newest checkpoint itself."""
+    opened = Checkpoint.open
+
+    def open_later(place):
+        if place == base:
+            (work_dir / "looked").touch()
+        return opened(place)
+
+    if os.environ["RANK"] == "1":
+        Checkpoint.open = staticmethod(open_later)
+    table = {"type": "FSDPTrainRunner", "max_steps": 1, "init_from": str(base)}
+    train({"config": tiny_config(table, 2), "work_dir": work_dir})
+
+
+def test_all_ranks_begin_from_the_checkpoint_that_the_first_one_found(tmp_path):
+    """A run that goes on saves in between: half the weights would be of another step."""
+    run(tmp_path / "base", save_iter_interval=2)
+    work_dir = tmp_path / "work"
+    assert run_ranks(2, begin_from, work_dir, (tmp_path / "base").resolve()) == [0, 0]
+    assert not (work_dir / "looked").exists()

@@ -230,14 +230,19 @@ def test_only_rank_0_of_torchrun_talks_and_writes(
     assert not Path("work_dirs/c/config.resolved.json").exists()
 
 
+def second_of_two(monkeypatch: pytest.MonkeyPatch, errors: Path) -> None:
+    """Be a rank that ``--nproc 2`` launched."""
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv(ranks.ERROR_DIR, str(errors))
+    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
+    Path("work_dirs/c").mkdir(parents=True)
+
+
 def test_a_launched_rank_leaves_its_error_to_the_launcher(
     run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("RANK", "1")
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
-    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
-    Path("work_dirs/c").mkdir(parents=True)
+    second_of_two(monkeypatch, tmp_path)
     ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
     assert (ended.code, ended.err) == (2, "")
     failure = ranks.failures(tmp_path)[1]
@@ -254,11 +259,7 @@ def test_a_launched_rank_leaves_its_error_to_the_launcher(
 def test_a_launched_rank_that_is_done_says_so(
     run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("RANK", "1")
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
-    monkeypatch.setattr(launch, "die_with_parent", lambda: None)
-    Path("work_dirs/c").mkdir(parents=True)
+    second_of_two(monkeypatch, tmp_path)
     assert run("--config", "c.py", "--section", "runner").code == 0
     assert (ranks.done(tmp_path), ranks.failures(tmp_path)) == ({1: 0}, {})
 

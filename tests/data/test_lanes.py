@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import pickle
 import threading
 
 import numpy as np
@@ -121,13 +120,3 @@ def test_what_cannot_be_read_is_told_whichever_thread_meets_it(movies, allowed, 
         with pytest.raises(DataError, match=r"gone\.mp4: cannot be opened as video"):
             lanes.read([*wanted[:place], (tmp_path / "gone.mp4", 0.0), *wanted[place:]])
     assert greys(lanes.read(wanted)) == pytest.approx(expected, abs=1)
-
-
-def test_a_copy_opens_its_own(movies, allowed):
-    allowed(2)
-    lanes = Lanes()
-    wanted, expected = wish(movies, 5)
-    lanes.read(wanted)
-    copy = pickle.loads(pickle.dumps(lanes))  # noqa: S301
-    assert not any(files._open for files in copy._lanes)
-    assert greys(copy.read(wanted)) == pytest.approx(expected, abs=1)

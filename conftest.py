@@ -26,8 +26,12 @@ if threading.current_thread() is threading.main_thread():
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+from pathlib import Path  # noqa: E402
+
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+
+from tools import skipped  # noqa: E402
 
 # How long an example takes says something about the machine, not about the project.
 settings.register_profile("fluxvla", deadline=None)
@@ -40,6 +44,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "ros_domain" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.network)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """The stages of a session are one run for people: what was skipped is told at its end."""
+    place = os.environ.get(skipped.FILE)
+    if place and "PYTEST_XDIST_WORKER" not in os.environ:  # its controller counts what it skipped
+        reports = terminalreporter.stats.get("skipped", [])
+        skipped.note(Path(place), [(r.nodeid, reason_of(r)) for r in reports])
+
+
+def reason_of(report: pytest.TestReport) -> str:
+    place = report.longrepr
+    text = str(place[2] if isinstance(place, tuple) else place)
+    return text.removeprefix("Skipped: ").partition("\n")[0]
 
 
 @pytest.fixture(autouse=True)

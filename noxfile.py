@@ -20,15 +20,27 @@ import nox
 ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT))
 
-from tools import envs, lerobot_env, project, rendering, shell, torch_build, unseen, wheels  # noqa: E402
+from tools import (  # noqa: E402
+    envs,
+    lerobot_env,
+    needs,
+    project,
+    rendering,
+    shell,
+    skipped,
+    torch_build,
+    unseen,
+    wheels,
+)
 from tools.demo import __main__ as demo_program  # noqa: E402
+from tools.demo import next_steps  # noqa: E402
 from tools.steps import Steps  # noqa: E402
 
 nox.needs_version = ">=2024.4.15"
 nox.options.sessions = ["tests"]
 nox.options.default_venv_backend = "none"
 
-EXTRAS = "data,train,report"
+EXTRAS = "data,train"
 TESTED_EXTRAS = f"{EXTRAS},record,lora,tensorboard,trackio,wandb"
 # Extras of plugins that some Pythons and platforms cannot have: their tests are skipped there.
 OPTIONAL = {
@@ -36,6 +48,7 @@ OPTIONAL = {
     "fluxvla-libero": "libero",
     "fluxvla-metaworld": "metaworld",
 }
+SKIPPED = ROOT / ".nox" / "skipped.jsonl"
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 SLOWEST = "--durations=15"
 # Files share what is slow to make; what waits for networks is in few files, of unequal length.
@@ -56,6 +69,8 @@ def tests(session: nox.Session) -> None:
             make_renderable(session, dev)
             step("pytest", lambda: dev.run("pytest", *session.posargs, env=rendering.VARIABLES))
             return
+        ensure_needs(session)
+        SKIPPED.unlink(missing_ok=True)
         # pip and mypy use one core each.
         with shell.beside([sys.executable, "-m", "nox", "-s", "environments"], cwd=ROOT):
             dev = dev_env(session)
@@ -63,10 +78,13 @@ def tests(session: nox.Session) -> None:
             step("types", lambda: dev.run("mypy", cwd=ROOT))
             step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
         make_renderable(session, dev)
+        variables = {**rendering.VARIABLES, skipped.FILE: str(SKIPPED)}
         for name, words in STAGES.items():
-            step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=rendering.VARIABLES))
+            step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=variables))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
+        step("what the demo names", lambda: check_next_steps(session))
         step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))
+        step("what was skipped", lambda: print(*skipped.summary(SKIPPED), sep="\n"))
 
 
 @nox.session
@@ -244,6 +262,14 @@ def install_optional(
         session.warn(f"no {name} for this Python and platform, its tests are skipped: {error}")
 
 
+def ensure_needs(session: nox.Session) -> None:
+    try:
+        needs.ensure(session.log)
+    except needs.Lacking as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)  # bad surroundings, as below
+
+
 def make_renderable(session: nox.Session, env: envs.Env) -> None:
     try:
         rendering.ensure(env, session.log)
@@ -259,6 +285,11 @@ def run_demo(session: nox.Session, arguments: list[str]) -> None:
     env, build = demo_env(session)
     words = ["--build", build, "--installed-in", f"{time.monotonic() - began:.1f}", *arguments]
     env.run("python", "-m", "tools.demo", *words, cwd=ROOT, env=rendering.VARIABLES)
+
+
+def check_next_steps(session: nox.Session) -> None:
+    env, _ = demo_env(session)
+    next_steps.check(env, ROOT, Path("demo_out"))
 
 
 def check_stranger(session: nox.Session) -> None:

@@ -1,6 +1,6 @@
 """One side of ``evaluation.py``: control steps a second in gym-aloha's transfer task.
 
-    python _evaluation_side.py engine|bare|lerobot PROCESSES STEPS EPISODES RENDER
+    python _evaluation_side.py engine|bare|vector|lerobot PROCESSES STEPS EPISODES RENDER
 
 Prints JSON. ``lerobot`` runs in an environment of its own and imports nothing of the rest. Every
 side has one thread a process, looks at the top camera in 480 x 640 at each step, and commands the
@@ -24,13 +24,13 @@ HEIGHT, WIDTH = 480, 640
 
 
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
-    """The evaluation engine: workers, ledger, records."""
+    """The evaluation engine: workers, episode log, records."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
-    from fluxvla_core.evaluate.ledger import EpisodeKey
+    from fluxvla_core.evaluate.episode_log import EpisodeKey, open_episode_log
+    from fluxvla_core.evaluate.episodes import run_in_pool
     from fluxvla_core.evaluate.policies import Source
     from fluxvla_core.evaluate.pool import WorkerPool
-    from fluxvla_core.evaluate.rollout import Course
+    from fluxvla_core.evaluate.rollout import RolloutSettings
     from fluxvla_core.evaluate.worker import Settings
     from fluxvla_core.plugins.files import load_plugin_files
 
@@ -39,16 +39,16 @@ def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, 
         environment={"type": "AlohaSimEnvironment", "render": render},
         tasks=(TASK,),
         sources={"policy": Source({"type": "Still"})},
-        course=Course(max_steps=steps),
+        course=RolloutSettings(max_steps=steps),
     )
     keys = [EpisodeKey("policy", TASK, seed) for seed in range(episodes)]
     warm = [EpisodeKey("policy", TASK, 10**6 + n) for n in range(processes)]
     with WorkerPool(_Worker(settings), processes) as pool, tempfile.TemporaryDirectory() as folder:
         for _ in pool.run(warm):
             continue
-        ledger = open_ledger(Path(folder) / "episodes.jsonl", {}, SilentReporter())
+        log = open_episode_log(Path(folder) / "episodes.jsonl", {}, SilentReporter())
         began, own = time.perf_counter(), time.process_time()
-        records = run_in_pool(pool, keys, ledger, SilentReporter())
+        records = run_in_pool(pool, keys, log, SilentReporter())
         seconds, own = time.perf_counter() - began, time.process_time() - own
     assert all(record["steps"] == steps for record in records)
     memory = max(record["timing"]["memory_mb"] for record in records)
@@ -126,6 +126,74 @@ def _loop(
     os._exit(0)
 
 
+class _Single:
+    """Makes, in a process of the vector environment, the engine's scene as one of Gymnasium's."""
+
+    def __init__(self, steps: int, render: str) -> None:
+        self.steps, self.render = steps, render
+
+    def __call__(self) -> Any:
+        import gymnasium
+        import numpy as np
+        from fluxvla_sim.environment import AlohaSimEnvironment
+
+        from fluxvla_core.spec.embodiment import Camera
+
+        camera, limit = Camera("top", HEIGHT, WIDTH), self.steps
+        environment = AlohaSimEnvironment(render=self.render)
+
+        class Single(gymnasium.Env[Any, Any]):
+            observation_space = gymnasium.spaces.Dict(
+                {
+                    "qpos": gymnasium.spaces.Box(-np.inf, np.inf, (14,), np.float32),
+                    "top": gymnasium.spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
+                }
+            )
+            action_space = gymnasium.spaces.Box(-np.inf, np.inf, (14,), np.float32)
+
+            def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+                super().reset(seed=seed)
+                self.left = limit
+                environment.reset(int(self.np_random.integers(2**31)), TASK)
+                return self._seen(), {}
+
+            def step(self, action: Any) -> Any:
+                found = environment.step(np.asarray(action, np.float64))
+                self.left -= 1
+                return self._seen(), found.reward, False, self.left == 0, {}
+
+            def _seen(self) -> Any:
+                seen = environment.observe((camera,))
+                return {"qpos": seen["qpos"], "top": seen["images"]["top"]}
+
+        return Single()
+
+
+def vector(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
+    """``gymnasium.vector.AsyncVectorEnv`` over the engine's scene: one camera, equal pictures."""
+    from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+
+    env = AsyncVectorEnv(
+        [_Single(steps, render)] * processes,
+        context="spawn",
+        autoreset_mode=AutoresetMode.DISABLED,
+    )
+    rounds = max(1, episodes // processes)
+    env.reset(seed=10**6)
+    pids = [child.pid for child in multiprocessing.active_children() if child.pid is not None]
+    began, before = time.perf_counter(), time.process_time() + sum(map(_cpu_s, pids))
+    for number in range(rounds):
+        seen, _ = env.reset(seed=[number * processes + n for n in range(processes)])
+        ended = [False]
+        while not any(ended):
+            seen, _, _, ended, _ = env.step(seen["qpos"])
+    seconds = time.perf_counter() - began
+    cpu = time.process_time() + sum(map(_cpu_s, pids)) - before
+    memory = max(map(_peak_mb, pids))
+    env.close()
+    return {**_pace(steps * rounds * processes, seconds, cpu), "worker_mb": memory}
+
+
 def lerobot(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """``lerobot-eval``'s own rollout over its asynchronous vector environment."""
     import torch
@@ -176,7 +244,7 @@ def _peak_mb(pid: int) -> float:
     return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith("VmHWM"))
 
 
-SIDES = {"engine": engine, "bare": bare, "lerobot": lerobot}
+SIDES = {"engine": engine, "bare": bare, "vector": vector, "lerobot": lerobot}
 
 
 def main() -> int:

@@ -20,8 +20,9 @@ from benchmarks._pi05_model import SIZES, BenchPi05
 from fluxvla_core import RunContext, build_runner_from_cfg
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.train import forward, memory, units
+from fluxvla_core.train import memory
 from fluxvla_core.train.batches import StepPlan, StepSampler
+from fluxvla_core.train.model import checkpoint_activations, compile_units, units_of
 
 OURS, HAND = "runner", "by hand"
 KEYS = ("images", "lang_tokens", "lang_masks", "actions", "noise", "time")
@@ -112,9 +113,9 @@ def our_config(setup: Setup) -> dict[str, Any]:
 
 def by_runner(setup: Setup, work_dir: Path) -> tuple[Callable[[int], float], Any]:
     """What does so many steps and gives the last loss, and the runner; nothing is saved."""
-    from fluxvla_core.train.loop import begin
-    from fluxvla_core.train.progress import Progress
+    from fluxvla_core.train.state import Progress
     from fluxvla_core.train.stop import StopRequest
+    from fluxvla_core.train.trainer import Trainer
 
     config = our_config(setup)
     context = RunContext(config=config, section="runner", work_dir=work_dir)
@@ -123,11 +124,11 @@ def by_runner(setup: Setup, work_dir: Path) -> tuple[Callable[[int], float], Any
     dataset = Samples(setup)
     runner.run_setup(len(dataset))
     runner.progress = Progress()
-    runner._loop = begin(runner, dataset, StopRequest(runner.world))
+    runner._trainer = Trainer(runner, dataset, StopRequest(runner.world))
 
     def run(steps: int) -> float:
         target = runner.progress.step + steps
-        runner.loop.run(lambda: runner.progress.step >= target, lambda: False)
+        runner.trainer.run(lambda: runner.progress.step >= target, lambda: False)
         return float(runner.progress.loss)
 
     return run, runner
@@ -143,13 +144,13 @@ def by_hand(setup: Setup) -> Callable[[int], float]:
     torch.manual_seed(SEED)
     model: Any = BenchPi05(**setup.model)
     if setup.recompute:
-        forward.checkpoint_activations(model)
+        checkpoint_activations(model)
     if setup.compile:
-        forward.compile_units(model)
+        compile_units(model)
     if setup.nproc > 1:
         from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
 
-        for unit in units.units_of(model):
+        for unit in units_of(model):
             fully_shard(list(unit), mp_policy=MixedPrecisionPolicy(**MIXED))
         fully_shard(model, mp_policy=MixedPrecisionPolicy(**MIXED))
     optimizer = torch.optim.AdamW(
@@ -217,7 +218,7 @@ def measure(side: str, setup: Setup, profile: bool, out: Path) -> None:
     if not dist.is_initialized() or dist.get_rank() == 0:
         out.write_text(json.dumps(found))
     if runner is not None:
-        runner.loop.close()
+        runner.trainer.close()
     if dist.is_initialized():
         dist.destroy_process_group()
 

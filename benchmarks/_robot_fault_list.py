@@ -199,6 +199,12 @@ REFUSALS = [
         "unknown task '3'; nothing was moved",
         exit_code=2,
     ),
+    Fault(
+        "instruction misspelt, or none that the config knows",
+        lambda stage: setattr(stage, "task", "move the arn"),
+        "unknown task 'move the arn'; nothing was moved",
+        exit_code=2,
+    ),
     Fault("policy for another robot", another_robot, "the policy .* the robot", exit_code=2),
     Fault(
         "start pose beyond a limit",
@@ -282,7 +288,6 @@ ROBOT = [
         cable_pulled,
         "OSError: cable pulled",
         rule="operator",
-        braked=False,
     ),
 ]
 POLICY = [

@@ -174,8 +174,8 @@ class Fault:
         exit_code: of the program.
         rule: that tripped, as the record has it; None where somebody ended the run, or it went on.
         after: called when the run is over; nothing may move because of it.
-        braked: whether the arm is slowed down within its limits; where it does not obey, its last
-            command, or where it is, is held at once.
+        braked: whether every joint is slowed down within its limits; those that do not obey halt at
+            once, and nothing more is sent where somebody else commands.
     """
 
     name: str
@@ -297,7 +297,7 @@ def play(stage: Stage, fault: Fault) -> Result:
         assert _settled(stage) == commands, "the arm was commanded after the run was over"
     positions = np.array([c for _, c in commands]).reshape(-1, len(NAMES))
     whole = _with_overtaken(positions.tolist(), stage.operator.sent)
-    check_limits(whole if fault.braked else whole[: len(whole) - _resting(whole)])
+    check_limits(whole, halts=not fault.braked)
     hold = None
     if fault.outcome == STOP and began and commands:
         strangers = [h["at"] for h in stage.ear.on(COMMAND) if tuple(h["name"]) != NAMES]
@@ -342,8 +342,11 @@ def _resting(positions: Array) -> int:
     return len(positions) - (int(moving[-1]) + 1 if moving.size else 0)
 
 
-def check_limits(positions: Array) -> None:
+def check_limits(positions: Array, halts: bool = False) -> None:
     """Position, velocity and acceleration of ``(N, 3)`` commands in a row.
+
+    Args:
+        halts: a joint may come to rest at once, and set off from there.
 
     Raises:
         AssertionError: a command is outside a limit.
@@ -358,7 +361,10 @@ def check_limits(positions: Array) -> None:
         assert joint.lower <= positions[:, index].min()
         assert positions[:, index].max() <= joint.upper
         assert np.abs(speed[:, index]).max() <= joint.velocity * slack, joint.name
-        assert np.abs(push[:, index]).max() <= joint.acceleration * slack, joint.name
+        beyond = np.flatnonzero(np.abs(push[:, index]) > joint.acceleration * slack)
+        assert beyond.size <= halts, joint.name
+        for halt in beyond:
+            assert abs(speed[halt + 1, index]) <= joint.acceleration / ARM.rate_hz * slack
 
 
 def _record(folder: Path) -> dict[str, Any] | None:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from benchmarks import _results
 from fluxvla_core import RUNNERS, VLAS, BaseTrainRunner, RunContext, build_runner_from_cfg
 from fluxvla_core.testing.training import TinyDataset
-from fluxvla_core.train.saver import Saver
+from fluxvla_core.train.saving import Saver
 
 MOST_RATIO = 0.10
 WIDTH = 4096
@@ -71,14 +71,14 @@ class TimedRunner(BaseTrainRunner):
         )
         return path
 
-    def _update(self) -> Tensor | None:
+    def optimizer_step(self) -> Tensor | None:
         saver: Saver | None = self._saver
         began = time.perf_counter()
         if saver is not None:
             saver.copied()
         if self.found:
             self.found[-1]["blocked_s"] += time.perf_counter() - began
-        return super()._update()
+        return super().optimizer_step()
 
 
 def measure(layers: int, saves: int, steps: int, work_dir: Path) -> tuple[list[Any], list[Any]]:
@@ -108,7 +108,7 @@ def measure(layers: int, saves: int, steps: int, work_dir: Path) -> tuple[list[A
     def before(**_: Any) -> None:
         began[:] = [time.perf_counter(), _writing(runner)]
 
-    step, call = runner._update, runner.hooks.call
+    step, call = runner.optimizer_step, runner.hooks.call
 
     def timed() -> Any:
         norm = step()
@@ -120,7 +120,7 @@ def measure(layers: int, saves: int, steps: int, work_dir: Path) -> tuple[list[A
             before()
         call(name, **facts)
 
-    runner._update, runner.hooks.call = timed, noticed
+    runner.optimizer_step, runner.hooks.call = timed, noticed
     dataset = TinyDataset()
     runner.run_setup(len(dataset))
     runner.run(dataset)

@@ -9,7 +9,7 @@ and the figure is the median over the rounds:
   processor time, which other work disturbs less);
 - collecting with two worker processes against one, and one against gym-aloha's own environment,
   which draws three 480 x 640 pictures after every step;
-- evaluating through the engine (processes, ledger) against the same episodes in a bare loop.
+- evaluating through the engine (processes, episode log) against the same episodes in a bare loop.
 
 Loading libraries and the scene is left out everywhere. Writes
 ``benchmarks/results/collection.json``.
@@ -38,12 +38,12 @@ from fluxvla_sim.expert import SimExpert
 
 from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.evaluate.demonstrating import demonstrate
-from fluxvla_core.evaluate.episodes import open_ledger, run_in_pool
-from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.collect import demonstrate
+from fluxvla_core.evaluate.episode_log import EpisodeKey, open_episode_log
+from fluxvla_core.evaluate.episodes import run_in_pool
 from fluxvla_core.evaluate.policies import Source
 from fluxvla_core.evaluate.pool import WorkerPool
-from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
+from fluxvla_core.evaluate.rollout import RolloutSettings, find_task, run_episode
 from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera
 
@@ -109,7 +109,7 @@ def stock(steps: int = 4) -> float:
 
 def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     """Episodes a minute through the engine, and in a bare loop in this process."""
-    course = Course(replan_every=5)
+    course = RolloutSettings(replan_every=5)
     settings = Settings(
         environment={"type": "AlohaSimEnvironment"},
         tasks=("lift_hold",),
@@ -121,9 +121,9 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     with WorkerPool(partial(EpisodeWorker, settings), workers) as pool:
         for _ in pool.run([EpisodeKey("policy", "lift_hold", 10**6)] * workers):
             continue
-        ledger = open_ledger(folder / "episodes.jsonl", {}, SilentReporter())
+        log = open_episode_log(folder / "episodes.jsonl", {}, SilentReporter())
         began = time.perf_counter()
-        run_in_pool(pool, keys, ledger, SilentReporter())
+        run_in_pool(pool, keys, log, SilentReporter())
         engine = time.perf_counter() - began
     shutil.rmtree(folder)
     environment, expert = AlohaSimEnvironment(), SimExpert()

@@ -5,9 +5,12 @@
 gym-aloha's transfer task with a policy that costs nothing, in as many processes as there are cores
 (at most 4), the top camera looked at in 480 x 640 at every step: the engine with stock pictures
 (shadows, multisampling) and with its own cheap ones, ``lerobot-eval``'s rollout over its
-asynchronous vector environments, and the engine's environment in a bare loop in as many processes.
-Renderer (EGL), MuJoCo and resolution are the same on all sides; LeRobot's environment always draws
-three cameras, and is given the processes that its own command cannot use. The sides take turns;
+asynchronous vector environments, Gymnasium's asynchronous vector environment around the engine's
+own scene, and the engine's environment in a bare loop in as many processes. Renderer (EGL), MuJoCo
+and resolution are the same on all sides. LeRobot's environment always draws three cameras where the
+others draw one, so most of ``times_lerobot`` is pictures that nobody looks at;
+``times_gymnasium_vector`` compares equal pictures, and is what the engine itself is worth. LeRobot
+is given the processes that its own command cannot use. The sides take turns;
 figures are medians over the rounds. An episode is 300 steps. Where the machine is shared, ratios of
 processor time say more than those of rates.
 
@@ -40,6 +43,7 @@ GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
 # side -> words of _evaluation_side.py: side, steps, episodes for each process, pictures
 SIDES = {
     "lerobot": ("lerobot", 20, 1, "reference"),
+    "gymnasium.vector, stock pictures": ("vector", 20, 2, "reference"),
     "engine, stock pictures": ("engine", 20, 2, "reference"),
     "engine": ("engine", 100, 2, "cheap"),
     "bare": ("bare", 100, 2, "cheap"),
@@ -118,6 +122,9 @@ def main() -> int:
         "share_of_bare": round(statistics.median(shares), 3),
         "share_of_bare_by_cpu": round(cost["bare"] / cost["engine"], 3),
     }
+    own, theirs = "engine, stock pictures", "gymnasium.vector, stock pictures"
+    figures["times_gymnasium_vector"] = round(pace[own] / pace[theirs], 2)
+    figures["times_gymnasium_vector_by_cpu"] = round(cost[theirs] / cost[own], 2)
     if "lerobot" in runs:
         for name, key in KEYS.items():
             figures[key] = round(pace[name] / pace["lerobot"], 2)
@@ -126,6 +133,7 @@ def main() -> int:
         **begun,
         **_lerobot.versions(env),
         "processes": args.processes,
+        "cameras_drawn": {name: 3 if name == "lerobot" else 1 for name in runs},
         "rounds": args.rounds,
         "steps_per_s": {name: round(value, 2) for name, value in pace.items()},
         "steps_per_s_by_round": {

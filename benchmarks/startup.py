@@ -4,9 +4,11 @@
 
 The commands take turns, so that other work on the machine slows all of them alike; figures are
 medians over the rounds, of the time on the clock and of the processor time, which other work
-disturbs less; what the commands do is all computing. Goals: at most 100 ms of processor time more
-than bare Python, and at least 20 times faster than ``lerobot-train --help`` (in an environment of
-its own, which ``tools/lerobot_env.py`` makes). Writes ``benchmarks/results/startup.json``.
+disturbs less; what the commands do is all computing. The list is also taken with 1,000 more
+distributions installed, 30 of them with plugins. Goals: at most 60 ms, 75 ms and 120 ms of
+processor time more than bare Python, and at least 20 times faster than ``lerobot-train --help`` (in
+an environment of its own, which ``tools/lerobot_env.py`` makes). Writes
+``benchmarks/results/startup.json``.
 """
 
 from __future__ import annotations
@@ -15,13 +17,17 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import _lerobot, _results
 
-MOST_EXTRA_MS = 100.0
+CROWDED = "fluxvla plugins list, 1000 more distributions"
+MOST_EXTRA_MS = {"fluxvla --help": 60.0, "fluxvla plugins list": 75.0, CROWDED: 120.0}
+DISTRIBUTIONS = 1000
+WITH_PLUGINS = 30
 LEAST_RATIO = 20.0
 
 
@@ -69,7 +75,7 @@ def summarise(clock: dict[str, float], processor: dict[str, float]) -> dict[str,
         "extra_processor_ms": {name: round(value, 1) for name, value in extra.items()},
         "extra_clock_ms": {name: round(clock[name] - clock["python"], 1) for name in ours},
         "goal_extra_ms": MOST_EXTRA_MS,
-        "goal_extra_met": all(value <= MOST_EXTRA_MS for value in extra.values()),
+        "goal_extra_met": all(value <= MOST_EXTRA_MS[name] for name, value in extra.items()),
     }
     if "lerobot-train --help" in clock:
         ratios = {name: clock["lerobot-train --help"] / clock[name] for name in ours}
@@ -77,6 +83,25 @@ def summarise(clock: dict[str, float], processor: dict[str, float]) -> dict[str,
         summary["goal_times_faster"] = LEAST_RATIO
         summary["goal_times_faster_met"] = all(r >= LEAST_RATIO for r in ratios.values())
     return summary
+
+
+def install_many(site: Path) -> None:
+    """Metadata of distributions as pip leaves it, with readmes of some length."""
+    readme = "A line of a readme, as long as they are wont to be.\n" * 200
+    for number in range(DISTRIBUTIONS):
+        name = f"filler-{number}"
+        folder = site / f"filler_{number}-1.0.dist-info"
+        folder.mkdir(parents=True)
+        about = (
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\nRequires-Dist: numpy\n\n{readme}"
+        )
+        (folder / "METADATA").write_text(about)
+        (folder / "RECORD").write_text(f"filler_{number}.py,,\n")
+        points = f"[console_scripts]\n{name} = filler_{number}:main\n"
+        if number < WITH_PLUGINS:
+            points += f"[fluxvla.transforms]\nFiller{number} = filler_{number}:Filler\n"
+        if number % 4 == 0 or number < WITH_PLUGINS:  # most distributions have none
+            (folder / "entry_points.txt").write_text(points)
 
 
 def main() -> int:
@@ -92,6 +117,10 @@ def main() -> int:
         "fluxvla plugins list": [program, "plugins", "list"],
     }
     env = _lerobot.prepared()
+    folder = tempfile.TemporaryDirectory(prefix="fluxvla-startup-")
+    install_many(Path(folder.name))
+    crowded = ["/usr/bin/env", f"PYTHONPATH={folder.name}", program, "plugins", "list"]
+    commands[CROWDED] = crowded
     if env is not None:
         commands["lerobot-train --help"] = [str(env.bin / "lerobot-train"), "--help"]
     summary = {
@@ -100,6 +129,7 @@ def main() -> int:
         "rounds": args.rounds,
         **summarise(*measure(commands, args.rounds)),
     }
+    folder.cleanup()
     _results.keep(args.out, summary)
     return 0
 

@@ -58,7 +58,7 @@ def main() -> int:
     found = {fault.name: measured(fault, results[fault.name]) for fault in faults}
     if args.only:
         kept = json.loads(args.out.read_text(encoding="utf-8"))["faults"]
-        found = {**kept, **found}
+        found = {fault.name: {**kept, **found}[fault.name] for fault in FAULTS}
     summary = {
         **begun,
         "what": "from a fault to the receipt of the command at which the arm rests",

@@ -4,18 +4,18 @@ In one terminal the robot:
 
     fluxvla sim aloha --ros2 --cameras top --height 144 --width 192
 
-and in another the policy, from the work dir that the training made:
+and in another the policy, from the work dir of the training (here the demo's):
 
     fluxvla run --config configs/aloha_sim_ros2.py --section inference --task 1 \
-        --work-dir work_dirs/aloha_sim_transfer
+        --work-dir demo_out/default/work
 
 How often it succeeds, over as many cube positions, in real time:
 
     fluxvla run --config configs/aloha_sim_ros2.py --section eval \
-        --work-dir work_dirs/aloha_sim_transfer
+        --work-dir demo_out/default/work
 
 On a machine that cannot simulate and think in real time, ``--real-time-factor 0.5`` there and
-``--set inference.operator.real_time_factor+=0.5`` here slow both down alike. On a real robot
+``--set inference.operator.real_time_factor=0.5`` here slow both down alike. On a real robot
 ``operator.type`` is ``AlohaOperator``: its ``preset`` has the topics of AgileX (the default) or of
 Interbotix, ``arms`` the limits.
 """

@@ -8,5 +8,5 @@ from fluxvla_core.cli.main import main
 if __name__ == "__main__":
     code = main()
     if ranks.world_size() is not None:
-        ranks.leave(code)
+        ranks.exit_now(code)
     sys.exit(code)

@@ -11,14 +11,16 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.config import keys
-from fluxvla_core.config.check import INJECTED
-from fluxvla_core.config.values import misfits
+from fluxvla_core.config.inspection import misfits, option_fields
+from fluxvla_core.config.resolve import INJECTED
+from fluxvla_core.config.signature import OPTIONS_KEYWORDS
+from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
+from fluxvla_core.registries import ROWS, RegistryRow
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,12 @@ class RunContext:
         resume: ``auto``, a checkpoint's path, or None.
         origins: dotted config key -> ``file:line``.
         config_file: the file that was named on the command line.
-        task: ``--task``: an id from the config or an instruction in words.
+        task: ``--task``: an id from the config, or the instruction that it stands for.
         task_file: ``--tasks``: a file with one of these a line.
-        nproc: ``--nproc``: how many processes work on this. Refused where a runner neither trains
-            nor has ``workers``, which it overrides.
+        free_task: ``--free-task``: other instructions are allowed, too.
+        nproc: ``--nproc``: how many processes work on this; where nobody said, 1 for a training
+            and None otherwise. Refused where a runner neither trains nor has ``workers``, which it
+            overrides.
         reporter: where progress goes.
     """
 
@@ -47,7 +51,8 @@ class RunContext:
     config_file: str | None = None
     task: str | None = None
     task_file: str | None = None
-    nproc: int = 1
+    free_task: bool = False
+    nproc: int | None = None
     reporter: Reporter = field(default_factory=SilentReporter)
 
     def where(self, key: str) -> str | None:
@@ -118,7 +123,7 @@ def takes(cfg: Any, registry: Registry, name: str) -> bool:
 
 
 def parameters(cls: type) -> set[str]:
-    """Names that a constructor takes, following ``**kwargs`` into its base classes."""
+    """Names that a constructor takes, following ``**kwargs`` into its base classes and Options."""
     names: set[str] = set()
     for base in inspect.getmro(cls):
         init = base.__dict__.get("__init__")
@@ -126,7 +131,10 @@ def parameters(cls: type) -> set[str]:
             continue
         found = inspect.signature(init).parameters
         names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
-        if not any(p.kind is p.VAR_KEYWORD for p in found.values()):
+        kwargs = [n for n, p in found.items() if p.kind is p.VAR_KEYWORD]
+        if kwargs == [OPTIONS_KEYWORDS]:
+            names |= {one.name for one in option_fields(cls)}
+        if not kwargs:
             break
     return names - {"self"}
 
@@ -139,8 +147,8 @@ def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) ->
     table = _key_of(cfg, context.config) if context is not None else None
     problems = [
         Problem(
-            context.origins.get(keys.child(table, one.name), "") if context and table else "",
-            keys.child(table or "", one.name),
+            context.origins.get(join_key(table, one.name), "") if context and table else "",
+            join_key(table or "", one.name),
             f"{cls.__name__}: {one}",
         )
         for one in wrong
@@ -168,7 +176,7 @@ def _key_of(cfg: Any, tree: Any, key: str = "") -> str | None:
     """The key under which this very table stands."""
     items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
     for name, value in items:
-        inner = keys.child(key, name)
+        inner = join_key(key, name)
         if value is cfg:
             return inner
         if isinstance(value, Mapping | list | tuple):
@@ -178,32 +186,33 @@ def _key_of(cfg: Any, tree: Any, key: str = "") -> str | None:
     return None
 
 
-def _builder(registry: str, kind: str) -> Callable[..., Any]:
+def _builder(row: RegistryRow) -> Callable[..., Any]:
     def build(cfg: Any, context: RunContext | None = None, **defaults: Any) -> Any:
-        return build_from_cfg(cfg, BY_NAME[registry], context, **defaults)
+        return build_from_cfg(cfg, BY_NAME[row.name], context, **defaults)
 
-    build.__name__ = build.__qualname__ = f"build_{kind}_from_cfg"
-    build.__doc__ = (
-        f"Build what a table of fluxvla.{registry} describes; see :func:`build_from_cfg`."
-    )
+    build.__name__ = build.__qualname__ = str(row.builder)
+    build.__doc__ = f"Build what a table of {row.group} describes; see :func:`build_from_cfg`."
     return build
 
 
-build_runner_from_cfg = _builder("runners", "runner")
-build_operator_from_cfg = _builder("operators", "operator")
-build_vla_from_cfg = _builder("vlas", "vla")
-build_vision_backbone_from_cfg = _builder("vision_backbones", "vision_backbone")
-build_llm_backbone_from_cfg = _builder("llm_backbones", "llm_backbone")
-build_vlm_backbone_from_cfg = _builder("vlm_backbones", "vlm_backbone")
-build_projector_from_cfg = _builder("projectors", "projector")
-build_head_from_cfg = _builder("heads", "head")
-build_dataset_from_cfg = _builder("datasets", "dataset")
-build_transform_from_cfg = _builder("transforms", "transform")
-build_collator_from_cfg = _builder("collators", "collator")
-build_tokenizer_from_cfg = _builder("tokenizers", "tokenizer")
-build_processor_from_cfg = _builder("processors", "processor")
-build_metric_from_cfg = _builder("metrics", "metric")
-build_optimizer_from_cfg = _builder("optimizers", "optimizer")
-build_action_filter_from_cfg = _builder("action_filters", "action_filter")
-build_environment_from_cfg = _builder("environments", "environment")
-build_policy_from_cfg = _builder("policies", "policy")
+if TYPE_CHECKING:  # the names that the table makes; a test compares them
+    build_runner_from_cfg: Callable[..., Any]
+    build_operator_from_cfg: Callable[..., Any]
+    build_vla_from_cfg: Callable[..., Any]
+    build_vision_backbone_from_cfg: Callable[..., Any]
+    build_llm_backbone_from_cfg: Callable[..., Any]
+    build_vlm_backbone_from_cfg: Callable[..., Any]
+    build_projector_from_cfg: Callable[..., Any]
+    build_head_from_cfg: Callable[..., Any]
+    build_dataset_from_cfg: Callable[..., Any]
+    build_transform_from_cfg: Callable[..., Any]
+    build_collator_from_cfg: Callable[..., Any]
+    build_tokenizer_from_cfg: Callable[..., Any]
+    build_processor_from_cfg: Callable[..., Any]
+    build_metric_from_cfg: Callable[..., Any]
+    build_optimizer_from_cfg: Callable[..., Any]
+    build_action_filter_from_cfg: Callable[..., Any]
+    build_environment_from_cfg: Callable[..., Any]
+    build_policy_from_cfg: Callable[..., Any]
+else:
+    globals().update({row.builder: _builder(row) for row in ROWS if row.builder})

@@ -21,7 +21,45 @@ FluxError                     1
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Literal
+
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_DONE",
+    "EXIT_FAILED",
+    "EXIT_INTERRUPTED",
+    "AmbiguousPlugin",
+    "CheckpointError",
+    "ConfigError",
+    "DataError",
+    "Faulted",
+    "FluxError",
+    "IncompatiblePlugin",
+    "LoadFailed",
+    "MissingPlugin",
+    "NotReady",
+    "OperatorError",
+    "PluginError",
+    "Problem",
+    "Rejected",
+    "RunFailed",
+    "SafetyStop",
+    "SpecMismatch",
+    "UsageError",
+]
+
+# Control characters but for tabs and line ends; marks without width and those that turn the
+# direction of writing; halves of surrogate pairs, which cannot be encoded.
+_STEERING = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+    r"\ud800-\udfff\U000e0000-\U000e007f]"
+)
+
+_LISTED = 200  # problems of a config
+
+EndReason = Literal["stopped", "rank lost", "work dir lost"]
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -36,7 +74,7 @@ class FluxError(Exception):
         what: the finding in one sentence, without a trailing full stop.
         where: ``file:line: dotted.key`` or a path; shown before ``what``.
         cause: the likely cause, if the finding alone does not say it.
-        next: the command, or the change, that mends it or tells more.
+        next: the command, or the change, that mends it or shows more.
     """
 
     exit_code = EXIT_FAILED
@@ -74,6 +112,14 @@ def _rebuild(
     return cls(what, where=where, cause=cause, next=next)
 
 
+def printable(text: str) -> str:
+    """``text`` for a terminal: what would steer it, or hide or reorder text, as escapes.
+
+    Names and messages may come from files that somebody else wrote.
+    """
+    return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
 @dataclass(frozen=True)
 class Problem:
     """One finding in a config; a ``ConfigError`` carries all of them.
@@ -107,7 +153,9 @@ class ConfigError(FluxError):
         """One error that lists all ``problems``, one a line."""
         count = len(problems)
         head = "1 problem in the config" if count == 1 else f"{count} problems in the config"
-        error = cls("\n".join([f"{head}:", *(f"  {p}" for p in problems)]), next=next)
+        listed = [f"  {problem}" for problem in problems[:_LISTED]]
+        listed += [f"  and {count - _LISTED} more"] if count > _LISTED else []
+        error = cls("\n".join([f"{head}:", *listed]), next=next)
         error.problems = problems
         return error
 
@@ -153,7 +201,27 @@ class CheckpointError(FluxError):
 
 
 class RunFailed(FluxError):
-    """Work that was under way could not be finished (disk full, worker lost)."""
+    """Work that was under way could not be finished (disk full, worker lost).
+
+    Args:
+        reason: what ended it, where others act on that: a signal or whoever started it asked it
+            to stop, another process of the same training is gone, or its work dir is.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        cause: str | None = None,
+        next: str | None = None,
+        reason: EndReason | None = None,
+    ) -> None:
+        super().__init__(what, where=where, cause=cause, next=next)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (*super().__reduce__(), {"reason": self.reason})
 
 
 class OperatorError(FluxError):

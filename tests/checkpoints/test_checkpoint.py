@@ -14,7 +14,7 @@ import pytest
 
 from fluxvla_core.checkpoints import checkpoint
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, newest_whole
-from fluxvla_core.checkpoints.manifest import read_manifest
+from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, read_manifest
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
@@ -69,7 +69,7 @@ def test_json_that_is_no_object_is_named(tmp_path, text):
     path = write(tmp_path, 1)
     (path / "policy.json").write_text(text)
     with pytest.raises(
-        CheckpointError, match=r"policy\.json (holds no JSON object|cannot be read)"
+        CheckpointError, match=r"policy\.json: (input should be an object|invalid JSON)"
     ):
         Checkpoint.open(path).policy()
 
@@ -129,18 +129,17 @@ def test_a_file_that_cannot_be_read_is_named_and_passed_over(tmp_path, monkeypat
 
 def test_a_folder_that_cannot_be_looked_into_is_passed_over(tmp_path, monkeypatch):
     first, second = write(tmp_path, 1), write(tmp_path, 2)
-    look, read = Path.is_file, Path.read_bytes
 
     def denied(operation):
-        def act(path):
-            if path.parent == second:
+        def act(path, *arguments, **named):
+            if Path(path).parent == second:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-            return operation(path)
+            return operation(path, *arguments, **named)
 
         return act
 
-    monkeypatch.setattr(Path, "is_file", denied(look))
-    monkeypatch.setattr(Path, "read_bytes", denied(read))
+    monkeypatch.setattr(Path, "is_file", denied(Path.is_file))
+    monkeypatch.setattr(os, "open", denied(os.open))
     found, (refused,) = newest_whole(tmp_path)
     assert found.path == first
     assert "manifest.json cannot be read" in refused.what
@@ -209,3 +208,61 @@ def test_newest_whole_says_what_it_passed_over(tmp_path):
         "policy.json is missing from the checkpoint",
     ]
     assert newest_whole(tmp_path / "nowhere") == (None, [])
+
+
+def relisted(path, name):
+    """The checkpoint at ``path`` lists ``name`` too, with a sum of its own that fits."""
+    found = read_manifest(path)
+    manifest = Manifest(1, 0, {**found.files, name: FileEntry(3, "0" * 64)}).to_bytes()
+    (path / "manifest.json").write_bytes(manifest)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../outside", "a/../../outside", "", "a//b", "."])
+def test_files_outside_the_folder_are_refused_by_name(tmp_path, name):
+    path = write(tmp_path, 1)
+    relisted(path, name)
+    with pytest.raises(CheckpointError, match="no path inside") as caught:
+        Checkpoint.open(path)
+    assert repr(name) in str(caught.value)
+
+
+def test_links_out_of_the_folder_are_refused_by_name(tmp_path):
+    path = write(tmp_path, 1)
+    secret = tmp_path / "secret"
+    secret.write_text("{}")
+    policy = path / "policy.json"
+    policy.unlink()
+    policy.symlink_to(secret)
+    with pytest.raises(CheckpointError, match=r"'policy\.json', which leads out of the checkpoint"):
+        Checkpoint.open(path)
+    policy.unlink()
+    policy.symlink_to("embodiment.json")  # within the folder
+    Checkpoint.open(path)
+    moved = tmp_path / "best"
+    moved.symlink_to(path)
+    Checkpoint.open(moved)
+
+
+def test_a_manifest_that_is_no_file_is_refused_at_once(tmp_path):
+    path = write(tmp_path, 1)
+    manifest = path / "manifest.json"
+    manifest.unlink()
+    os.mkfifo(manifest)
+    with pytest.raises(CheckpointError, match=r"manifest\.json is no regular file"):
+        Checkpoint.open(path)
+    manifest.unlink()
+    manifest.symlink_to("/dev/zero")
+    with pytest.raises(CheckpointError, match=r"manifest\.json is no regular file"):
+        Checkpoint.open(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("step", "Infinity"), ("step", "-1"), ("epoch", '"3"'), ("files", "[1]")]
+)
+def test_wrong_types_in_the_manifest_are_named(tmp_path, key, value):
+    path = write(tmp_path, 1)
+    body = json.loads((path / "manifest.json").read_text())
+    text = json.dumps(body | {key: "HERE"}).replace('"HERE"', value)
+    (path / "manifest.json").write_text(text)
+    with pytest.raises(CheckpointError, match=f"manifest.json is damaged: {key}"):
+        Checkpoint.open(path)

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 
 from fluxvla_core.checkpoints import owner
 from fluxvla_core.checkpoints.owner import LOCK, claim
-from fluxvla_core.errors import UsageError
+from fluxvla_core.errors import RunFailed, UsageError
 
 OWNER = """
 import os, sys, time
@@ -119,3 +120,61 @@ def test_a_file_system_without_locks_is_said(tmp_path, monkeypatch):
         f"{tmp_path}/{LOCK} cannot be locked (No locks available): nothing keeps a second training "
         "out of this work dir"
     ]
+
+
+@pytest.mark.parametrize("locks", [True, False])
+@pytest.mark.parametrize("how", ["removed", "moved", "another is there", "a link leads elsewhere"])
+def test_a_work_dir_that_was_taken_away_is_noticed(tmp_path, monkeypatch, how, locks):
+    work, moved = tmp_path / "work", tmp_path / "moved"
+    real = moved if how == "a link leads elsewhere" else work
+    saved = real / "checkpoints/step-000000003"
+    saved.mkdir(parents=True)
+    (saved / "manifest.json").write_text("{}")
+    if real is not work:
+        work.symlink_to(real)
+    if not locks:
+        monkeypatch.setattr(fcntl, "lockf", no_locks)
+    with (
+        closing(claim(work, lambda text: None)) as outer,
+        closing(claim(work, pytest.fail)) as mine,
+    ):
+        mine.check()
+        if how == "removed":
+            shutil.rmtree(work)
+        elif how == "a link leads elsewhere":
+            work.unlink()
+        else:
+            work.rename(moved)
+        if how in ("another is there", "a link leads elsewhere"):
+            work.mkdir()
+        for held in (outer, mine):
+            with pytest.raises(RunFailed, match=f"the work dir {work} was taken away") as caught:
+                held.check()
+    text = str(caught.value)
+    if how == "removed":
+        assert "likely cause: it was removed; what was saved there is gone with it\n" in text
+    else:
+        assert f"; the newest checkpoint is {moved}/checkpoints/step-000000003\n" in text
+        assert f"--work-dir {moved} --resume auto" in text
+        assert ("was left as it is" in text) == (how != "moved")
+
+
+def test_a_lock_that_was_removed_lets_another_in_and_is_noticed(tmp_path):
+    with closing(claim(tmp_path, pytest.fail)) as mine:
+        (tmp_path / LOCK).unlink()
+        with pytest.raises(RunFailed, match=r"run\.lock in it was removed or replaced"):
+            mine.check()
+
+
+def test_a_server_that_does_not_answer_takes_nothing_away(tmp_path, monkeypatch):
+    with closing(claim(tmp_path, pytest.fail)) as mine:
+
+        def times_out(path):
+            raise OSError(errno.ETIMEDOUT, "Connection timed out")
+
+        monkeypatch.setattr(os, "stat", times_out)
+        mine.check()
+
+
+def no_locks(*args):
+    raise OSError(errno.ENOLCK, "No locks available")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import struct
+import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
+from fluxvla_core.checkpoints.parts import StoredTensors
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names, read_tensors
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
@@ -108,3 +112,62 @@ def test_check_names_lists_what_differs():
         "  next: resume with the config that made it: config.resolved.json in its folder"
     )
     check_names(ours, ours, "the weights", "/ckpt")
+
+
+def with_header(path, header, length=None):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text)
+    return path
+
+
+def test_headers_larger_than_any_models_are_refused_before_they_are_parsed(tmp_path):
+    entry = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
+    many = with_header(tmp_path / "many", {f"{i:06d}": entry for i in range(600_000)})
+    few = with_header(tmp_path / "few", {f"{i:06d}": entry for i in range(150_000)})
+    stated = with_header(tmp_path / "stated", {}, 1 << 60)
+    begin = time.perf_counter()
+    for path, fact in ((many, "16 MiB"), (few, "150000 tensors"), (stated, "16 MiB")):
+        for read in (read_tensors, lambda path: StoredTensors([path])):
+            with pytest.raises(CheckpointError, match=fact):
+                read(path)
+    assert time.perf_counter() - begin < 10
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"[" * 100_000,
+        {"a": {"dtype": "F32", "shape": [1 << 62, 4], "data_offsets": [0, 0]}},
+        {"a": {"dtype": "F32", "shape": "x", "data_offsets": [0, 0]}},
+        {"__metadata__": {"aliases": "[1]"}},
+        {"__metadata__": {"aliases": '{"a": "b"}'}},
+        {"__metadata__": {"aliases": "[" * 10_000}},
+    ],
+)
+def test_headers_of_other_types_are_named(tmp_path, header):
+    path = with_header(tmp_path / "odd.safetensors", header)
+    with pytest.raises(CheckpointError, match=r"odd\.safetensors"):
+        read_tensors(path)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"DCP_SHARDING_INFO": "[]"},
+        {"DCP_SHARDING_INFO": '{"a": {"saved_offsets": "x"}}'},
+        {"DCP_SHARDING_INFO": '{"b": {"saved_offsets": [0]}}'},
+        {"DCP_SHARDING_INFO": '{"a": {"saved_offsets": [0, 0]}}'},
+        {"shapes": '{"a": [1, 2, 3]}'},
+    ],
+)
+def test_places_of_parts_are_checked(tmp_path, metadata):
+    entry = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
+    path = with_header(tmp_path / "odd.safetensors", {"__metadata__": metadata, "a": entry})
+    with pytest.raises(CheckpointError, match=r"odd\.safetensors"):
+        StoredTensors([path])
+
+
+def test_tensors_in_a_pipe_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(CheckpointError, match="no regular file"):
+        read_tensors(tmp_path / "pipe")

@@ -5,21 +5,21 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.checkpoints.disk import Disk
-from fluxvla_core.checkpoints.shelf import (
+from fluxvla_core.checkpoints.directory import (
     clear_leftovers,
     name_best,
     prepare,
     rotate,
     set_aside_later,
 )
-from fluxvla_core.checkpoints.writer import CheckpointWriter
+from fluxvla_core.checkpoints.writer import CheckpointWriter, Disk
 from fluxvla_core.errors import RunFailed, UsageError
 
 
@@ -265,3 +265,14 @@ def test_no_permission_is_refused_before_training(tmp_path):
             os._exit(7 if "Permission denied" in str(error) else 8)
         os._exit(9)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
+
+
+def test_a_folder_that_was_removed_meanwhile_is_not_made_again(tmp_path):
+    writer = CheckpointWriter(tmp_path / "work", 5, 0)
+    writer.begin()
+    shutil.rmtree(tmp_path / "work")
+    writer.fill_folder("processors", lambda folder: None)
+    writer.write_bytes("random/rank-00000.safetensors", b"x")
+    with pytest.raises(RunFailed, match="No such file or directory"):
+        writer.commit()
+    assert list(tmp_path.iterdir()) == []

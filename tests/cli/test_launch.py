@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.cli import launch, ranks
+from fluxvla_core.cli.main import _end_reason
 from fluxvla_core.cli.ranks import Failure, root_cause
 from fluxvla_core.errors import RunFailed
 
@@ -86,7 +88,9 @@ def test_two_ranks_train_and_one_talks(write: Write) -> None:
             "rank 1 dies",
             1,
             "rank 1 ended without a word: killed by SIGKILL\n"
-            "  likely cause: killed from outside, most often for want of memory\n",
+            "  likely cause: this machine, or its container, ran out of memory (dmesg tells), or "
+            "somebody killed it\n"
+            "  next: go on with the same command and --resume auto\n",
         ),
     ],
 )
@@ -111,7 +115,14 @@ def waiting(process: subprocess.Popen[str]) -> list[int]:
 @torch
 @pytest.mark.parametrize(
     ("number", "code", "text"),
-    [(signal.SIGINT, 130, "interrupted\n"), (signal.SIGTERM, 1, "stopped by SIGTERM\n")],
+    [
+        (
+            signal.SIGINT,
+            130,
+            "interrupted: go on with the same command and --resume auto\n",
+        ),
+        (signal.SIGTERM, 1, "stopped by SIGTERM\n"),
+    ],
 )
 def test_signals_reach_the_ranks(write: Write, number: int, code: int, text: str) -> None:
     process = start("--set", "runner.mode+=wait")
@@ -261,7 +272,7 @@ def test_a_launched_rank_that_is_done_says_so(
 ) -> None:
     second_of_two(monkeypatch, tmp_path)
     assert run("--config", "c.py", "--section", "runner").code == 0
-    assert (ranks.done(tmp_path), ranks.failures(tmp_path)) == ({1: 0}, {})
+    assert (ranks.finished(tmp_path), ranks.failures(tmp_path)) == ({1: 0}, {})
 
 
 def test_a_signal_after_all_ranks_were_done_is_no_failure(
@@ -270,10 +281,10 @@ def test_a_signal_after_all_ranks_were_done_is_no_failure(
     def ended(rank: str, attempt: str) -> None:
         monkeypatch.setenv("RANK", rank)
         monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", attempt)
-        ranks.record_done(signal.SIGTERM)
+        ranks.record_finished(signal.SIGTERM)
 
     monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
-    assert ranks.record("a.mp4: bad data", 2, expected=True)
+    assert ranks.record_failure("a.mp4: bad data", 2, expected=True)
     ended("0", "1")
     with pytest.raises(RunFailed, match=r"^1 of 2 ranks were killed"):
         launch._signalled(signal.SIGTERM, tmp_path, 2, tmp_path, 5)
@@ -285,7 +296,7 @@ def test_a_record_that_a_full_disk_cut_off_hides_no_other(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
-    assert ranks.record("a.mp4: bad data", 2, expected=True)
+    assert ranks.record_failure("a.mp4: bad data", 2, expected=True)
 
     def cut(path: Path, *args: object, **settings: object) -> None:
         path.touch()
@@ -294,7 +305,7 @@ def test_a_record_that_a_full_disk_cut_off_hides_no_other(
     monkeypatch.setenv("RANK", "1")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_text", cut)
-        assert not ranks.record("rank 1 says it on the terminal", 1, expected=True)
+        assert not ranks.record_failure("rank 1 says it on the terminal", 1, expected=True)
     assert [path.name for path in tmp_path.iterdir()] == ["rank-0.0.json"]
     (tmp_path / "rank-2.0.json").touch()
     assert list(ranks.failures(tmp_path)) == [0]
@@ -323,18 +334,31 @@ def test_a_rank_that_lost_another_is_no_cause(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path))
-    assert ranks.record("rank 0 of 2 lost another rank during step 14\n  …", 1, expected=True)
+    said = "rank 0 of 2 lost another rank during step 14\n  …"
+    assert ranks.record_failure(said, 1, expected=True, reason="rank lost")
     (lost,) = ranks.failures(tmp_path).values()
     assert lost.asked
-    killed = Failure(1, lost.time + 1, "ended without a word", 1, wordless=True)
+    killed = Failure(1, lost.time + 1, "ended without a word", 1, silent=True)
     assert root_cause([lost, killed]) is killed
+
+
+def test_why_a_run_ended_is_a_field() -> None:
+    stopped = RunFailed("stopped by SIGTERM", next="go on", reason="stopped")
+    sent = pickle.loads(pickle.dumps(stopped))  # noqa: S301 - of this very test
+    assert (str(sent), sent.next, sent.reason) == (str(stopped), "go on", "stopped")
+    assert _end_reason(stopped) == "stopped"
+    assert _end_reason(RunFailed("the text stopped by SIGTERM alone says nothing")) is None
+    closing = OSError("while closing")
+    closing.__context__ = stopped
+    assert _end_reason(closing) == "stopped"
+    assert _end_reason(KeyboardInterrupt()) is None
 
 
 def test_the_root_cause() -> None:
     asked = Failure(0, 1.0, "training was stopped by SIGTERM", 1, expected=True, asked=True)
     broken = Failure(1, 2.0, "RuntimeError: connection closed", 1)
     later = Failure(2, 2.5, "RuntimeError: connection closed", 1)
-    killed = Failure(3, 3.0, "ended without a word", 1, wordless=True)
+    killed = Failure(3, 3.0, "ended without a word", 1, silent=True)
     named = Failure(4, 4.0, "a.mp4: bad data", 2, expected=True)
     assert root_cause([asked, broken, later, killed, named]) is named
     assert root_cause([asked, broken, later, killed]) is killed

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.cli import main as main_module
-from fluxvla_core.cli.main import main
-from fluxvla_core.cli.table import COMMANDS, Entry
+from fluxvla_core.cli.main import COMMANDS, Entry, main
 from fluxvla_core.errors import DataError
 from tests.conftest import Install
 
@@ -179,7 +178,7 @@ def test_a_plugins_command_is_listed_without_importing_and_run_by_name(
         entry_points="[fluxvla.commands]\ngreet = acme_greet:Greet\n",
         files={"acme_greet.py": COMMAND},
     )
-    assert "greet           (from acme-greet 1.0)" in fluxvla("--help").out
+    assert "greet           Greets (from acme-greet 1.0)" in fluxvla("--help").out
     assert "acme_greet" not in sys.modules
     assert "no command 'gret'; did you mean 'fluxvla greet'?" in fluxvla("gret").err
     ended = fluxvla("greet", "--name", "you")
@@ -189,6 +188,17 @@ def test_a_plugins_command_is_listed_without_importing_and_run_by_name(
         in fluxvla("greet", "--name", "x", "--nam", "y").err
     )
     assert "Greets." in fluxvla("greet", "--help").out
+
+
+def test_a_known_command_that_is_not_installed_says_how_to_get_it(
+    fluxvla: Fluxvla, install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLUXVLA_PLUGINS", "")
+    install("acme-greet", entry_points="", files={})  # the index is made anew
+    assert fluxvla("report", "work").err == (
+        "fluxvla report comes with fluxvla-report, which is not installed\n"
+        "  next: pip install fluxvla-report\n"
+    )
 
 
 def test_a_broken_command_hurts_only_itself(fluxvla: Fluxvla, install: Install) -> None:

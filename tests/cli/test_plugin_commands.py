@@ -14,7 +14,7 @@ from tests.conftest import Install
 from .conftest import Fluxvla
 
 ARM = '''
-from fluxvla_core.infer import nothing
+from fluxvla_core.robot import nothing
 class Base:
     def __init__(self, rate: int = 30, context=None, **extra): ...
 class Arm(Base):
@@ -68,7 +68,7 @@ def test_a_broken_distribution_is_reported_and_hurts_nobody(fluxvla: Fluxvla, ar
 
 
 def test_nothing_installed(fluxvla: Fluxvla, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fluxvla_core.cli.plugin_list.index", lambda: _metadata.Index({}, ()))
+    monkeypatch.setattr("fluxvla_core.cli.plugin_commands.index", lambda: _metadata.Index({}, ()))
     assert fluxvla("plugins", "list").out == "nothing is installed\n"
 
 
@@ -106,6 +106,36 @@ def test_show_of_what_takes_nothing_or_cannot_be_read(fluxvla: Fluxvla, install:
     assert (
         "cannot work  acme-bare 1.0 provides 'Lost' but its module 'acme_lost'"
         in fluxvla("plugins", "show", "Lost").out
+    )
+
+
+def test_show_says_what_each_key_means(fluxvla: Fluxvla, install: Install) -> None:
+    files = {
+        "acme_doc.py": '''raise RuntimeError("show must not import")
+class Base:
+    """A base.
+
+    Args:
+        rate: commands a second,
+            by default 30.
+        topic: of the base.
+    """
+    def __init__(self, rate=30, topic="/b"): ...
+class Arm(Base):
+    """An arm.
+
+    Args:
+        topic: where it listens.
+    """
+    def __init__(self, topic="/a", **kwargs):
+        super().__init__(**kwargs)
+'''
+    }
+    points = "[fluxvla.operators]\nDocumented = acme_doc:Arm\n"
+    install("acme-doc", entry_points=points, files=files)
+    assert fluxvla("plugins", "show", "Documented").out.endswith(
+        "  keys\n    topic = '/a'\n        where it listens.\n"
+        "    rate = 30\n        commands a second, by default 30.\n"
     )
 
 

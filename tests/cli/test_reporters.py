@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +23,9 @@ import pytest
 from fluxvla_core.cli import reporters
 from fluxvla_core.cli.reporters import (
     JsonReporter,
+    KeepAliveReporter,
     LineReporter,
-    Pace,
+    Throttle,
     make_reporter,
     plain,
     shown,
@@ -76,7 +88,7 @@ def test_progress_is_paced(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_last_step_is_never_left_out() -> None:
-    pace = Pace(1e9)
+    pace = Throttle(1e9)
     assert [pace.due("a", n, 3) for n in (1, 2, 3)] == [True, False, True]
 
 
@@ -121,6 +133,101 @@ def test_a_terminal_gets_bars_and_plain_text() -> None:
     text = out.getvalue()
     for part in ("a [b] c", "[red]careful", "train [x]", "2/2", "loss 0.25", "video: [a].mp4"):
         assert part in text, part
+
+
+def test_a_silence_is_broken_and_a_person_who_types_is_left_alone() -> None:
+    out = io.StringIO()
+    reporter = KeepAliveReporter(LineReporter(out), every=0.2)
+    reporter.info("evaluating a\nsecond line")
+    until(lambda: out.getvalue().count("s since: evaluating a") == 2)
+    reporter.progress("episodes", 1, 4)
+    until(lambda: "s since: episodes 1/4" in out.getvalue())
+    reporter.settle()
+    reporter.info("task id or instruction:")
+    before = out.getvalue()
+    time.sleep(0.6)
+    assert out.getvalue() == before
+    reporter.progress("commands", 1, 300)
+    until(lambda: "s since: commands 1/300" in out.getvalue())
+    reporter.close()
+    assert "fluxvla-keep-alive" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_silence_for_machines() -> None:
+    out = io.StringIO()
+    reporter = KeepAliveReporter(JsonReporter(out), every=0.2)
+    until(lambda: "still" in out.getvalue())
+    reporter.close()
+    record = json.loads(out.getvalue().splitlines()[0])
+    assert (record["kind"], record["what"]) == ("still", "start")
+    assert record["seconds"] >= 0.2
+
+
+def until(holds: Callable[[], bool]) -> None:
+    limit = time.monotonic() + 20
+    while not holds():
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+
+
+METRICS = {
+    "epoch": 0.4,
+    "loss": 0.3166,
+    "grad_norm": 0.8021,
+    "lr": 0.0001726,
+    "step_time": 0.4683,
+    "samples_per_s": 34.16,
+    "data_wait": 0.01903,
+    "memory_gb": 0.8033,
+}
+
+
+@pytest.mark.parametrize("columns", [80, 100, 140])
+def test_count_bar_and_time_left_stay_where_the_terminal_is_narrow(columns: int) -> None:
+    """In a terminal of its own: the program that draws runs behind a real pty."""
+    code = (
+        "import sys, time\n"
+        "from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter\n"
+        "reporter = KeepAliveReporter(make_reporter('text'), every=0.4)\n"
+        "for step in range(340, 344):\n"
+        "    time.sleep(0.3)\n"
+        f"    reporter.progress('train', step, 894, **{METRICS!r})\n"
+        "time.sleep(1.2)\n"
+        "reporter.close()\n"
+    )
+    text = behind_a_terminal([sys.executable, "-c", code], columns)
+    drawn = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", part) for part in re.split(r"[\r\n]+", text)]
+    drawn = [line for line in drawn if line.startswith("train")]
+    assert drawn
+    assert {len(line) for line in drawn if len(line) > columns} == set()
+    last = drawn[-1]
+    assert re.match(r"train +343/894 ━.*━ +\d+:\d\d left ", last)
+    assert "loss 0.3166" in last
+    assert last.rstrip().endswith("…")
+    assert "working" in text
+    assert "since: train 343/894" in text
+
+
+def behind_a_terminal(command: list[str], columns: int) -> str:
+    own, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 30, columns, 0, 0))
+    unset = {"COLUMNS", "LINES", "NO_COLOR"}
+    environment = {k: v for k, v in os.environ.items() if k not in unset}
+    environment["TERM"] = "xterm-256color"
+    child = subprocess.Popen(command, stdout=theirs, stdin=theirs, env=environment)
+    os.close(theirs)
+    parts: list[bytes] = []
+    while True:
+        try:
+            part = os.read(own, 65536)
+        except OSError:  # EIO: nobody holds the other end any more
+            break
+        if not part:
+            break
+        parts.append(part)
+    os.close(own)
+    assert child.wait(60) == 0
+    return b"".join(parts).decode()
 
 
 def test_values() -> None:

@@ -12,9 +12,13 @@ import pytest
 
 from fluxvla_core import atomic
 from fluxvla_core.cli.plan import default_work_dir
+from fluxvla_core.config.load import load_config
+from fluxvla_core.config.overrides import apply_overrides
+from fluxvla_core.config.snapshot import write_resolved
+from fluxvla_core.plugins.registry import RUNNERS
 from tests.conftest import Install
 
-from .conftest import CONFIG, Fluxvla, Write
+from .conftest import CONFIG, TOY, Fluxvla, Write
 
 
 def said(folder: str = "work_dirs/c", rank: int = 0) -> dict[str, object]:
@@ -355,7 +359,11 @@ def test_several_processes_for_a_runner_that_is_one(run: Fluxvla, write: Write) 
             "no space left on the disk while writing big.bin\n"
             "  next: make room and run the same command again, training with --resume auto\n",
         ),
-        ("ctrl-c", 130, "interrupted: saved at step 3\n"),
+        (
+            "ctrl-c",
+            130,
+            "interrupted: saved at step 3\n  next: go on with the same command and --resume auto\n",
+        ),
         ("sigterm", 1, "stopped by SIGTERM\n"),
     ],
 )
@@ -455,9 +463,82 @@ def test_plugin_files_that_cannot_be_used(
         ("out/eval/config.resolved.json", "out/eval"),
         ("trained/eval/config.resolved.json", "trained"),
         ("trained/other/config.resolved.json", "trained/other"),
+        ("exported/config.resolved.json", "work_dirs/exported"),
         ("other.json", "work_dirs/other"),
     ],
 )
 def test_default_work_dirs(write: Write, file: str, folder: str) -> None:
     write("trained/config.resolved.json", "{}")
+    write("exported/manifest.json", "{}")
     assert default_work_dir(Path(file), ["eval", "inference"]) == Path(folder)
+
+
+@pytest.mark.parametrize(
+    ("words", "taken"),
+    [
+        ((), "out/checkpoints/step-000000003"),
+        (("--set", "eval.ckpt_path=mine"), "mine"),
+    ],
+)
+def test_the_config_of_a_checkpoint_means_that_checkpoint(
+    run: Fluxvla, write: Write, words: tuple[str, ...], taken: str
+) -> None:
+    folder = "out/checkpoints/step-000000003"
+    toy = TOY.replace("seeds=1, workers", "seeds=1, ckpt_path=None, workers")
+    write(
+        "toy.py", toy.replace("{self.context.nproc}", "{self.context.config['eval']['ckpt_path']}")
+    )
+    config = apply_overrides(load_config("c.py"), ["eval.ckpt_path+=another"])
+    write(f"{folder}/manifest.json", "{}")
+    write_resolved(Path(folder, "config.resolved.json"), config)
+    ended = run("--config", f"{folder}/config.resolved.json", "--section", "eval", *words)
+    assert ended.code == 0, ended.err
+    assert Path("out/eval.txt").read_text().split()[-1] == taken
+
+
+REFUSING = """
+from fluxvla_core import RUNNERS
+from fluxvla_core.errors import ConfigError
+
+@RUNNERS.register_module()
+class RefusingRunner:
+    def __init__(self, late=False, context=None):
+        self.late, self.folder = late, context.work_dir
+
+    def run_setup(self):
+        if self.late:
+            (self.folder / "found.txt").touch()
+        raise ConfigError("this cannot be meant")
+
+    def run(self): ...
+"""
+
+
+def test_a_refused_run_leaves_no_work_dir(fluxvla: Fluxvla, write: Write) -> None:
+    write("refusing.py", REFUSING)
+    write("r.toml", "[eval]\ntype = 'RefusingRunner'\n")
+    words = ("run", "--plugin", "refusing.py", "--config", "r.toml", "--work-dir")
+    ended = fluxvla(*words, "new/deep/work")
+    assert (ended.code, ended.err) == (2, "this cannot be meant\n")
+    assert not Path("new").exists()
+    RUNNERS.unregister("RefusingRunner")
+    assert fluxvla(*words, "kept/work", "--set", "eval.late=true").code == 2
+    assert Path("kept/work/found.txt").exists()
+    RUNNERS.unregister("RefusingRunner")
+    write("mine/config.resolved.json", "{}")
+    assert fluxvla(*words, "mine").code == 2
+    assert [p.name for p in Path("mine").iterdir()] == ["config.resolved.json"]
+    RUNNERS.unregister("RefusingRunner")
+
+
+def test_ctrl_c_says_how_an_evaluation_goes_on(fluxvla: Fluxvla, write: Write) -> None:
+    text = REFUSING.replace("late=False", "episodes=1, late=False")
+    refused = 'raise ConfigError("this cannot be meant")'
+    write("refusing.py", text.replace(refused, "raise KeyboardInterrupt"))
+    write("r.toml", "[eval]\ntype = 'RefusingRunner'\n")
+    ended = fluxvla("run", "--plugin", "refusing.py", "--config", "r.toml")
+    assert (ended.code, ended.err) == (
+        130,
+        "interrupted: finished episodes are kept\n  next: go on with the same command\n",
+    )
+    RUNNERS.unregister("RefusingRunner")

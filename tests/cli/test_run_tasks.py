@@ -20,3 +20,10 @@ def test_one_of_both_is_enough(run: Fluxvla) -> None:
 
     assert ended.code == 2
     assert "--task and --tasks both say what to do: give one of them" in ended.err
+
+
+def test_a_training_takes_no_free_task(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--free-task")
+
+    assert ended.code == 2
+    assert "--free-task is for a robot, and section 'runner' trains" in ended.err

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config import load_config, write_resolved
+from fluxvla_core.config.load import load_config
+from fluxvla_core.config.snapshot import write_resolved
 from fluxvla_core.errors import ConfigError
 
 from .conftest import Write
@@ -244,10 +247,10 @@ def test_not_utf8(write: Write) -> None:
 def test_a_file_that_may_not_be_read(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write("c.toml", "")
 
-    def refuse(*args: object, **kwargs: object) -> str:
+    def refuse(*args: object, **kwargs: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_text", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     assert message(path) == "c.toml: cannot be read: Permission denied"
 
 
@@ -331,3 +334,79 @@ def test_another_json_is_refused(write: Write) -> None:
     )
     assert "e.json: a: an origin must be 'file:line', got 3" in text
     assert "this has format None" in message(write("f.json", "[1]"))
+
+
+def test_keys_by_the_hundred_thousand_are_refused_at_once(write: Write) -> None:
+    begin = time.perf_counter()
+    text = message(write("c.toml", "".join(f"a{i}=1\n" for i in range(400_000))))
+    assert "more than 1 MiB" in text
+    text = message(write("d.toml", "".join(f"a{i}=1\n" for i in range(90_000))))
+    assert "90000 keys; 5000 are the most" in text
+    assert time.perf_counter() - begin < 10
+
+
+def test_places_of_many_keys_are_found_in_linear_time(write: Write) -> None:
+    lines = [f"a{i} = 'x'\n" for i in range(4_000)]
+    path = write("c.toml", "\n" * 500_000 + "".join(lines))
+    begin = time.perf_counter()
+    assert load_config(path).where("a3999").endswith("c.toml:504000")
+    assert time.perf_counter() - begin < 5
+
+
+@pytest.mark.parametrize("twice", [True, False])
+def test_a_base_that_is_named_again_and_again_is_read_once(write: Write, twice: bool) -> None:
+    for i in range(25):
+        text = f"_base_ = [{', '.join([repr(f'c{i - 1}.toml')] * (2 if twice else 1))}]\n" * (i > 0)
+        path = write(f"c{i}.toml", f"{text}k{i} = {i}\n")
+    assert load_config(path).tree == {f"k{i}": i for i in range(25)}
+
+
+def test_chains_of_bases_have_an_end(write: Write) -> None:
+    for i in range(60):
+        path = write(f"c{i}.toml", f"_base_ = 'c{i - 1}.toml'\n" * (i > 0))
+    assert "a chain of more than 50 files by _base_" in message(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.toml", f"a = {'[' * 450}{']' * 450}"),
+        ("c.toml", f"a = {'[' * 50_000}{']' * 50_000}"),
+        ("c.toml", f"{'a.' * 500}a = 1"),
+        ("c.json", f'{{"format": "fluxvla-config-1", "config": {{"a": {"[" * 450}{"]" * 450}}}}}'),
+        ("c.json", "[" * 100_000),
+        ("c.py", f"a = {'[' * 150}{']' * 150}"),
+        ("c.py", f"a = {'-' * 100_000}1"),
+    ],
+)
+def test_what_is_nested_too_deeply_is_refused(write: Write, name: str, text: str) -> None:
+    assert "nested deeper than 100" in message(write(name, text))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fact"),
+    [
+        ("c.toml", f"a = {'9' * 5000}", "a value cannot be read"),
+        ("c.json", f'{{"a": {"9" * 5000}}}', "a value cannot be read"),
+        (
+            "c.json",
+            '{"format": "fluxvla-config-1", "config": {"a": "\\ud800", "\\udfff": 1}}',
+            "half of a surrogate pair",
+        ),
+        ("c.py", "a = dict(b='\\ud800')", "half of a surrogate pair"),
+    ],
+)
+def test_values_that_cannot_be_kept_are_refused(
+    write: Write, name: str, text: str, fact: str
+) -> None:
+    assert fact in message(write(name, text))
+
+
+def test_files_that_are_none_are_refused_at_once(tmp_path: Path) -> None:
+    pipe, endless, loop = (tmp_path / f"{name}.toml" for name in ("pipe", "endless", "loop"))
+    os.mkfifo(pipe)
+    endless.symlink_to("/dev/zero")
+    loop.symlink_to(loop)
+    assert "is no regular file" in message(pipe)
+    assert "is no regular file" in message(endless)
+    assert "no such config" in message(loop)

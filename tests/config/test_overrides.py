@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from fluxvla_core.config import Config, apply_overrides, keys
+from fluxvla_core.config.overrides import apply_overrides
+from fluxvla_core.config.tree import Config, leaves
 from fluxvla_core.errors import ConfigError
 
 TREE: dict[str, Any] = {
@@ -94,7 +95,7 @@ def test_what_was_there_before_something_was_added_keeps_its_place() -> None:
     config = Config(TREE, {**CONFIG.origins, **origins}, "c.py")
     more = ["runner.op+={y = 2, type = 'B'}", "runner.keys+=['b', 'c']", "transforms.0+={z = 1}"]
     config = apply_overrides(config, more)
-    assert {key: config.where(key) for key, _ in keys.leaves(config.tree)} == {
+    assert {key: config.where(key) for key, _ in leaves(config.tree)} == {
         "runner.max_epochs": "c.py:1",
         "runner.keys": "c.py:4",
         "runner.op.type": f"--set {more[0]}",
@@ -114,11 +115,13 @@ def test_a_key_must_exist() -> None:
     assert refused("runner.max_epoch=3") == (
         "1 problem in the config:\n"
         "  --set runner.max_epoch=3: no 'runner.max_epoch' in the config; did you mean "
-        "'runner.max_epochs'? [to add a new key: --set runner.max_epoch+=...]"
+        "--set runner.max_epochs=3? [to add it: --set runner.max_epoch+=3]"
     )
-    assert "no 'runnr.max_epochs' in the config; did you mean 'runner.max_epochs'?" in refused(
-        "runnr.max_epochs=3"
+    assert "no 'runnr.max_epochs' in the config; did you mean --set runner.max_epochs=3?" in (
+        refused("runnr.max_epochs=3")
     )
+    text = refused("runner.nme={type = 'B'}")
+    assert text.endswith("""[to add it: --set 'runner.nme+={type = '"'"'B'"'"'}']""")
     assert refused("zzz.q.w=3").endswith("no 'zzz.q.w' in the config")
 
 
@@ -144,3 +147,17 @@ def test_all_that_do_not_fit_are_listed() -> None:
     assert "'[1' is no TOML value: " in text
     assert "'.5' is no TOML number; write it as 0.5, or '\".5\"' for text" in text
     assert "'007' is no TOML number; write it as 7, or" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "fact"),
+    [
+        (f"transforms.{'9' * 5000}.height=1", "must be a number"),
+        ("transforms.².height=1", "must be a number"),
+        (f"runner.max_epochs={'9' * 5000}", "thousands of digits"),
+        (f"runner.max_epochs={'[' * 5000}{']' * 5000}", "nested too deeply"),
+        ("runner.max_epochs=\udc80", "half of a surrogate pair"),
+    ],
+)
+def test_what_no_config_can_hold_is_refused(text: str, fact: str) -> None:
+    assert fact in refused(text)

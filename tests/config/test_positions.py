@@ -10,9 +10,8 @@ import tomli
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fluxvla_core.config import keys
-from fluxvla_core.config.py_positions import py_positions
-from fluxvla_core.config.toml_positions import toml_positions
+from fluxvla_core.config.positions import py_positions, toml_positions
+from fluxvla_core.config.tree import all_keys, join_key, leaves, parent_key, split_key
 
 
 def lines(positions: dict[str, str]) -> dict[str, int]:
@@ -190,10 +189,10 @@ def test_every_key_of_a_toml_file_has_the_line_it_is_on(tree: dict[str, dict[str
     expected: dict[str, int] = {}
     for table, pairs in tree.items():
         rows += ["# [comment]", f"[{_quoted(table)}]"]
-        expected[keys.child("", table)] = len(rows)
+        expected[join_key("", table)] = len(rows)
         for name, value in pairs.items():
             rows.append(f"{_quoted(name)} = {_toml(value)} # x = 1")
-            for key in keys.every(value, keys.child(keys.child("", table), name)):
+            for key in all_keys(value, join_key(join_key("", table), name)):
                 expected[key] = len(rows)
     text = "\n".join(rows)
     assert tomli.loads(text) == tree
@@ -205,19 +204,19 @@ def test_every_key_of_a_toml_file_has_the_line_it_is_on(tree: dict[str, dict[str
     [("a", ["a"]), ("a.0.b", ["a", "0", "b"]), (r"a.b\.c", ["a", "b.c"])],
 )
 def test_dotted_keys_split_and_join(key: str, parts: list[str]) -> None:
-    assert keys.split(key) == parts
+    assert split_key(key) == parts
     joined = ""
     for part in parts:
-        joined = keys.child(joined, part)
+        joined = join_key(joined, part)
     assert joined == key
-    assert keys.parent(key) == (
-        keys.child("", parts[0]) if len(parts) == 2 else key[:-2] * (len(parts) > 1)
+    assert parent_key(key) == (
+        join_key("", parts[0]) if len(parts) == 2 else key[:-2] * (len(parts) > 1)
     )
 
 
 def test_leaves_are_what_a_person_would_list() -> None:
     tree = {"a": {"b": [1, 2], "c": [{"d": 1}], "e": {}, "f": []}}
-    assert list(keys.leaves(tree)) == [
+    assert list(leaves(tree)) == [
         ("a.b", [1, 2]),
         ("a.c.0.d", 1),
         ("a.e", {}),

@@ -1,18 +1,25 @@
 from __future__ import annotations
 
+import threading
+from abc import abstractmethod
+
 import pytest
 from torch import nn
 
 from fluxvla_core.config.resolve import installed
-from fluxvla_core.contracts import API
-from fluxvla_core.contracts.check import check_class, is_train_runner, missing_operator_methods
-from fluxvla_core.contracts.methods import MAY_HAVE, NEEDS
-from fluxvla_core.contracts.optional import can_continue
+from fluxvla_core.contracts import Environment, Hook, Operator, Policy
+from fluxvla_core.contracts.check import (
+    check_class,
+    check_operator,
+    is_train_runner,
+    missing_operator_methods,
+)
+from fluxvla_core.contracts.contract import implements, original
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
-from fluxvla_core.hooks import specs
-from fluxvla_core.metrics.vla_metric import VLAMetric
-from fluxvla_core.plugins.groups import REGISTRIES
 from fluxvla_core.plugins.registry import BY_NAME
+from fluxvla_core.registries import REGISTRIES
+from fluxvla_core.train.metrics import VLAMetric
 
 
 class Train:
@@ -61,6 +68,56 @@ def test_what_an_operator_of_the_specifications_shape_lacks():
 
     lacks = missing_operator_methods(Partial())
     assert lacks == ["embodiment", "connect()", "send_action()", "stop()", "close()"]
+
+
+class Sends:
+    def get_frame(self): ...
+    def send_action(self, action): ...
+    def stop(self): ...
+
+
+async def stop_later(self): ...
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "problem"),
+    [
+        ("stop", None, "stop() is missing"),
+        ("stop", 3, "stop is a int, not a method"),
+        ("stop", lambda self, mode: None, "stop() must accept no argument"),
+        ("stop", stop_later, "stop() is async, and nobody awaits it"),
+        ("stop", abstractmethod(lambda self: None), "stop() is abstract"),
+        ("send_action", lambda self, arm, action: None, "send_action() must accept 1 argument"),
+        ("send_action", property(lambda self: None), "send_action is a property, not a method"),
+        ("get_frame", lambda self, timeout: None, "get_frame() must accept no argument"),
+        ("connect", lambda self, address: None, "connect() must accept no argument"),
+        ("close", lambda self, hard: None, "close() must accept no argument"),
+    ],
+)
+def test_an_operator_that_is_sent_actions_can_be_stopped(method, body, problem):
+    check_class("operators", Sends, "here")
+    with pytest.raises(LoadFailed) as caught:
+        check_class("operators", type("Wrong", (Sends,), {method: body}), "here")
+    assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["connect", "stop", "close"])
+def test_what_an_operator_of_the_specifications_shape_has_takes_what_it_is_given(method):
+    shape = {"get_frame": lambda self: {}, "servoj": lambda self, joints: None}
+    check_class("operators", type("Bare", (), shape), "here")
+    with pytest.raises(LoadFailed, match=rf"{method}\(\) must accept no argument"):
+        check_class("operators", type("Bare", (), {**shape, method: lambda self, x: None}), "here")
+
+
+def test_an_attribute_that_hides_a_method_is_found_in_the_object():
+    operator = Sends()
+    operator.get_state = lambda: None
+    check_operator(operator)
+
+    operator.stop = threading.Event()
+
+    with pytest.raises(LoadFailed, match=r"constructor of Sends hides .*: stop is a Event"):
+        check_operator(operator)
 
 
 @pytest.mark.parametrize(
@@ -166,21 +223,12 @@ def test_what_is_enough(registry, cls):
     check_class(registry, cls, "here")
 
 
-def test_the_hooks_are_those_that_are_called():
-    assert {name for one in NEEDS["hooks"] for name in one} == set(specs.NAMES)
-
-
 def test_whether_a_policy_can_go_on_from_a_chunk():
     able = type("Able", (), {"continue_action": lambda self, observation, rest: None})
 
-    assert can_continue(able())
-    assert not can_continue(type("Unable", (able,), {"continues": False})())
-    assert not can_continue(object())
-
-
-def test_every_registry_has_a_contract_and_its_version():
-    assert tuple(API) == tuple(NEEDS) == REGISTRIES
-    assert set(MAY_HAVE) <= set(REGISTRIES)
+    assert Policy.adapt(able()).continues
+    assert not Policy.adapt(type("Unable", (able,), {"continues": False})()).continues
+    assert not Policy.adapt(object()).continues
 
 
 @pytest.mark.parametrize("registry", REGISTRIES)
@@ -199,3 +247,112 @@ def test_a_class_for_another_contract_is_refused_in_every_registry(install, regi
         there.get("Late")
     with pytest.raises(IncompatiblePlugin, match=message):
         installed(*there.installed()["Late"])
+
+
+def test_a_class_that_inherits_must_bring_what_is_abstract():
+    class Half(Operator):
+        def connect(self): ...
+        def get_frame(self): ...
+        def send_action(self, action): ...
+        def close(self): ...
+
+    with pytest.raises(LoadFailed, match=r"stop\(\) is missing"):
+        check_class("operators", Half, "here")
+    check_class("operators", type("Whole", (Half,), {"stop": lambda self: None}), "here")
+    body = {"stop": lambda self: None, "begin_episode": lambda self, task: None}
+    with pytest.raises(LoadFailed, match=r"begin_episode\(\) must accept 2 arguments"):
+        check_class("operators", type("Other", (Half,), body), "here")
+
+
+def test_a_model_that_inherits_has_a_forward_all_the_same():
+    with pytest.raises(LoadFailed, match=r"it needs forward\(\), or predict_action\(\)"):
+        check_class("vlas", type("Empty", (VLA, nn.Module), {}), "here")
+    check_class("vlas", type("Fits", (VLA, Fit), {}), "here")
+
+
+def test_a_hook_that_inherits_overrides_something():
+    with pytest.raises(LoadFailed, match=r"it needs run_started\(\), or "):
+        check_class("hooks", type("Typo", (Hook,), {"after_stp": lambda self, step: None}), "here")
+    check_class("hooks", type("Log", (Hook,), {"after_step": lambda self, step: None}), "here")
+
+
+class Scene:
+    """Has what an environment must have, and inherits nothing."""
+
+    def __init__(self):
+        self.spec, self.seeds = "spec", []
+
+    def reset(self, seed, task):
+        self.seeds.append(seed)
+
+    def step(self, action):
+        return action
+
+    def observe(self, cameras): ...
+    def close(self): ...
+    def own(self):
+        return "own"
+
+
+def test_what_inherits_nothing_gets_the_defaults_and_keeps_all_of_its_own():
+    scene = Scene()
+    adapted = Environment.adapt(scene)
+    assert isinstance(adapted, Environment)
+    assert type(adapted).__name__ == "Scene"
+    adapted.reset(3, "t")
+    assert (scene.seeds, adapted.step(5), adapted.own(), adapted.spec) == ([3], 5, "own", "spec")
+    assert (adapted.others("t"), adapted.state_hash(), adapted.divergence()) == ((), None, None)
+    scene.simulation = adapted.spec = "later"
+    assert (adapted.simulation, scene.spec) == ("later", "later")
+    assert original(adapted) is scene
+    assert Environment.adapt(adapted) is adapted
+    assert not implements(adapted, Environment, "others")
+    assert implements(adapted, Environment, "step")
+    with pytest.raises(AttributeError, match="Scene has no state"):
+        _ = adapted.state
+
+
+def test_what_inherits_is_taken_as_it_is():
+    class Still(Policy):
+        def __init__(self):
+            self.horizon = 3
+
+        def reset(self, seed): ...
+        def predict_action(self, observation): ...
+
+    policy = Still()
+    assert Policy.adapt(policy) is policy
+    assert (policy.horizon, policy.stages) == (3, {})
+    assert not hasattr(policy, "embodiment")
+    assert not policy.continues
+
+
+def test_an_object_that_answers_for_another_one_is_asked():
+    class Logged:
+        def __init__(self, operator):
+            self._inner = operator
+
+        def __getattr__(self, name):
+            return getattr(self._inner, name)
+
+    inner = type("Arm", (), {"get_frame": lambda self: 1, "task_done": lambda self: True})()
+    arm = Operator.adapt(Logged(inner))
+    assert arm.get_frame() == 1
+    assert arm.task_done()
+    assert not implements(arm, Operator, "get_state")
+
+
+def test_none_in_the_place_of_a_method_is_no_method():
+    arm = Operator.adapt(type("Arm", (), {"get_frame": lambda self: 1, "stop": None})())
+    assert not implements(arm, Operator, "stop")
+    arm.stop()
+
+
+def test_a_model_that_inherits_can_be_given_another_class_as_fsdp_does():
+    class Sharded:
+        pass
+
+    for bases in ((VLA, nn.Module), (nn.Module, VLA)):
+        model = type("Model", bases, {})()
+        model.__class__ = type("ShardedModel", (Sharded, type(model)), {})
+        assert isinstance(model, Sharded)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -11,9 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from fluxvla_core.cli.main import main
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.metadata import read_metadata
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError, SpecMismatch
 
@@ -85,9 +86,9 @@ def test_info_that_is_no_json_or_not_all(dataset):
     (dataset / "meta/info.json").write_text(json.dumps(info))
     assert "meta/info.json: data_path, fps missing" in refused(dataset)
     (dataset / "meta/info.json").write_text("[1]")
-    assert "meta/info.json: holds a list, not a table" in refused(dataset)
+    assert "meta/info.json: input should be an object" in refused(dataset)
     (dataset / "meta/info.json").write_text("{")
-    assert "meta/info.json: cannot be read as JSON" in refused(dataset)
+    assert "meta/info.json: invalid JSON" in refused(dataset)
 
 
 @pytest.mark.parametrize("keep", [0, 3, 500, -30])
@@ -251,9 +252,22 @@ def test_pictures_of_another_size_than_stated(dataset, capsys):
     info["features"][TOP]["shape"] = [64, 48, 3]
     edit_info(dataset, features=info["features"])
     assert main(["data", "validate", str(dataset)]) == 2
-    assert "is 32 x 48, info.json says 64 x 48" in capsys.readouterr().err
-    with pytest.raises(DataError, match=r"frames of 32 x 48, info\.json says 64 x 48"):
-        load(dataset, cache_frames=True).prepare()
+    assert "frames of 32 x 48, info.json says 64 x 48" in capsys.readouterr().err
+    assert "frames of 32 x 48, info.json says 64 x 48" in refused(dataset)
+
+
+@pytest.mark.parametrize("fps", [0, -10, 9999999, "10", True, None])
+def test_rates_that_are_none(dataset, fps):
+    edit_info(dataset, fps=fps)
+    assert "meta/info.json: fps: input should be" in refused(dataset)
+
+
+def test_videos_of_another_rate_than_stated(dataset, capsys):
+    edit_info(dataset, fps=20)
+    assert main(["data", "validate", str(dataset)]) == 2
+    said = capsys.readouterr().err
+    assert f"{dataset / VIDEO}: 10 frames a second, info.json says 20" in said
+    assert "10 frames a second, info.json says 20" in refused(dataset)
 
 
 def test_rows_that_do_not_begin_at_zero(dataset):
@@ -319,11 +333,95 @@ def test_joints_in_another_order_do_not_go_together(dataset, shared, tmp_path):
 def test_joints_of_other_names_are_doubted(dataset, shared, tmp_path):
     other = shutil.copytree(shared, tmp_path / "other")
     both = [str(rename(dataset, ["a", "b", "c"])), str(rename(other, ["x", "b", "c"]))]
-    doubts = ParquetDataset(both, [], ["top"]).doubts()
-    assert [d for d in doubts if "states have other names: a, b, c / x, b, c" in d]
+    warnings = ParquetDataset(both, [], ["top"]).warnings()
+    assert [d for d in warnings if "states have other names: a, b, c / x, b, c" in d]
     tables = [
         {"type": "ParquetDataset", "data_root_path": b, "transforms": [], "img_keys": ["top"]}
         for b in both
     ]
-    assert DistributedRepeatingDataset(tables).doubts() == doubts
-    assert ParquetDataset([both[0], both[0]], [], ["top"]).doubts() == []
+    assert DistributedRepeatingDataset(tables).warnings() == warnings
+    assert ParquetDataset([both[0], both[0]], [], ["top"]).warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("pattern", "fact"),
+    [
+        ("{chunk_index:0999999999d}", "takes no width but one like 03d"),
+        ("{chunk_index:999}", "takes no width"),
+        ("{chunk_index!r}", "takes no width"),
+        ("{chunk_index:{file_index}}", "takes no width"),
+        ("{chunk_index.__class__}", "there is no {chunk_index.__class__}"),
+        ("{0}", "there is no {0}"),
+        ("{", "no pattern"),
+        ("/etc/passwd", "leads out of the dataset's folder"),
+        ("data/../../{chunk_index}", "leads out of the dataset's folder"),
+        (3, "data_path: input should be a valid string"),
+    ],
+)
+def test_path_patterns_are_no_programs(dataset, pattern, fact):
+    edit_info(dataset, data_path=pattern)
+    assert fact in refused(dataset)
+
+
+def test_camera_names_do_not_lead_out(dataset):
+    meta = read_metadata(dataset)
+    with pytest.raises(DataError, match=r"'\.\./\.\./x' leads out of the dataset's folder"):
+        meta.video_file("../../x", (0, 0))
+
+
+@pytest.mark.parametrize("index", [10**12, -1, 2**60])
+def test_task_numbers_have_a_bound(dataset, index):
+    edit_column(dataset, "meta/tasks.parquet", "task_index", lambda v: [0, index])
+    assert "task_index" in refused(dataset)
+
+
+def test_tables_of_more_rows_than_expected_are_not_unpacked(dataset):
+    """A million equal rows are a few kB on the disk; 10^12 were gigabytes in memory."""
+    table = pq.read_table(dataset / DATA)
+    pq.write_table(pa.concat_tables([table.slice(0, 1)] * 1000), dataset / DATA)
+    assert f"{dataset / DATA}: 28 frames expected, 1000 found" in refused(dataset)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fact"),
+    [
+        ({"features": [1]}, "features: input should be an object"),
+        ({"features": {"a": 3}}, "features.a: input should be"),
+        ({"features": {"a": {"dtype": 3, "shape": [1]}}}, "features.a.dtype"),
+        ({"features": {"a": {"dtype": "float32", "shape": "3"}}}, "features.a.shape"),
+        ({"features": {"a": {"dtype": "float32", "shape": [-1]}}}, "features.a.shape.0"),
+        ({"features": {"a": {"dtype": "video", "shape": [3]}}}, "features.a.shape: a picture is"),
+        ({"features": {"a": {"dtype": "image", "shape": [20000, 20000, 3]}}}, "each side from 1"),
+        ({"features": {"a": {"dtype": "image", "shape": [16000, 16000, 3]}}}, "64 million pixels"),
+        ({"total_frames": "28"}, "total_frames"),
+        ({"total_episodes": 1e400}, "total_episodes"),
+        ({"codebase_version": ["v3.0"]}, "of version"),
+    ],
+)
+def test_wrong_types_are_named_by_their_field(dataset, changes, fact):
+    edit_info(dataset, **changes)
+    assert fact in refused(dataset)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, '{"\\ud800": 1}', "\udc80"])
+def test_json_that_is_nested_deeply_or_no_text(dataset, text):
+    (dataset / "meta/info.json").write_text(text, errors="surrogateescape")
+    assert "meta/info.json: " in refused(dataset)
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", DATA, "meta/tasks.parquet", VIDEO])
+def test_pipes_and_devices_are_not_read(dataset, name):
+    for make in (os.mkfifo, lambda path: os.symlink("/dev/zero", path)):
+        (dataset / name).unlink()
+        make(dataset / name)
+        assert str(dataset) in refused(dataset)
+
+
+def test_a_playlist_that_is_called_mp4_opens_nothing(dataset, tmp_path):
+    """ffmpeg goes by content, and would open whatever files a playlist names."""
+    secret = tmp_path / "secret.mp4"
+    shutil.copy(dataset / VIDEO, secret)
+    (dataset / VIDEO).write_text(
+        f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:2.8,\n{secret}\n#EXT-X-ENDLIST\n"
+    )
+    assert f"{dataset / VIDEO}: cannot be opened as video" in refused(dataset)

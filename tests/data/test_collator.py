@@ -70,7 +70,7 @@ def test_a_key_that_one_sample_lacks_is_named():
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_key_that_only_some_samples_have_is_an_error_whichever_comes_first(turned):
-    """The batch began with one without ``b``: it had none, and nobody was told."""
+    """The batch began with one without ``b``: it had none, and there was no error."""
     samples = [{"a": np.zeros(2)}, {"a": np.zeros(2), "b": np.zeros(2)}]
     with pytest.raises(DataError, match=r"'b' is missing in one sample .* it has \['a'\]"):
         DictCollator(["a", "b"])(samples[::-1] if turned else samples)

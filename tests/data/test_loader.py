@@ -1,12 +1,17 @@
 from __future__ import annotations
 
+import multiprocessing
+import os
 import platform
 import random
 import resource
+import signal
 import subprocess
 import sys
 import time
 from itertools import islice
+from multiprocessing.connection import Client
+from multiprocessing.resource_sharer import DupFd
 from pathlib import Path
 from subprocess import PIPE
 
@@ -17,8 +22,7 @@ import torch
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.loader import make_loader
-from fluxvla_core.data.rng import sample_rng
-from fluxvla_core.data.sampler import EpochSampler, Position
+from fluxvla_core.data.sampler import EpochSampler, Position, sample_rng
 from fluxvla_core.errors import ConfigError, DataError
 
 collate = DictCollator(["x", "noise"])
@@ -123,6 +127,17 @@ def test_making_batches_leaves_the_global_generators_as_they_were():
     assert drawn(0) == drawn(2)
 
 
+def test_what_numpy_draws_beside_a_loader_does_not_depend_on_its_workers():
+    """Numpy keeps every second normal number; where batches are made here it is forgotten."""
+
+    def beside(workers):
+        np.random.seed(1)
+        loader = make_loader(Careless(), collate, EpochSampler(10, 2), workers)
+        return [np.random.standard_normal() for _ in islice(loader, 3)]
+
+    assert beside(0) == beside(2)
+
+
 def test_a_dataset_may_prepare_and_read_a_batch_at_once():
     dataset = Grouped()
     assert equal(batches(3, dataset=dataset), batches(3))
@@ -130,14 +145,14 @@ def test_a_dataset_may_prepare_and_read_a_batch_at_once():
 
 
 def test_preparing_is_reported():
-    told = []
+    reported = []
 
-    class Told(SilentReporter):
+    class Reports(SilentReporter):
         def progress(self, name, done, total, **fields):
-            told.append((name, done, total))
+            reported.append((name, done, total))
 
-    make_loader(Grouped(), collate, EpochSampler(10, 2), reporter=Told())
-    assert told == [("decode frames", 3, 3)]
+    make_loader(Grouped(), collate, EpochSampler(10, 2), reporter=Reports())
+    assert reported == [("decode frames", 3, 3)]
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -157,7 +172,7 @@ def test_an_error_of_the_collator_arrives_too(workers):
 
 
 class Large:
-    """Each sample makes pictures, and tells how many pages of memory it took to do so."""
+    """Each sample makes pictures, and returns how many page faults that took."""
 
     def get_sample(self, index, epoch):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -166,7 +181,7 @@ class Large:
         return {"x": np.int64(after - before), "noise": sum(int(p[0]) for p in pictures)}
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is told to glibc")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is of glibc")
 def test_a_worker_uses_the_memory_of_a_batch_for_the_next_one():
     """22 MB are 5300 pages; each batch got all of them anew."""
     found = batches(6, workers=1, dataset=Large(), collate=DictCollator(["x"], ["noise"]))
@@ -175,13 +190,34 @@ def test_a_worker_uses_the_memory_of_a_batch_for_the_next_one():
     assert max(pages[2:]) < 1000, pages
 
 
+class Handed:
+    """Samples that name the socket where this worker hands its batches over."""
+
+    def get_sample(self, index, epoch):
+        address, _ = DupFd(0)._id
+        return {"x": np.int64(index), "address": address}
+
+
+def test_a_trainer_that_is_gone_while_it_takes_a_batch_is_no_error_of_the_worker(capfd):
+    loader = make_loader(
+        Handed(), DictCollator(["x"], ["address"]), EpochSampler(10, 2), 1, prefetch_factor=1
+    )
+    taken = iter(loader)
+    address = next(taken)["address"][0]
+    Client(address, authkey=multiprocessing.current_process().authkey).close()
+    # Served after that connection, by the same thread.
+    assert [len(next(taken)["x"]) for _ in range(4)] == [2] * 4
+    taken.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_negative_workers_are_refused():
     with pytest.raises(ConfigError, match="per_device_num_workers must be at least 0, got -1"):
         make_loader(Noisy(), collate, EpochSampler(4, 2), -1)
 
 
 TRAINER = """
-import multiprocessing, sys, time
+import multiprocessing, signal, sys, time
 import numpy as np
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.loader import make_loader
@@ -197,19 +233,38 @@ if __name__ == "__main__":
     )
     batches = iter(loader)
     next(batches)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: None)
     print(*(child.pid for child in multiprocessing.active_children()), flush=True)
-    time.sleep(600)
+    sys.stdin.readline()
+    print(sum(len(next(batches)["x"]) for _ in range(20)), flush=True)
+    if sys.argv[2] == "stay":
+        time.sleep(600)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-@pytest.mark.parametrize("context", ["fork", "forkserver", "spawn"])
-def test_workers_end_with_a_trainer_that_is_killed(tmp_path, context):
+@pytest.mark.parametrize(
+    ("context", "end"),
+    [("fork", "stay"), ("fork", "leave"), ("forkserver", "stay"), ("spawn", "stay")],
+)
+def test_workers_end_with_their_trainer_and_of_no_signal_to_its_group(tmp_path, context, end):
+    """The trainer is killed, or ends with its loader still open."""
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER)
-    with subprocess.Popen([sys.executable, str(script), context], stdout=PIPE) as trainer:
-        workers = [Path("/proc", pid) for pid in trainer.stdout.readline().decode().split()]
+    command = [sys.executable, str(script), context, end]
+    with subprocess.Popen(
+        command, stdin=PIPE, stdout=PIPE, text=True, start_new_session=True
+    ) as trainer:
+        workers = [Path("/proc", pid) for pid in trainer.stdout.readline().split()]
         assert len(workers) == 2
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            os.killpg(trainer.pid, number)
+        trainer.stdin.write("go on\n")
+        trainer.stdin.flush()
+        assert trainer.stdout.readline() == "40\n"
+        if end == "leave":
+            assert trainer.wait(60) == 0
         trainer.kill()
     until = time.monotonic() + 120
     while any(worker.exists() for worker in workers):

@@ -13,9 +13,9 @@ import torch
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext
 from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset, first_dataset, shares
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
 from fluxvla_core.train.state import seeds_of
@@ -123,13 +123,13 @@ def test_a_runs_seed_reaches_those_that_have_none(shared, others):
         tables = (table(shared), {**table(others[0]), "seed": 5})
         return mixture(*tables, weights=[1, 3], samples_per_epoch=40, seed=seed)
 
-    told, own = make(), make(1)
-    before = drawn(told, [0])
-    told.use_seed(7)
+    given, own = make(), make(1)
+    before = drawn(given, [0])
+    given.use_seed(7)
     own.use_seed(7)
-    assert seeds_of(told) == [7, 7, 5]
+    assert seeds_of(given) == [7, 7, 5]
     assert seeds_of(own) == [1, 7, 5]
-    assert drawn(told, [0]) == drawn(make(7), [0]) != before
+    assert drawn(given, [0]) == drawn(make(7), [0]) != before
     assert drawn(own, [0]) == drawn(make(1), [0])
 
 
@@ -148,7 +148,7 @@ def test_statistics_of_several_are_those_of_all_frames(shared, others, options):
     whole = build_dataset_from_cfg({**both, "data_root_path": [str(shared), str(others[0])]})
     assert dataset.statistics == whole.statistics
     found = dataset.statistics["private"]["proprio"]
-    states = np.concatenate([d.recordings[0].states for d in dataset.datasets]).astype(float)
+    states = np.concatenate([d.loaded[0].states for d in dataset.datasets]).astype(float)
     np.testing.assert_allclose(found["std"], states.std(0), rtol=1e-12)
     np.testing.assert_array_equal(found["q99"], np.quantile(states, 0.99, axis=0))
     assert found["count"] == [38]
@@ -164,7 +164,7 @@ def test_samples_are_normalised_by_what_they_share(shared, others):
 
 
 def test_statistics_are_computed_once_for_all_that_share_them(shared, others, monkeypatch):
-    from fluxvla_core.data import parquet_dataset
+    from fluxvla_core.data import dataset as parquet_dataset
 
     computed = []
     column_statistics = parquet_dataset.column_statistics
@@ -184,7 +184,7 @@ def test_what_several_doubt_of_shared_statistics_is_said_once(tmp_path, recorder
         still = take(key, 6)
         still.state[:, 1] = 0.5
         roots.append(recorder(tmp_path / str(key), [still]))
-    (said,) = mixture(*(table(root, transforms=[NORMALISE]) for root in roots)).doubts()
+    (said,) = mixture(*(table(root, transforms=[NORMALISE]) for root in roots)).warnings()
     assert "state elbow" in said
 
 
@@ -260,17 +260,17 @@ def test_the_context_is_handed_on(shared, tmp_path, monkeypatch):
 
 
 def test_every_dataset_prepares_and_says_so(shared, others):
-    told = []
+    reported = []
 
     class Reporter:
         def progress(self, name, done, total, **fields):
-            told.append((name, done, total))
+            reported.append((name, done, total))
 
     cached = {"img_keys": ["wrist"], "cache_frames": True}
     dataset = mixture(table(shared, **cached), table(others[0], **cached))
     dataset.prepare(Reporter())
-    assert ("decode frames", 28, 28) in told
-    assert told[-1] == ("decode frames", 10, 10)
+    assert ("decode frames", 28, 28) in reported
+    assert reported[-1] == ("decode frames", 10, 10)
 
 
 @pytest.mark.parametrize(

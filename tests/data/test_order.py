@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.data.order import EpisodeShards, epoch_order
-from fluxvla_core.data.parquet_dataset import ParquetDataset
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.dataset import ParquetDataset
+from fluxvla_core.data.sampler import EpisodeShards, EpochSampler, epoch_order
 from fluxvla_core.errors import ConfigError
 
 lengths = st.lists(st.integers(1, 9), min_size=1, max_size=12)

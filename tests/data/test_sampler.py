@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.data.rng import order_rng, sample_rng
-from fluxvla_core.data.sampler import EpochSampler, Position, SampleKey
+from fluxvla_core.data.sampler import EpochSampler, Position, SampleKey, order_rng, sample_rng
 from fluxvla_core.errors import ConfigError
 
 sizes = st.integers(1, 60)

@@ -9,8 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from fluxvla_core.data.encode import CODECS, EpisodeEncoder
-from fluxvla_core.data.scheduling import unchanged_scheduling
+from fluxvla_core.data.video_encode import CODECS, EpisodeEncoder, unchanged_scheduling
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="scheduling policies are Linux's")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -11,9 +12,10 @@ import pytest
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.data.convert import convert
-from fluxvla_core.data.parquet_dataset import ParquetDataset
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.data.validate import validate
+from fluxvla_core.data.video_decode import picture_size
 from fluxvla_core.errors import DataError
 
 from .version2 import write_v2
@@ -120,3 +122,26 @@ def test_a_column_of_something_else_is_refused_before_training(old):
     with pytest.raises(DataError, match="wrist holds int64, not the bytes of pictures"):
         load(old)
     assert len(load(old, ["top"])) == 28
+
+
+def test_a_picture_is_looked_at_before_it_is_decoded(old):
+    """20,000 x 20,000 equal pixels are 1 MB as a PNG and 1.2 GB in memory."""
+    path = next(iter(sorted(old.glob("data/*/*.parquet"))))
+    whole = bytearray(pq.read_table(path)[TOP][0].as_py()["bytes"])
+    whole[16:24] = (20_000).to_bytes(4, "big") * 2
+    table = pq.read_table(path)
+    rows = table[TOP].to_pylist()
+    rows[0]["bytes"] = bytes(whole)
+    place = table.schema.get_field_index(TOP)
+    pq.write_table(table.set_column(place, TOP, pa.array(rows, table[TOP].type)), path)
+    with pytest.raises(DataError, match=r"row 0 is 20000 x 20000, info\.json says 32 x 48"):
+        load(old)[0]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("size", [(1, 1), (480, 640), (33, 7)])
+def test_the_size_in_a_pictures_head(suffix, size):
+    data = cv2.imencode(suffix, np.zeros((*size, 3), np.uint8))[1].tobytes()
+    assert picture_size(data) == size
+    assert picture_size(data[:10]) is None
+    assert picture_size(b"BM" + data) is None

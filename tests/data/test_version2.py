@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core import build_dataset_from_cfg
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.metadata import read_metadata
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.errors import DataError
 
 from .version2 import write_v2
@@ -99,9 +99,9 @@ def test_a_file_of_an_episode_that_is_missing_or_short(broken):
     ("text", "message"),
     [
         (None, "the file is missing"),
-        ('{"episode_index": 0', "cannot be read as JSON lines"),
-        ("\n[1]\n", ":2: holds a list, no table"),
-        ('{"task": "x"}\n', "has no whole number"),
+        ('{"episode_index": 0', ":1: invalid JSON"),
+        ("\n[1]\n", ":2: input should be an object"),
+        ('{"task": "x"}\n', "_index: field required"),
     ],
 )
 def test_damaged_tables(broken, name, text, message):

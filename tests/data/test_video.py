@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from fluxvla_core.data.encode import CODECS, Clip, EpisodeEncoder, find_codec, join_clips
-from fluxvla_core.data.video import VideoFile, VideoFiles, check_video
+from fluxvla_core.data.video_decode import ExpectedVideo, FrameReader, VideoFile, check_video
+from fluxvla_core.data.video_encode import CODECS, Clip, EpisodeEncoder, find_codec, join_clips
 from fluxvla_core.errors import ConfigError, DataError
 
 FPS = 30
@@ -21,6 +21,10 @@ def encode(path, count, first=0, codec="h264"):
         encoder.add(np.full((16, 16, 3), 4 * i, np.uint8))
     encoder.close()
     return path
+
+
+def stated(frames):
+    return ExpectedVideo(frames, 16, 16, FPS)
 
 
 def number(image):
@@ -107,7 +111,7 @@ def test_a_clip_that_is_too_short_or_no_video(tmp_path, movie):
 
 def test_only_so_many_files_stay_open(tmp_path):
     paths = [encode(tmp_path / f"{i}.mp4", 3, first=i) for i in range(4)]
-    files = VideoFiles(capacity=2)
+    files = FrameReader(capacity=2)
     for _ in range(2):
         for i, path in enumerate(paths):
             assert number(files.read(path, 1 / FPS)) == i + 1
@@ -121,7 +125,7 @@ def test_only_so_many_files_stay_open(tmp_path):
 
 
 def test_open_files_are_not_shared_with_a_forked_or_spawned_worker(movie):
-    files = VideoFiles()
+    files = FrameReader()
     files.read(movie, 0)
     copy = pickle.loads(pickle.dumps(files))  # noqa: S301
     assert not copy._open
@@ -133,12 +137,12 @@ def test_open_files_are_not_shared_with_a_forked_or_spawned_worker(movie):
 
 
 def test_whole_files_pass_and_missing_ones_are_named(movie, tmp_path):
-    check_video(movie, 40)
-    check_video(movie, 30)
+    check_video(movie, stated(40))
+    check_video(movie, stated(30))
     with pytest.raises(DataError, match=r"none\.mp4: the video file is missing; 3 frames expected"):
-        check_video(tmp_path / "none.mp4", 3)
+        check_video(tmp_path / "none.mp4", stated(3))
     with pytest.raises(DataError) as caught:
-        check_video(movie, 41)
+        check_video(movie, stated(41))
     assert "movie.mp4: 41 frames expected, 40 found" in str(caught.value)
     assert "belongs to another dataset" in str(caught.value)
 
@@ -157,7 +161,7 @@ def test_a_truncated_file_is_found_by_its_index(front, keep, tmp_path):
     cut = tmp_path / "cut.mp4"
     cut.write_bytes(data[:size])
     with pytest.raises(DataError) as caught:
-        check_video(cut, 40)
+        check_video(cut, stated(40))
     text = str(caught.value)
     assert f"{cut}: " in text
     assert "40 frames expected, " in text

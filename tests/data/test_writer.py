@@ -9,10 +9,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from fluxvla_core.data import assemble, draft
-from fluxvla_core.data.encode import CODECS
+from fluxvla_core.data import assemble
+from fluxvla_core.data import writer as writer_module
+from fluxvla_core.data.dataset import ParquetDataset
+from fluxvla_core.data.files import write_json
 from fluxvla_core.data.metadata import read_metadata
-from fluxvla_core.data.parquet_dataset import ParquetDataset
+from fluxvla_core.data.video_encode import CODECS
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed
 
@@ -354,13 +356,18 @@ def test_a_full_disk_keeps_what_was_saved(step, tmp_path, spec, takes, monkeypat
     def full(*args, **kwargs):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    def full_at_the_last_file(path, value):
+        if path.name == "episode.json":
+            full()
+        write_json(path, value)
+
     with monkeypatch.context() as patch:
         if step == "add_frame":
-            patch.setattr(draft.EpisodeEncoder, "add", full)
+            patch.setattr(writer_module.EpisodeEncoder, "add", full)
             act = lambda: writer.add_frame(**frame())  # noqa: E731
         elif step == "save_episode":
             writer.add_frame(**frame())
-            patch.setattr(draft, "write_json", full)
+            patch.setattr(writer_module, "write_json", full_at_the_last_file)
             act = writer.save_episode
         else:
             patch.setattr(assemble, "join_clips", full)

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fluxvla_core.data.encode import EpisodeEncoder, find_codec
 from fluxvla_core.data.statistics import column_statistics, histogram_statistics, image_histogram
+from fluxvla_core.data.video_encode import EpisodeEncoder, find_codec
 
 CAMERAS = ("top", "wrist")
 JOINTS = ["waist", "elbow", "gripper"]

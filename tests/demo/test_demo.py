@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -11,10 +12,18 @@ from pathlib import Path
 import pytest
 
 from tools.demo import __main__ as program
-from tools.demo import outcome, stages
+from tools.demo import next_steps, outcome, stages
 from tools.demo.journal import Entry, Journal, key_of
 from tools.demo.run import Demo
-from tools.demo.sizes import AFTER_TRAINING_S, AROUND_STEPS_S, SIZES, affordable_steps
+from tools.demo.sizes import (
+    AFTER_TRAINING_S,
+    AROUND_STEPS_S,
+    SIZES,
+    Size,
+    affordable_steps,
+    expected_s,
+    left_s,
+)
 from tools.shell import StepFailed
 
 RATE = {"episodes": 50, "rate": 0.88, "successes": 44, "low": 0.76, "high": 0.94}
@@ -103,11 +112,32 @@ def test_every_stage_in_its_order(programs: Programs, said: list[str]) -> None:
     assert "trained policy: 44 of 50 episodes succeed (88%, 95 % interval 76% to 94%)" in told
     assert "training made the difference" in told
     assert "in all (install 0:10, collect 0:00, train 0:00," in told
+    assert said[-6].endswith("webbrowser " + (programs.root / "report.html").resolve().as_uri())
+    work = f"--work-dir {programs.work}"
+    for words, line in zip(
+        (
+            f"--section eval --work-dir {programs.root}/again --set eval.ckpt_path={programs.work}",
+            f"--section inference {work} --task 'hand the cube over to the left arm'",
+            f"--config configs/aloha_sim_ros2.py --section inference {work} --task 1",
+            "beside it: fluxvla sim aloha --ros2",
+            f"--section runner {work}",
+        ),
+        said[-5:],
+        strict=True,
+    ):
+        assert words in line
+    assert "--set runner.max_steps=24" in said[-1]
     rows = json.loads((programs.work / "stages.json").read_text())["stages"]
     assert [r["name"] for r in rows] == [
         *("install", "collect", "train", "evaluate", "robot 1", "robot 2")
     ]
     assert rows[1]["command"].startswith("fluxvla collect aloha")
+
+
+def test_what_it_names_is_what_its_config_and_the_page_of_ros2_name() -> None:
+    """The instruction is one of the config's, the robot's command the one that docs/ros2.md has."""
+    assert next_steps.OTHER_TASK in stages.CONFIG.read_text(encoding="utf-8")
+    assert next_steps.ROBOT in Path("docs/ros2.md").read_text(encoding="utf-8")
 
 
 def test_what_is_done_is_kept(programs: Programs, said: list[str]) -> None:
@@ -116,7 +146,7 @@ def test_what_is_done_is_kept(programs: Programs, said: list[str]) -> None:
     said.clear()
     demo(programs, said).run()
     assert programs.ran == []
-    assert "[2] train for 12 steps" in "\n".join(said)
+    assert "stage 2 of 6: train for 12 steps" in "\n".join(said)
     assert "done before, in 0:00" in "\n".join(said)
 
 
@@ -195,7 +225,7 @@ def test_with_a_time_limit_the_speed_is_measured_first(programs: Programs, said:
     assert "--set runner.max_steps=10" in lines[1]
     assert f"--work-dir {programs.root}/speed" in lines[1]
     fit = int((19 * 60 - 10 - AFTER_TRAINING_S - AROUND_STEPS_S) / 0.5)
-    assert "a step takes 0.50 s: 1500 steps fit" in said
+    assert "a step takes 0.50 s: 1500 steps fit\n" in said
     assert fit > 1500
     assert "--set runner.max_steps=1500" in lines[2]
     assert any("at most 20 minutes" in line for line in said)
@@ -206,9 +236,35 @@ def test_steps_that_fit() -> None:
     spare = AFTER_TRAINING_S + AROUND_STEPS_S
     assert affordable_steps(size, 1.0, 0.0) == int(19 * 60 - spare)
     assert affordable_steps(size, 1.0, 100.0) == int(19 * 60 - spare - 100)
+    assert affordable_steps(size, 1.0, 0.0, pace=1.5) == int(19 * 60 - 1.5 * spare)
+    assert affordable_steps(size, 1.0, 0.0, pace=0.5) == affordable_steps(size, 1.0, 0.0)
     assert affordable_steps(size, 0.01, 0.0) == size.steps
     assert affordable_steps(size, 30.0, 0.0) == size.fewest_steps
     assert affordable_steps(SIZES["full"], 30.0, 1e6) == SIZES["full"].steps
+
+
+def test_the_time_left_follows_how_fast_the_machine_is() -> None:
+    expected = {"collect": 100.0, "train": 200.0, "report": 10.0}
+    assert left_s(expected, {}) == 310.0
+    assert left_s(expected, {"collect": 150.0}) == 1.5 * 210.0
+    assert left_s(expected, {"collect": 50.0, "train": 100.0}) == 5.0
+    assert left_s(expected, {"collect": 100.0, "train": 400.0, "report": 1.0}) == 0.0
+
+
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_what_is_expected_are_the_stages_of_a_demo(
+    programs: Programs, said: list[str], size: Size
+) -> None:
+    demo(programs, said, size.name).run()
+    entries = Journal(programs.root / "journal.json").entries
+    assert list(entries) == ["install", *expected_s(size)]
+    heads = [line for line in said if line.startswith("stage ")]
+    assert [head.partition(":")[0] for head in heads] == [
+        f"stage {n + 1} of {len(heads)}" for n in range(len(heads))
+    ]
+    assert all(re.search(r" · \d+:\d\d so far, about [\d:]+ left$", head) for head in heads)
+    if size.minutes is not None:
+        assert sum(expected_s(size).values()) <= size.minutes * 60
 
 
 def test_the_median_step_leaves_the_first_ones_out(tmp_path: Path) -> None:
@@ -226,6 +282,15 @@ def test_the_verdict_says_when_nothing_was_shown(tmp_path: Path) -> None:
     assert outcome.verdict(file)[-1] == (
         "the intervals overlap: this says nothing about the training"
     )
+    swapped = {
+        "groups": {"swapped": {"all": {**NONE, "successes": 1}}},
+        "obeyed": {"swapped": RATE},
+    }
+    file.write_text(json.dumps(swapped))
+    assert outcome.verdict(file) == [
+        "wrong instruction: does the task that it was told: 44 of 50 episodes "
+        "(88%, 95 % interval 76% to 94%)"
+    ]
     file.write_text(json.dumps({"groups": {"mine": {"all": RATE}, "no": {"all": {"episodes": 0}}}}))
     assert outcome.verdict(file) == [
         "mine: 44 of 50 episodes succeed (88%, 95 % interval 76% to 94%)"

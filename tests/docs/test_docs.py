@@ -1,16 +1,29 @@
 """Every command and file in README and docs is run, page by page, as a reader would.
 
 Blocks of one page run in order in one folder, which has the repository's ``configs`` in it. A
-comment before a block says what becomes of it: ``<!-- file: NAME -->`` writes it to a file,
-``<!-- not run: WHY -->`` leaves it out.
+comment before a block says what becomes of it:
+
+``<!-- file: NAME -->``      it is written to a file
+``<!-- fragment: WHY -->``   it is code to read, no command
+``<!-- CI: FILE -->``        it is a line of that file, which CI runs
+``<!-- nightly: WHY -->``    it would disturb other tests: run every night, in a clone of its own
+``<!-- demo: WHY -->``       it needs what the demo makes: run every night, where the demo ran
+``<!-- terminal: WHY -->``   likewise, in a terminal of its own, beside the blocks that follow
+``<!-- checkout: WHY -->``   it is for CONTRIBUTING.md, in a clone: test_contributing.py checks it
 """
 
 from __future__ import annotations
 
+import faulthandler
+import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,17 +34,21 @@ from tools.envs import Env
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
-    ROOT / "README.md",
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "plugins").glob("*/README.md")),
-    *sorted((ROOT / "examples").glob("*.md")),
+    *sorted((ROOT / "examples").glob("*/README.md")),
 ]
 BLOCK = re.compile(
-    r"^(?:<!-- (?P<marker>file|not run): (?P<text>.+?) -->\n)?```(?P<language>\w*)\n"
+    r"^(?:<!-- (?P<marker>[\w ]+): (?P<text>.+?) -->\n)?```(?P<language>\w*)\n"
     r"(?P<body>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
 RUN = {"bash", "sh", "console"}
+MARKERS = {"", "file", "fragment", "CI", "nightly", "demo", "terminal", "checkout"}
+AFTER_DEMO = {"demo", "terminal"}
+NIGHTLY = AFTER_DEMO | {"nightly"}
+TERMINAL_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -70,19 +87,125 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
 def test_what_a_page_tells_to_do_works(page: Path, env: Env, tmp_path: Path) -> None:
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     for block in blocks(page.read_text(encoding="utf-8")):
-        if block.marker == "not run":
-            continue
-        if block.marker == "file":
-            target = tmp_path / block.text
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(block.body, encoding="utf-8")
-        elif block.language in RUN:
-            script = f"set -euo pipefail\n{block.body}"
-            variables = {**env.variables(), **rendering.VARIABLES, "OMP_NUM_THREADS": "1"}
-            command = ["bash", "-c", script]
-            shell.run(command, cwd=tmp_path, env=variables, quiet=True, echo=False)
-        elif block.language == "python":
-            env.run("python", "-c", block.body, cwd=tmp_path, quiet=True, echo=False)
+        if block.marker in {"", "file"}:
+            do(block, tmp_path, env.variables())
+    for made in tmp_path.iterdir():  # a reader may do all that in a clone
+        words = ["git", "check-ignore", "-q", f"{made.name}/" if made.is_dir() else made.name]
+        there = subprocess.run(words, cwd=ROOT, check=False).returncode == 0
+        assert there or made.name == "configs", f"git does not ignore {made.name}"
+
+
+def do(block: Block, folder: Path, variables: Mapping[str, str]) -> None:
+    """What a reader does with a block."""
+    if block.marker == "file":
+        target = folder / block.text
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(block.body, encoding="utf-8")
+        return
+    words = command(block)
+    if words:
+        shell.run(words, cwd=folder, env=around(variables), quiet=True, echo=False)
+
+
+def command(block: Block) -> list[str]:
+    """The program that a block is for, empty where it is only to be read."""
+    if block.language in RUN:
+        return ["bash", "-c", f"set -euo pipefail\n{block.body}"]
+    return ["python", "-c", block.body] if block.language == "python" else []
+
+
+def around(variables: Mapping[str, str]) -> dict[str, str]:
+    return {**variables, **rendering.VARIABLES, "OMP_NUM_THREADS": "1"}
+
+
+@contextmanager
+def terminal(block: Block, folder: Path, variables: Mapping[str, str]) -> Iterator[None]:
+    """A block that goes on beside the body, and is ended with Ctrl-C."""
+    with (folder / "terminal.txt").open("w+", encoding="utf-8") as said:
+        environment = shell.child_environment(around(variables))
+        child = subprocess.Popen(
+            command(block),
+            cwd=folder,
+            env=environment,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+        )
+        try:
+            until = time.monotonic() + TERMINAL_S
+            while child.poll() is None and not said.tell() and time.monotonic() < until:
+                time.sleep(0.2)  # it says when it is ready
+                said.seek(0, os.SEEK_END)
+            yield
+            ended = child.poll()
+        finally:
+            if child.poll() is None:
+                os.killpg(child.pid, signal.SIGINT)
+            child.wait(TERMINAL_S)
+        said.seek(0)
+        assert ended is None, f"it ended by itself: {said.read()}"
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the repository in a folder that tests may fill as they like."""
+    root = tmp_path_factory.mktemp("nightly") / "clone"
+    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in listed.split("\0"):
+        if name and (ROOT / name).is_file():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, root / name)
+    return root
+
+
+@pytest.fixture(scope="module")
+def after_demo(clone: Path, env: Env) -> Path:
+    """A clone in which the demo ran; its short form stands where the default one would be."""
+    env.run("python", "-m", "tools.demo", "--smoke", cwd=clone, env=rendering.VARIABLES, quiet=True)
+    (clone / "demo_out" / "default").symlink_to("smoke")
+    return clone
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("page", [p for p in PAGES if "<!-- demo: " in p.read_text()], ids=str)
+def test_what_is_done_with_the_demos_policy_works(page: Path, env: Env, after_demo: Path) -> None:
+    if "--ros2" in page.read_text(encoding="utf-8"):
+        pytest.importorskip("rclpy")
+    faulthandler.cancel_dump_traceback_later()  # the limit is the one above
+    with ExitStack() as terminals:
+        for block in blocks(page.read_text(encoding="utf-8")):
+            if block.marker == "terminal":
+                terminals.enter_context(terminal(block, after_demo, env.variables()))
+            elif block.marker in {"demo", "file"}:
+                do(block, after_demo, env.variables())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(4 * 3600)
+def test_what_installs_and_trains_works(clone: Path) -> None:
+    """README and the demo's page as they are typed in a fresh clone, README's other blocks too."""
+    faulthandler.cancel_dump_traceback_later()
+    path = os.pathsep.join([str(clone / "env" / "bin"), os.environ.get("PATH", os.defpath)])
+    for page in (ROOT / "README.md", ROOT / "docs" / "demo.md"):
+        for block in blocks(page.read_text(encoding="utf-8")):
+            if block.marker in {"", "file", "nightly"}:
+                do(block, clone, {"PATH": path})
+
+
+def test_a_page_leaves_no_command_out() -> None:
+    for page in PAGES:
+        for block in blocks(page.read_text(encoding="utf-8")):
+            assert block.marker in MARKERS, f"{page.name}: {block.marker}"
+            if block.marker == "fragment":
+                assert block.language not in RUN, f"{page.name}: {block.body}"
+            if block.marker == "CI":
+                assert block.body in (ROOT / block.text).read_text(encoding="utf-8")
+            if block.marker == "checkout":
+                assert page == ROOT / "CONTRIBUTING.md"
+            if block.marker == "nightly":
+                assert page in (ROOT / "README.md", ROOT / "docs" / "demo.md")
 
 
 def test_every_block_says_what_it_is() -> None:
@@ -97,16 +220,28 @@ def test_every_block_says_what_it_is() -> None:
 
 def test_links_to_files_of_the_repository_lead_somewhere() -> None:
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-            if "://" not in target:
-                assert (page.parent / target).exists(), f"{page.name} links to {target}"
+        for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+            file, _, anchor = target.partition("#")
+            if "://" in target:
+                continue
+            there = page.parent / file if file else page
+            assert there.exists(), f"{page.name} links to {target}"
+            if anchor:
+                assert anchor in anchors(there), f"{page.name} links to {target}"
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to a page's headings."""
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def test_the_blocks_of_a_page_are_found() -> None:
     text = (
-        "a\n<!-- file: x.py -->\n```python\nx = 1\n```\n\n<!-- not run: no -->\n```bash\nrm\n```\n"
+        "a\n<!-- file: x.py -->\n```python\nx = 1\n```\n\n<!-- nightly: no -->\n```bash\nrm\n```\n"
     )
     assert list(blocks(text)) == [
         Block("file", "x.py", "python", "x = 1\n"),
-        Block("not run", "no", "bash", "rm\n"),
+        Block("nightly", "no", "bash", "rm\n"),
     ]

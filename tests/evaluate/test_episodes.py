@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluate.episodes import open_ledger, run_episodes
-from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
-from fluxvla_core.evaluate.summary import describe, summarise
+from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.evaluate.episode_log import EpisodeKey, EpisodeLog, open_episode_log
+from fluxvla_core.evaluate.episodes import run_in_pool
+from fluxvla_core.evaluate.pool import WorkerPool
+from fluxvla_core.evaluate.statistics import describe_rate, summarise
 from tests.evaluate.workers import Episodes
 
 
@@ -43,8 +44,9 @@ def keys_of(count, task="task", group="policy"):
 
 def run(folder, keys, workers=2, reporter=None, what=None):
     reporter = reporter or Listener()
-    ledger = open_ledger(folder / "episodes.jsonl", what or {"about": "this"}, reporter)
-    return run_episodes(Episodes(str(folder)), keys, ledger, workers, reporter)
+    log = open_episode_log(folder / "episodes.jsonl", what or {"about": "this"}, reporter)
+    with WorkerPool(Episodes(str(folder)), workers) as pool:
+        return run_in_pool(pool, keys, log, reporter)
 
 
 def runs(folder):
@@ -99,6 +101,40 @@ def test_another_evaluation_counts_nothing_of_the_one_before(tmp_path):
     ]
 
 
+CODE = {"versions": {"mujoco": "3.3.0", "numpy": "2"}, "hash": "abc"}
+
+
+def test_an_episode_log_of_other_versions_is_asked_for(tmp_path):
+    path, record = tmp_path / "episodes.jsonl", {**keys_of(1)[0].__dict__, "status": "done"}
+    EpisodeLog(path, {"a": 1}, code=CODE).add({**record, "success": True, "return": float("nan")})
+    assert json.loads(path.read_text().splitlines()[1])["return"] is None, "JSON has no NaN"
+    assert len(EpisodeLog(path, {"a": 1}, code=CODE).records(keys_of(1))) == 1
+    newer = {**CODE, "versions": {"mujoco": "3.4.0", "numpy": "2"}}
+    with pytest.raises(UsageError, match=r"ran them: mujoco 3\.3\.0 -> 3\.4\.0\n"):
+        EpisodeLog(path, {"a": 1}, code=newer)
+    beside = tmp_path / "episodes-0000-of-0002.jsonl"
+    with pytest.raises(UsageError, match=r"mujoco 3\.3\.0 -> 3\.4\.0"):
+        EpisodeLog(beside, {"a": 1}, "episodes*.jsonl", newer)
+    log = EpisodeLog(path, {"a": 1}, code=newer, reuse=True)
+    assert log.reused == set(keys_of(1))
+    log.add({**record, "success": False})  # run again, by this code
+    assert EpisodeLog(path, {"a": 1}, code=newer).reused == set()
+
+
+def test_an_episode_log_of_the_former_format_says_nothing_of_its_code(tmp_path):
+    path = tmp_path / "episodes.jsonl"
+    lines = [{"format": "fluxvla-episodes-1", "evaluation": {"a": 1}}]
+    lines += [{"group": "policy", "task": "task", "seed": 0, "status": "done", "success": True}]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(UsageError, match="a former version of FluxVLA kept these episodes"):
+        EpisodeLog(path, {"a": 1}, code=CODE)
+    log = EpisodeLog(path, {"a": 1}, code=CODE, reuse=True)
+    assert (len(log.records(keys_of(1))), len(log.reused)) == (1, 1)
+    assert EpisodeLog(path, {"a": 2}, code=CODE).set_aside is not None, (
+        "another evaluation still is"
+    )
+
+
 def test_a_crash_is_an_error_and_not_a_failure(tmp_path):
     listener = Listener()
     keys = [*keys_of(2), EpisodeKey("policy", "crash", 4), EpisodeKey("policy", "crashonce", 6)]
@@ -114,7 +150,7 @@ def test_a_crash_is_an_error_and_not_a_failure(tmp_path):
     assert (summary["all"]["episodes"], summary["all"]["successes"]) == (3, 2)
     assert summary["all"]["errors"] == 1
     assert summary["tasks"]["crash"]["rate"] is None
-    assert describe("crash", summary["tasks"]["crash"]) == (
+    assert describe_rate("crash", summary["tasks"]["crash"]) == (
         "crash: no episode gave a result (1 errors)"
     )
     run(tmp_path, keys)
@@ -126,9 +162,9 @@ def started(folder):
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-m", "tests.evaluate.workers", str(folder)]
     process = subprocess.Popen(command, cwd=root, start_new_session=True)
-    ledger = folder / "episodes.jsonl"
+    log = folder / "episodes.jsonl"
     deadline = time.monotonic() + 60
-    while not ledger.exists() or len(ledger.read_text().splitlines()) < 5:
+    while not log.exists() or len(log.read_text().splitlines()) < 5:
         assert time.monotonic() < deadline, "the evaluation does not get going"
         assert process.poll() is None
         time.sleep(0.02)
@@ -185,23 +221,23 @@ def test_a_last_line_cut_short_is_no_episode(tmp_path):
     assert all(json.loads(line) for line in path.read_text().splitlines())
 
 
-def test_a_ledger_that_cannot_be_written_is_named(tmp_path):
+def test_an_episode_log_that_cannot_be_written_is_named(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(RunFailed, match="episodes cannot be kept") as caught:
-        Ledger(blocked / "episodes.jsonl", {})
+        EpisodeLog(blocked / "episodes.jsonl", {})
     assert str(blocked) in str(caught.value)
 
 
 def test_a_full_disk_says_how_to_go_on(tmp_path, monkeypatch):
-    ledger = Ledger(tmp_path / "episodes.jsonl", {})
+    log = EpisodeLog(tmp_path / "episodes.jsonl", {})
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(RunFailed, match="No space left on device") as caught:
-        ledger.add({"group": "policy", "task": "task", "seed": 1, "status": "done"})
+        log.add({"group": "policy", "task": "task", "seed": 1, "status": "done"})
     assert "run the same command again; finished episodes are kept" in str(caught.value)
 
 
@@ -216,5 +252,5 @@ def test_summaries_are_by_group_and_task():
     assert summary["policy"]["all"]["successes"] == 5
     assert summary["policy"]["all"]["episodes"] == 10
     assert summary["untrained"]["all"]["rate"] == 0.0
-    line = describe("a", summary["policy"]["tasks"]["a"])
+    line = describe_rate("a", summary["policy"]["tasks"]["a"])
     assert line == "a: 4/5 = 80% (95% interval 38% to 96%)"

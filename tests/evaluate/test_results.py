@@ -12,10 +12,15 @@ import pytest
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError, RunFailed
 from fluxvla_core.evaluate import results
+from fluxvla_core.evaluate.policies import chosen_checkpoint
 from fluxvla_core.evaluate.pool import WorkerPool
-from fluxvla_core.evaluate.showing import choose_episodes, record_videos, video_name
-from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import problems, summarise
+from fluxvla_core.evaluate.results import (
+    choose_episodes,
+    record_videos,
+    video_name,
+    with_others,
+)
+from fluxvla_core.evaluate.statistics import problems, summarise
 
 
 def record(task, seed, success, group="policy", **more):
@@ -54,6 +59,14 @@ def test_results_appear_whole(tmp_path):
     results.write_results(path, {"a": 1})
     assert json.loads(path.read_text()) == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_no_number_is_null(tmp_path):
+    """Others' JSON readers refuse NaN and Infinity, which are none of its words."""
+    path = tmp_path / "results.json"
+    results.write_results(path, {"a": [float("nan"), 1.5], "b": {"c": (float("-inf"),)}})
+    found = json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert found == {"a": [None, 1.5], "b": {"c": [None]}}
 
 
 def test_a_full_disk_is_named_and_can_be_mended(tmp_path, monkeypatch):
@@ -132,11 +145,11 @@ def test_people_are_told_rates_speed_and_videos(tmp_path):
         "timing": results.timing(records, 2, 4.0, 2),
         "videos": [{"path": "videos/x.mp4"}],
     }
-    results.tell(listener, found, tmp_path)
+    results.report_results(listener, found, tmp_path)
     assert listener.lines == [
         "policy a: 1/1 = 100% (95% interval 21% to 100%)",
         "policy b: 0/1 = 0% (95% interval 0% to 79%)",
-        "policy all tasks: 1/2 = 50% (95% interval 9% to 91%)",
+        "policy all 2 tasks: 1/2 = 50% (95% interval 9% to 91%)",
         "20 steps in 4 s: 5 steps/s in 2 processes",
         "video x.mp4",
     ]
@@ -160,7 +173,7 @@ def test_what_went_wrong_is_counted_the_most_frequent_first(listener, tmp_path):
     ]
     others = [{**found[1], "what": f"reason {n}"} for n in range(4)]
     told = {"groups": {}, "problems": found + others, "timing": {"episodes": 0}, "videos": []}
-    results.tell(listener, told, tmp_path)
+    results.report_results(listener, told, tmp_path)
     assert listener.warnings == [
         "policy: 3 episodes gave no result: KeyError: 'qpos'",
         "policy: 2 episodes failed: not finite",
@@ -230,3 +243,20 @@ def test_videos_are_of_the_episodes_that_were_counted(tmp_path):
         "its outcome does not follow from its seed alone",
         "RuntimeError: the camera fell over",
     ]
+
+
+def test_every_group_is_seen_beside_the_trained_policy():
+    def record(group, task, seed, success):
+        return {"group": group, "task": task, "seed": seed, "success": success, "status": "done"}
+
+    records = [
+        record("policy", "lift", 1, False), record("policy", "lift", 2, True),
+        record("swapped", "lift", 7, False), record("swapped", "lift", 2, False),
+        record("untrained", "lift", 1, False), record("untrained", "pour", 1, False),
+    ]  # fmt: skip
+    shown = with_others(records[:2], records)
+
+    assert shown[:2] == records[:2]
+    # Of the same seed where there is one.
+    assert [(r["group"], r["seed"]) for r in shown[2:]] == [("swapped", 2), ("untrained", 1)]
+    assert with_others([], records) == []

@@ -9,11 +9,11 @@ import pytest
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import ConfigError, RunFailed, SafetyStop, UsageError
 from fluxvla_core.evaluate.robot import RobotEvalRunner
-from fluxvla_core.infer.base_runner import BaseInferenceRunner
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
+from fluxvla_core.robot.clock import SimulatedClock
+from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec("slider", (Joint("x", "m", -2.0, 2.0, 5.0, 200.0, "prismatic"),), (), 50.0)
@@ -127,6 +127,9 @@ def test_every_task_is_counted_over_its_seeds(evaluate, section, tmp_path, liste
     for task in ("right", "left"):
         assert found["groups"]["policy"]["tasks"][task]["successes"] == 2
     assert found["groups"]["policy"]["all"]["low"] == pytest.approx(0.2152, abs=1e-4)
+    assert found["provenance"]["seeds"] == {"policy": [10, 13]}
+    assert "fluxvla-core" in found["provenance"]["versions"]
+    assert (tmp_path / "eval_robot" / "config.resolved.json").exists()
     records = episodes(tmp_path)
     assert [(r["task"], r["seed"]) for r in records[:3]] == [
         ("right", 10),

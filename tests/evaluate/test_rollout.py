@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
+from fluxvla_core.evaluate.divergence import Diverged
 from fluxvla_core.evaluate.policies import RandomPolicy, fit, resolve_name
-from fluxvla_core.evaluate.rollout import Course, run_episode
-from fluxvla_core.evaluate.worker import memory_mb, told_instead
+from fluxvla_core.evaluate.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluate.worker import memory_mb, swapped_task
 from fluxvla_core.spec.embodiment import Camera
 
 
@@ -40,7 +41,7 @@ class Says:
 def episode(environment, actor, task="right", told=None, watch=None, **course):
     tasks = {each.name: each for each in environment.spec.tasks}
     told = None if told is None else tasks[told]
-    return run_episode(environment, actor, tasks[task], 5, Course(**course), told, watch)
+    return run_episode(environment, actor, tasks[task], 5, RolloutSettings(**course), told, watch)
 
 
 def test_it_ends_with_the_environment_or_with_the_steps(walk):
@@ -135,6 +136,13 @@ def test_a_state_that_is_not_finite_is_not_the_policys_fault(walk):
         assert "likely cause: the simulation diverged" in str(caught.value)
 
 
+@pytest.mark.parametrize("told", [None, "left"])
+def test_the_last_steps_state_is_looked_at_too(walk, told):
+    """Nobody observes after it: such an episode was a failure, or a success that was not."""
+    with pytest.raises(Diverged, match="state is not finite after 3 steps"):
+        episode(walk.Walk(diverging=6), walk.Walker(), max_steps=3, told=told)
+
+
 def test_equal_seeds_give_equal_courses(walk):
     one, two = (episode(walk.Walk(), walk.Walker()) for _ in range(2))
     assert one["state_hash"] == two["state_hash"]
@@ -188,10 +196,10 @@ def test_a_wrong_instruction_is_the_next_task_of_those_evaluated(walk):
         def others(self, task):
             return ["left"] if task == "right" else []
 
-    assert told_instead(World(), "right", ["right"]) == "left"
-    assert told_instead(walk.Walk(), "left", ["left", "right"]) == "right"
+    assert swapped_task(World(), "right", ["right"]) == "left"
+    assert swapped_task(walk.Walk(), "left", ["left", "right"]) == "right"
     with pytest.raises(ConfigError, match="no other task of a line can be done in the scene of 'l"):
-        told_instead(World(), "left", [])
+        swapped_task(World(), "left", [])
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells it there")

@@ -8,9 +8,13 @@ from collections import Counter
 
 import pytest
 
-from fluxvla_core.build import RunContext
-from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.config.load import load_config
+from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch, UsageError
+from fluxvla_core.evaluate.compare import read
 from fluxvla_core.evaluate.runner import EvalRunner
+from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files
+from tests.evaluate.conftest import WALKING
 
 WALK = {"type": "Walk"}
 
@@ -48,6 +52,8 @@ def test_outcomes_are_the_same_for_any_number_of_workers(tmp_path, walking):
     assert {name: row["successes"] for name, row in tasks.items()} == {"right": 4, "left": 4}
     assert result["groups"]["swapped"]["all"]["successes"] == 0
     assert result["behaviours"]["swapped"]["go left"]["left"] == 4
+    told = {group: (row["successes"], row["episodes"]) for group, row in result["obeyed"].items()}
+    assert told == {"policy": (8, 8), "swapped": (8, 8)}
     assert result["instruction_test"]["p_a_better"] == 1 / 2**8
     assert result["settings"]["ground"] == "shaky"
     assert result["timing"]["worker_memory_mb"] > 1
@@ -156,7 +162,7 @@ def test_a_simulation_that_diverges_is_an_error_of_its_episode(
     with pytest.raises(RunFailed, match="1 of 4 episodes gave no result"):
         evaluate(tmp_path, {**WALK, "diverging": 1}, reporter=listener, **options)
     assert listener.warnings[-1] == (
-        "policy: 1 episode gave no result: the environment's state is not finite after 4 steps"
+        "policy: 1 episode gave no result: the environment's state is not finite after 3 steps"
     )
     assert results(tmp_path)["groups"]["policy"]["all"]["episodes"] == 3
 
@@ -233,6 +239,8 @@ def test_nproc_is_workers_but_for_torchruns_own_count(tmp_path, walking, monkeyp
 
     assert workers() == 5
     assert workers(SLURM_ARRAY_TASK_ID="0", SLURM_ARRAY_TASK_COUNT="2") == 5
+    one = RunContext(work_dir=tmp_path, nproc=1)
+    assert EvalRunner(context=one, environment=WALK, workers=3).workers == 1
     assert workers(RANK="1", WORLD_SIZE="5") == 3
     context = RunContext(work_dir=tmp_path)
     assert EvalRunner(context=context, environment=WALK, live=True).workers == 1
@@ -257,6 +265,61 @@ def test_other_settings_are_another_evaluation(tmp_path, walking, listener):
     first = (tmp_path / "eval" / "episodes.jsonl").read_text()
     evaluate(tmp_path, tasks=["right"], workers=1, episodes=3, replan_every=1)
     assert (tmp_path / "eval" / "episodes.jsonl").read_text() == first, "nothing was missing"
+
+
+def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
+    tmp_path, walking, listener, monkeypatch
+):
+    options = {"tasks": ["right"], "episodes": 2, "workers": 1}
+    evaluate(tmp_path, **options)
+    first = results(tmp_path)["provenance"]
+    assert set(first) >= {"date", "commit", "versions", "code", "machine", "seeds", "pictures"}
+    assert first["seeds"] == {"policy": [0, 1]}
+    assert first["reused"] == {"episodes": 0, "changed": []}
+    assert {"fluxvla-core", "numpy"} <= set(first["versions"])
+    assert first["date"].endswith("+00:00")
+    before = (tmp_path / "eval" / "results.json").read_text()
+
+    path = tmp_path / "walking.py"  # the plugin file, edited; its name is the same
+    path.write_text(WALKING.read_text() + "\n# faster\n")
+    forget_plugin_files()
+    load_plugin_files([path])
+    with pytest.raises(UsageError, match=r"other code ran them: source code \w+ -> \w+") as caught:
+        evaluate(tmp_path, **options, reporter=listener)
+    assert "--set eval.reuse=true to count them" in str(caught.value)
+    assert (tmp_path / "eval" / "results.json").read_text() == before
+
+    evaluate(tmp_path, **{**options, "episodes": 3}, reuse=True, reporter=listener)
+    assert listener.warnings[0].startswith("2 episodes that other code ran are counted, as reuse")
+    second = results(tmp_path)["provenance"]
+    assert second["code"] != first["code"]
+    assert second["reused"]["episodes"] == 2
+    assert results(tmp_path)["groups"]["policy"]["all"]["episodes"] == 3
+    # The third is of this code; the other two are not, however often they were counted.
+    with pytest.raises(UsageError, match="other code ran them"):
+        evaluate(tmp_path, **options)
+    compared = read(tmp_path)
+    assert len(compared.records) == 3
+
+
+def test_each_evaluation_keeps_its_own_config(tmp_path, walking):
+    environment = {"type": "Walk", "limited": True}
+    for live in (False, True):
+        section = {"type": "EvalRunner", "environment": environment, "live": live}
+        section |= {"policy": "expert", "episodes": 1, "record_videos": 0, "tasks": ["right"]}
+        context = RunContext({"eval": section}, "eval", tmp_path, origins={"eval": "c.toml:1"})
+        runner = build_runner_from_cfg(section, context)
+        runner.run_setup()
+        runner.run()
+    for name, live in (("eval", False), ("eval_live", True)):
+        kept = load_config(tmp_path / name / "config.resolved.json")
+        assert kept.tree["eval"]["live"] is live
+
+
+def test_how_pictures_were_drawn_is_in_the_results(tmp_path, walking):
+    evaluate(tmp_path, policy={"type": "Thinker"}, tasks=["right"], episodes=1, workers=1)
+    pictures = results(tmp_path)["provenance"]["pictures"]
+    assert pictures == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"
 
 
 def test_chance_does_what_chance_does(tmp_path, walking):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluate.shards import Shard, shard_of
+from fluxvla_core.evaluate.episodes import Shard, shard_of
 
 ARRAY = {"SLURM_ARRAY_TASK_ID": "5", "SLURM_ARRAY_TASK_MIN": "3", "SLURM_ARRAY_TASK_COUNT": "4"}
 
@@ -30,8 +30,8 @@ def test_launchers_say_which_part_it_is(variables, shard):
 def test_every_episode_is_in_one_part():
     parts = [Shard(index, 3).of(range(8)) for index in range(3)]
     assert parts == [[0, 3, 6], [1, 4, 7], [2, 5]]
-    assert Shard(0, 1).ledger == "episodes.jsonl"
-    assert Shard(2, 3).ledger == "episodes-0002-of-0003.jsonl"
+    assert Shard(0, 1).log_name == "episodes.jsonl"
+    assert Shard(2, 3).log_name == "episodes-0002-of-0003.jsonl"
 
 
 @pytest.mark.parametrize(

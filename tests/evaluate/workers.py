@@ -103,15 +103,17 @@ class Episodes:
 
 
 def evaluate_forever(folder: str) -> None:
-    """What a killed or interrupted evaluation runs: slow episodes into a ledger."""
+    """What a killed or interrupted evaluation runs: slow episodes into a log."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluate.episodes import run_episodes
-    from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
+    from fluxvla_core.evaluate.episode_log import EpisodeKey, EpisodeLog
+    from fluxvla_core.evaluate.episodes import run_in_pool
+    from fluxvla_core.evaluate.pool import WorkerPool
 
     keys = [EpisodeKey("policy", "task", seed) for seed in range(40)]
-    ledger = Ledger(Path(folder) / "episodes.jsonl", {"about": "this"})
+    log = EpisodeLog(Path(folder) / "episodes.jsonl", {"about": "this"})
     try:
-        run_episodes(Episodes(folder, 0.15), keys, ledger, 2, SilentReporter())
+        with WorkerPool(Episodes(folder, 0.15), 2) as pool:
+            run_in_pool(pool, keys, log, SilentReporter())
     except KeyboardInterrupt:
         sys.exit(130)
 

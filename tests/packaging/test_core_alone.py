@@ -14,6 +14,7 @@ from tools.shell import StepFailed
 ALLOWED = {
     *("fluxvla-core", "numpy", "packaging", "pluggy", "rich", "tomli"),
     *("markdown-it-py", "mdurl", "pygments", "importlib-metadata", "zipp", "typing-extensions"),
+    *("pydantic", "pydantic_core", "annotated-types", "typing_extensions", "typing-inspection"),
     *("pip", "setuptools", "wheel"),
 }
 

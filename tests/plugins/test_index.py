@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import importlib.metadata as metadata
+import os
 import subprocess
 import sys
+import zipfile
 
 import pytest
 
 from fluxvla_core.plugins import _metadata
-from fluxvla_core.plugins.locate import locate
+from fluxvla_core.plugins.load import locate
 
 GOOD = "[fluxvla.operators]\nGoodOperator = good:GoodOperator\n"
 
@@ -28,7 +31,7 @@ def test_nothing_is_imported_by_the_scan(install):
 @pytest.mark.parametrize(
     ("broken", "reason"),
     [
-        (b"[fluxvla.operators]\nno equals sign\n", "TypeError"),
+        (b"[fluxvla.operators]\nno equals sign\n", "no '=' in 'no equals sign'"),
         (b"[fluxvla.operators]\nX = \xff\xfe:X\n", "UnicodeDecodeError"),
     ],
 )
@@ -80,6 +83,56 @@ def test_environment_variables_choose_distributions(install, monkeypatch):
     assert "GoodOperator" not in names()
 
 
+def test_what_is_read_is_what_importlib_reads(install):
+    install(
+        "fluxvla-odd",
+        entry_points=b"# a comment\r\nbefore = any:Group\r\n\r\n[fluxvla.operators ]\r\n"
+        b"[fluxvla.operators]\r\n  Odd  =  odd : Odd [extra]\r\n",
+    ).joinpath("METADATA").write_bytes(
+        b"metadata-version: 2.1\r\nNAME:  fluxvla_odd\r\nVersion: 1.0\r\nversion: 2.0\r\n"
+        b"Summary: Odd:\r\n  folded\r\nRequires-Dist: numpy; python_version>'3'\r\n"
+        b"Description-Content-Type: text/markdown\r\n\r\nName: of the readme\r\n"
+    )
+
+    def facts(dist):
+        points = sorted((p.group, p.name, p.value) for p in dist.entry_points)
+        return dist.metadata["Name"], dist.version, list(dist.requires or ()), points
+
+    seen = set()
+    for dist in metadata.distributions():
+        if dist._path.suffix == ".dist-info" and dist.metadata["Name"] not in seen:
+            seen.add(dist.metadata["Name"])
+            ours = _metadata._DistInfo(_metadata._Folder(str(dist._path)))
+            assert facts(ours) == facts(dist)
+            assert _metadata.version(dist.metadata["Name"]) == dist.version
+    assert {"fluxvla_odd", "fluxvla-core", "numpy"} <= seen
+    (plugin,) = _metadata.index().plugins["fluxvla.operators", "Odd"]
+    assert (plugin.module, plugin.attribute) == ("odd", "Odd")
+
+
+def test_eggs_and_archives_are_left_to_importlib(install, tmp_path, monkeypatch):
+    site = install("fluxvla-good", entry_points=GOOD).parent
+    egg = site / "fluxvla_egg-0.1-py3.11.egg-info"
+    egg.mkdir()
+    (egg / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: fluxvla-egg\nVersion: 0.1\n")
+    (egg / "requires.txt").write_text("numpy\n\n[fast]\nnumba\n")
+    (egg / "entry_points.txt").write_text(GOOD.replace("Good", "Egg"))
+    with zipfile.ZipFile(tmp_path / "archive.zip", "w") as archive:
+        for name in ("METADATA", "entry_points.txt"):
+            text = (site / "fluxvla_good-1.0.dist-info" / name).read_text()
+            text = text.replace("Good", "Zipped").replace("-good", "-zipped")
+            archive.writestr(f"fluxvla_zipped-1.0.dist-info/{name}", text)
+    monkeypatch.syspath_prepend(str(tmp_path / "archive.zip"))
+    _metadata.index.cache_clear()
+    found = _metadata.index().plugins
+    assert found["fluxvla.operators", "EggOperator"][0].requires == (
+        "numpy",
+        'numba; extra == "fast"',
+    )
+    assert found["fluxvla.operators", "ZippedOperator"][0].origin == "fluxvla-zipped 1.0"
+    assert (_metadata.version("fluxvla-egg"), _metadata.version("fluxvla-zipped")) == ("0.1", "1.0")
+
+
 def test_only_one_module_imports_the_metadata_library():
     found = subprocess.run(
         ["grep", "-rlE", r"importlib[._]metadata", "--include=*.py", "src/fluxvla_core"],
@@ -110,3 +163,31 @@ def test_locate_finds_a_source_file_without_importing(tmp_path, monkeypatch):
     assert locate("loc_pkg.absent") is None
     assert locate("loc_absent.inner") is None
     assert "loc_pkg" not in sys.modules
+
+
+def _pipe(path):
+    os.mkfifo(path)
+
+
+def _endless(path):
+    path.symlink_to("/dev/zero")
+
+
+def _large(path):
+    path.write_text("Name: x\n")
+    os.truncate(path, 1 << 30)
+
+
+@pytest.mark.parametrize("make", [_pipe, _endless, _large])
+@pytest.mark.parametrize("name", ["METADATA", "entry_points.txt"])
+def test_files_without_an_end_do_not_keep_every_command_waiting(install, name, make):
+    install("fluxvla-good", entry_points=GOOD)
+    folder = install("fluxvla-bad", entry_points=GOOD.replace("Good", "Bad"))
+    (folder / name).unlink()
+    make(folder / name)
+    index = _metadata.index()
+    assert ("fluxvla.operators", "GoodOperator") in index.plugins
+    (line,) = [b for b in index.broken if "fluxvla_bad" in b]
+    assert name in line
+    if name == "METADATA":
+        assert _metadata.version("fluxvla-bad") is None

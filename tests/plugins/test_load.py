@@ -7,7 +7,7 @@ import pytest
 import tomli
 
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
-from fluxvla_core.plugins import known
+from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS, Registry
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,7 @@ def test_a_misspelt_name_gets_a_suggestion(install):
 
 
 def test_a_missing_first_party_plugin_is_named_with_its_pip_command(monkeypatch):
-    monkeypatch.setattr(known, "FIRST_PARTY", {"fluxvla-acme": {"runners": ("AcmeRunner",)}})
+    monkeypatch.setattr(first_party, "FIRST_PARTY", {"fluxvla-acme": {"runners": ("AcmeRunner",)}})
     with pytest.raises(MissingPlugin, match=r"pip install fluxvla-acme"):
         RUNNERS.get("AcmeRunner")
     with pytest.raises(MissingPlugin, match=r"did you mean 'AcmeRunner'\? \(fluxvla-acme provides"):
@@ -147,9 +147,13 @@ def test_the_table_of_first_party_names_equals_their_pyproject_files():
     stated: dict[str, dict[str, tuple[str, ...]]] = {}
     for file in sorted((ROOT / "plugins").glob("*/pyproject.toml")):
         project = tomli.loads(file.read_text())["project"]
+        if "entry-points" not in project:  # a library of plugins
+            continue
         stated[project["name"]] = {
             group.removeprefix("fluxvla."): tuple(sorted(names))
             for group, names in project["entry-points"].items()
         }
-    table = {d: {r: tuple(sorted(n)) for r, n in t.items()} for d, t in known.FIRST_PARTY.items()}
+    table = {
+        d: {r: tuple(sorted(n)) for r, n in t.items()} for d, t in first_party.FIRST_PARTY.items()
+    }
     assert table == stated

@@ -1,7 +1,7 @@
 """Arms, policies and filters that do whatever hypothesis says, for ``test_limits_property``.
 
-An arm may lag behind its commands, droop, press on what its jaw holds, be slowed down by a person,
-be moved between two episodes, and lie about all of it.
+An arm may lag behind its commands, overshoot them, droop, press on what its jaw holds, be slowed
+down by a person, be pushed in the middle of an episode and between two, and lie about all of it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 from hypothesis import strategies as st
 
 from fluxvla_core import Frame
-from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.control.clock import SimulatedClock
-from fluxvla_core.control.filters import LowPass, SnapGripper
-from fluxvla_core.control.joiners import METHODS
-from fluxvla_core.safety.trips import HOLD_REACH
+from fluxvla_core.contracts.policy import Continuation
+from fluxvla_core.robot.clock import SimulatedClock
+from fluxvla_core.robot.filters import LowPass, SnapGripper
+from fluxvla_core.robot.joiners import METHODS
+from fluxvla_core.robot.tracking import HOLD_REACH
+from fluxvla_core.ros2.holding import PATIENCE_S, hold_target, way_to_hold
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
@@ -39,6 +40,7 @@ HELD = 0.3
 CHUNKS = 40
 # No rule but the limits is in the way of these.
 LIMITS_ALONE = {"jump_s": 1e12, "excess": 1e12, "tracking_error": 1e12}
+LIMITS_AND_TRACKING = {"jump_s": 1e12, "excess": 1e12}
 
 
 class Arm:
@@ -58,6 +60,9 @@ class Arm:
         self.clock = SimulatedClock()
         self.pose = HOME.copy()
         self.last: np.ndarray | None = None
+        self.before: np.ndarray | None = None
+        self.was = HOME.copy()
+        self.moving = False
         self.sent = 0
         self.lie: tuple[str, float] | None = None
 
@@ -83,16 +88,32 @@ class Arm:
         return Frame(state, {} if kind == "blind" else {"front": image}, stamps)
 
     def send_action(self, action: np.ndarray) -> None:
+        self.moving = True
+        self._follow(action)
+
+    def _follow(self, action: np.ndarray) -> None:
         self.send(action)
-        self.last = np.array(action)
+        self.before, self.last = self.last, np.array(action)
         self.sent += 1
+        self.was = self.pose.copy()
         rest = self.last - self.case["droop"] * DROOP
         rest[2] = max(rest[2], HELD if self.case["droop"] else 0.0)
-        self.pose += self.case["follows"] * (rest - self.pose)
+        pose = self.pose + self.case["follows"] * (rest - self.pose)
+        # It overshoots into its end stops at most.
+        self.pose = np.clip(pose, LOWER - DROOP, UPPER + DROOP)
         self.clock.advance(1 / ARM.rate_hz)
 
     def stop(self) -> None:
-        """It holds its last command."""
+        """As ``RosOperator`` does it, on this arm's clock."""
+        if not self.moving:
+            return
+        self.moving = False
+        last = self.last
+        before = last if self.before is None else self.before
+        moved = (self.pose - self.was) * PATIENCE_S * ARM.rate_hz
+        target = hold_target(ARM, last, self.pose, moved)
+        for command in way_to_hold(ARM, last, before, 1 / ARM.rate_hz, target):
+            self._follow(command)
 
     def close(self) -> None:
         """Nothing was opened."""
@@ -109,6 +130,13 @@ class Arm:
         stayed = np.abs(self.pose - self.last) <= REACH
         kept = stayed if self.case["tells"] else np.inf == REACH
         return np.where(kept, self.last, np.clip(self.pose, LOWER, UPPER))
+
+
+class Readable:
+    """Tells where it is at any time."""
+
+    def get_state(self):
+        return self.pose.copy()
 
 
 class Telling:
@@ -130,7 +158,11 @@ class Slowed:
 
 def arm_of(send: Callable[[np.ndarray], None], case: Mapping[str, Any]) -> Arm:
     """An arm that has what the case says, and lacks the rest."""
-    more = (*[Telling] * case["tells"], *[Slowed] * bool(case["shares"]))
+    more = (
+        *[Readable] * case["readable"],
+        *[Telling] * case["tells"],
+        *[Slowed] * bool(case["shares"]),
+    )
     return type("Arm", (*more, Arm), {})(send, case)
 
 
@@ -146,6 +178,7 @@ class Adversary:
         self.action_rate_hz = rate
         self.played = 0
         self.continued = 0
+        self.pushes = 0
 
     @property
     def over(self) -> bool:
@@ -160,6 +193,9 @@ class Adversary:
         kind, a, b, lie = self.script[self.played]
         self.played += 1
         self.arm.lie = (lie, b) if lie else None
+        if lie == "pushed":
+            self.arm.pushed(float(np.clip(b, -0.25, 0.25)))
+            self.pushes += 1
         return chunk_of(kind, a, b, np.asarray(observation["qpos"], dtype=np.float64))
 
     def continue_action(self, observation: dict[str, Any], rest: Continuation) -> np.ndarray:
@@ -211,7 +247,7 @@ FILTERS: Mapping[str, Callable[[], list[Any]]] = {
     "shaken": lambda: [Shaken()],
 }
 MOVES = ["far", "spike", "to and fro", "sweep", "near", "huge", "rest"]
-LIES = ["", "", "", "noise"]
+LIES = ["", "", "", "noise", "pushed"]
 AMOUNTS = st.floats(-50.0, 50.0, allow_nan=False) | st.floats(-0.2, 0.2, allow_nan=False)
 # Nine in ten go on; what ends an episode (and begins the next) comes between them.
 GOOD = st.tuples(st.sampled_from(MOVES), AMOUNTS, AMOUNTS, st.sampled_from(LIES))
@@ -227,15 +263,16 @@ POSES = st.tuples(*(st.floats(j.lower, j.upper) for j in ARM.joints))
 SHARES = st.lists(st.sampled_from([0.0, 0.1, 0.3, 1.0]), max_size=3).map(lambda s: s and [*s, 1.0])
 SETTINGS = st.fixed_dictionaries(
     {
-        "safety": st.sampled_from([LIMITS_ALONE, LIMITS_ALONE, {}]),
+        "safety": st.sampled_from([LIMITS_ALONE, LIMITS_AND_TRACKING, {}]),
         "execute_horizon": st.sampled_from([1, 2, 4, None]),
         "rate": st.sampled_from([25.0, 10.0]),
-        "joining": st.sampled_from(METHODS),
+        "joining": st.sampled_from([*METHODS, "rtc"]),
         "latency": st.sampled_from([0.0, 0.0, 0.06, 0.3]),
         "filters": st.sampled_from(["none", "none", *FILTERS]),
         "start_pose": st.none() | POSES,
         "shares": st.just([]) | SHARES,
-        "follows": st.sampled_from([1.0, 1.0, 0.5, 0.2]),
+        "follows": st.sampled_from([1.0, 0.5, 0.08, 2.0]),
+        "readable": st.booleans(),
         "droop": st.sampled_from([0.0, 1.0]),
         "tells": st.booleans(),
         # What somebody does to the arm after each stop.

@@ -58,7 +58,7 @@ def test_grey_is_grey_in_all_three_channels():
     grey = np.arange(24, dtype=np.uint8).reshape(4, 6)
 
     np.testing.assert_array_equal(
-        images.to_rgb(message(grey, "mono8", 2), 4, 6), grey[..., None].repeat(3, 2)
+        images.to_rgb(message(grey, "mono8", 2), 4, 6, grey=True), grey[..., None].repeat(3, 2)
     )
 
 
@@ -106,6 +106,8 @@ def test_a_view_copies_nothing_and_a_picture_is_copied_once():
         ("to_rgb", message(colours(8, 6), "rgb8"), "sends 6x8 pictures, the embodiment says 6x4"),
         ("to_rgb", message(colours(), "yuv422"), "encoding 'yuv422'; understood are rgb8"),
         ("to_rgb", message(np.zeros((4, 6), np.uint16), "16UC1"), "16UC1 pictures, which have no"),
+        ("to_rgb", message(np.zeros((4, 6), np.uint8), "mono8"), "mono8 pictures, which have no c"),
+        ("to_rgb", message(np.zeros((4, 6), np.uint8), "8UC1"), "8UC1 pictures, which have no col"),
         ("to_depth", message(colours(), "rgb8"), "rgb8 pictures, which hold no distances"),
         ("to_depth", message(np.zeros((8, 6), np.uint16), "16UC1"), "sends 6x8 pictures"),
     ],
@@ -175,6 +177,14 @@ class TestCompressed:
 
         assert np.abs(got.astype(int) - rgb).max() <= 4
 
+    @pytest.mark.parametrize("form", ["mono8; jpeg compressed ", "jpeg"])
+    def test_a_compressed_picture_without_colours_is_refused(self, form):
+        grey = self.packed(np.full((48, 64), 90, np.uint8), ".jpg", form)
+
+        with pytest.raises(BadMessage, match="sends mono8 pictures, which have no colours"):
+            images.to_rgb(grey, 48, 64)
+        assert (images.to_rgb(grey, 48, 64, grey=True) == 90).all()
+
     def test_compressed_depth(self):
         depth = np.array([[0, 1500]], np.uint16)
         sent = self.packed(depth, ".png", "16UC1; compressedDepth png", header=bytes(12))
@@ -194,7 +204,7 @@ class TestCompressed:
         assert message.format == f"{encoding}; {form} compressed bgr8"
         assert type(message.data) is array.array, "others are converted byte by byte"
         assert len(message.data) < rgb.size
-        got = images.to_rgb(message, 48, 64)
+        got = images.to_rgb(message, 48, 64, grey=encoding == "mono8")
         assert np.abs(got.astype(int) - wanted).max() <= off
 
     def test_depth_comes_back(self):

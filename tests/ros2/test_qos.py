@@ -44,6 +44,21 @@ def test_last_messages_are_asked_for_only_where_everybody_keeps_them(given, kept
     assert qos.keeps_last(offers(*given)) is kept
 
 
+@pytest.mark.parametrize(
+    ("vendors", "fast"),
+    [
+        ([], False),
+        ([(1, 15)], True),
+        ([(1, 16)], False),  # Eclipse Cyclone DDS
+        ([(1, 15), (1, 1)], False),  # RTI Connext
+    ],
+)
+def test_the_vendor_is_told_by_the_publishers_guid(ros_domain, vendors, fast):
+    given = [SimpleNamespace(endpoint_gid=[*vendor, *range(14)]) for vendor in vendors]
+
+    assert qos.from_fast_dds(given) is fast
+
+
 def test_profiles_say_what_was_chosen(ros_domain):
     profile = qos.profile(qos.RELIABLE, 3, latched=True)
     plain = qos.profile(qos.BEST_EFFORT, 1)

@@ -13,8 +13,8 @@ from fluxvla_core.ros2.rates import SEGMENT_BYTES, Reception, check, large_frame
 VGA = 640 * 480 * 3
 
 
-def reception(received, lost=0, size=VGA, reliability="best_effort", expected_hz=None):
-    return Reception("cam (/c)", reliability, 2.0, received, lost, size, expected_hz)
+def reception(received, lost=0, size=VGA, reliability="best_effort", expected_hz=None, fast=True):
+    return Reception("cam (/c)", reliability, 2.0, received, lost, size, expected_hz, fast)
 
 
 def test_what_arrives_whole_is_fine():
@@ -46,6 +46,16 @@ def test_the_trap_is_named_even_when_nothing_ever_arrived():
         check([reception(0, lost=50, size=0)])
 
     assert "512 KB" in caught.value.cause
+
+
+def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
+    with pytest.raises(NotReady) as caught:
+        check([reception(1, lost=59, fast=False)])
+
+    error = caught.value
+    assert "do not share Fast DDS's memory" in error.cause
+    assert "RELIABLE" in error.next
+    assert "FASTDDS" not in error.next
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fluxvla_core.ros2.ring import Received
-from fluxvla_core.ros2.sync import check_age, match, silent
+from fluxvla_core.ros2.sync import check_age, check_together, match, silent
 from fluxvla_core.ros2.trouble import Stale
 
 
@@ -61,6 +61,60 @@ def test_clocks_that_differ_are_named_as_such_and_receipt_mends_it():
     assert caught.value.cause == "they arrive together, so the clocks that stamp them differ"
     assert "sync_on='receipt'" in caught.value.next
     assert match(streams, max_skew=0.1, by="receipt").skew == 0.0
+
+
+@pytest.mark.parametrize(
+    ("clock", "cause"),
+    [
+        (-10.0, "the clock that stamps cam is 10.03 s behind this machine's, or its messages are"),
+        (10.0, "the clock that stamps cam is 9.97 s ahead of this machine's"),
+    ],
+)
+def test_the_clock_that_is_off_is_named_however_many_messages_are_kept(clock, cause):
+    """The state's ring reaches back for seconds, and what is nearest in it is old."""
+    streams = {
+        "cam": stream(99.9, 99.93, 99.96, latency=0.03, clock=clock),
+        "state": stream(*[97.44 + i / 50 for i in range(128)]),
+    }
+
+    with pytest.raises(Stale) as caught:
+        match(streams, max_skew=0.1, wall=0.0)
+
+    assert caught.value.cause.startswith(cause)
+    assert "synchronise the machines' clocks" in caught.value.next
+
+
+def test_a_camera_that_is_late_is_no_matter_of_clocks():
+    streams = {"cam": stream(99.3, latency=0.7), "state": stream(99.9, 99.95, 100.0)}
+
+    with pytest.raises(Stale) as caught:
+        match(streams, max_skew=0.1, wall=0.0)
+
+    assert caught.value.cause == "cam is late, or comes in bursts"
+
+
+def test_two_arms_that_are_stamped_apart_are_no_one_state():
+    together = [99.8, 99.9, 100.0]
+    left, right = stream(*together, latency=0.01), stream(*together, latency=0.02)
+    check_together({"left": left, "right": right}, max_skew=0.1, wall=0.0)
+
+    off = stream(*together, latency=0.01, clock=-0.2)
+    with pytest.raises(Stale) as caught:
+        check_together({"left": off, "right": right}, max_skew=0.1, wall=0.0)
+
+    assert caught.value.what == (
+        "left is stamped 0.190 s before right, with which it arrives; at most 0.1 s is allowed"
+    )
+    assert caught.value.cause.startswith("the clock that stamps left is 0.21 s behind this mach")
+    check_together({"left": off, "right": right}, max_skew=0.3, wall=0.0)
+
+
+def test_a_state_that_comes_in_bursts_or_without_stamps_is_together():
+    burst = [Received(100.0, stamp, stamp) for stamp in (99.8, 99.9, 100.0)]
+    bare = [Received(100.0, None, "x")]
+
+    check_together({"left": burst, "right": stream(100.0)}, max_skew=0.1)
+    check_together({"left": stream(50.0), "right": bare}, max_skew=0.1)
 
 
 def test_one_stream_without_stamps_makes_receipts_count():

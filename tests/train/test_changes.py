@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fluxvla_core.train.changes import changed_settings, changed_statistics
+from fluxvla_core.train.resuming import changed_settings, changed_statistics
 
 
 def tree(**dataset):

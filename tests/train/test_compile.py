@@ -22,7 +22,7 @@ from fluxvla_core.testing.training import (
     train_all,
     unflushed,
 )
-from fluxvla_core.train.forward import compile_units
+from fluxvla_core.train.model import compile_units
 from fluxvla_core.train.weights import load_for_inference
 
 compiles = pytest.mark.skipif(

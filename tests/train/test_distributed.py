@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 
 import pytest
 import torch
@@ -104,7 +106,7 @@ def test_devices_that_are_not_there_are_refused(monkeypatch):
     monkeypatch.setenv("LOCAL_RANK", "1")
     with pytest.raises(ConfigError, match=r"process 2 .* no GPU of its own: torch sees 1") as found:
         start("auto")
-    assert "--nproc 1, or device='cpu'" in str(found.value)
+    assert "--nproc 1, or --set runner.device=cpu" in str(found.value)
 
 
 def test_a_lost_rank_is_explained_and_other_errors_are_not():
@@ -160,3 +162,20 @@ WORKER = "Caught RuntimeError in DataLoader worker process 0.\nOriginal Tracebac
 )
 def test_what_is_of_this_rank_is_not_blamed_on_another(error):
     assert explain(error, TWO, 12) is None
+
+
+def interfaces(folder, local_size):
+    os.environ.pop("GLOO_SOCKET_IFNAME", None)
+    os.environ["LOCAL_WORLD_SIZE"] = local_size
+    world = start("cpu")
+    names = [os.environ.get(f"{kind}_SOCKET_IFNAME") for kind in ("GLOO", "NCCL")]
+    (folder / f"{local_size}-{world.rank}").write_text(str(names))
+    distributed.stop(world)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its loopback has another name")
+@pytest.mark.parametrize(("local_size", "name"), [("2", "lo"), ("1", None)])
+def test_processes_of_one_machine_listen_to_it_alone(tmp_path, local_size, name):
+    assert run_ranks(2, interfaces, tmp_path, local_size) == [0, 0]
+    said = {(tmp_path / f"{local_size}-{rank}").read_text() for rank in range(2)}
+    assert said == {str([name, name])}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
@@ -10,12 +11,12 @@ import torch
 from safetensors.torch import load_file, save
 
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.disk import Disk
-from fluxvla_core.checkpoints.writer import CheckpointWriter
+from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, read_manifest
+from fluxvla_core.checkpoints.writer import CheckpointWriter, Disk
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import CheckpointError, RunFailed, UsageError
-from fluxvla_core.infer.local_policy import load_policy
+from fluxvla_core.errors import CheckpointError, FluxError, RunFailed, UsageError
 from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core.robot.local_policy import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.train.export import export
 from fluxvla_core.train.weights import left_out
@@ -177,3 +178,59 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path, monkeypatch):
     with pytest.raises(RunFailed, match="the disk is full"):
         export(source, tmp_path / "out" / "policy")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_full_disk_says_how_an_export_goes_on(tmp_path, monkeypatch):
+    def full(self, file, data):
+        raise OSError(28, "No space left on device")
+
+    source = saved(tmp_path / "run")
+    monkeypatch.setattr(Disk, "write", full)
+    with pytest.raises(RunFailed) as caught:
+        export(source, tmp_path / "out")
+    assert caught.value.what == "the disk is full: the export could not be saved"
+    assert "export again, or name a folder on another disk" in str(caught.value)
+    assert "--resume" not in str(caught.value)
+
+
+def test_only_files_that_the_manifest_vouches_for_are_copied(tmp_path, monkeypatch):
+    source = saved(tmp_path / "run")
+    (source / "processors").mkdir(exist_ok=True)
+    (source / "processors" / "planted.json").write_text("{}")
+    out = export(source, tmp_path / "out")
+    assert not (out / "processors" / "planted.json").exists()
+    Checkpoint.open(out).verify()
+
+    def swapped(self):  # another process writes between the check and the copy
+        (source / "policy.json").write_text('{"horizon": 3}')
+
+    monkeypatch.setattr(Checkpoint, "verify", swapped)
+    with pytest.raises(CheckpointError, match=r"policy\.json was changed since it was saved"):
+        export(source, tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fact"),
+    [
+        ("trainer.json", '{"left_out": 3}', "trainer.json: left_out"),
+        ("trainer.json", '{"left_out": {"sha256": 1}}', "trainer.json: left_out.sha256"),
+        ("config.resolved.json", '{"config": []}', "config.resolved.json: config"),
+        ("policy.json", '{"action_rate_hz": Infinity, "horizon": 1}', "policy.json: action_rate"),
+        ("policy.json", '{"action_rate_hz": -1, "horizon": 1}', "policy.json: action_rate_hz"),
+        ("policy.json", '{"action_rate_hz": 5, "horizon": "4"}', "policy.json: horizon"),
+        ("dataset_statistics.json", '{"private": 1}', "dataset_statistics.json: private"),
+        ("embodiment.json", '{"joints": 1}', "no embodiment spec"),
+    ],
+)
+def test_wrong_types_in_a_checkpoint_are_named(tmp_path, name, text, fact):
+    source = saved(tmp_path / "run")
+    (source / name).write_text(text)
+    found = read_manifest(source)
+    entry = FileEntry(len(text), hashlib.sha256(text.encode()).hexdigest())
+    manifest = Manifest(found.step, found.epoch, {**found.files, name: entry})
+    (source / "manifest.json").write_bytes(manifest.to_bytes())
+    with pytest.raises(FluxError) as caught:
+        load_policy(source)
+    assert fact in str(caught.value)
+    assert caught.value.exit_code == 2

@@ -234,11 +234,11 @@ def test_no_tracker_that_was_not_asked_for_is_touched(tmp_path, monkeypatch):
 
 def test_the_device_is_waited_for_every_few_steps_only(tmp_path, monkeypatch):
     """Peers call loss.item() and grad_norm.item() in every step."""
-    from fluxvla_core.train.window import Window
+    from fluxvla_core.train.step_metrics import StepMetrics
 
     fetched = []
-    fetch = Window.fetch
-    monkeypatch.setattr(Window, "fetch", lambda self: fetched.append(1) or fetch(self))
+    fetch = StepMetrics.fetch
+    monkeypatch.setattr(StepMetrics, "fetch", lambda self: fetched.append(1) or fetch(self))
     waits = []
     item = torch.Tensor.item
     monkeypatch.setattr(torch.Tensor, "item", lambda self: waits.append(1) or item(self))

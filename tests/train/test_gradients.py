@@ -10,7 +10,7 @@ import torch
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders
-from fluxvla_core.data.order import epoch_order
+from fluxvla_core.data.sampler import epoch_order
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.testing.training import (

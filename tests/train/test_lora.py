@@ -258,7 +258,8 @@ def test_going_on_with_another_base_names_both(tmp_path, base):
     assert (
         f"was trained with (the model from {now}; then from {before})\n"
         "  likely cause: init_from was changed, or that place has other weights by now\n"
-        f"  next: set init_from to where the weights of {before} are, or resume without it"
+        f"  next: --set runner.init_from=DIR, where the weights of {before} are; or resume "
+        "without it"
     ) in str(caught.value)
     shutil.copytree(base, tmp_path / "copy")
     run(tmp_path / "run", "auto", init_from=str(tmp_path / "copy"), lora=LORA)
@@ -291,7 +292,7 @@ def test_with_and_without_an_adapter_are_two_models(tmp_path, base):
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base))
     assert f"lora is not set, {had}" in str(caught.value)
-    assert "begin another run from these weights: init_from" in str(caught.value)
+    assert "begin another run from these weights: --set runner.init_from=" in str(caught.value)
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base), lora={**LORA, "rank": 3})
     assert f"modules_to_save=['head'], {had}" in str(caught.value)

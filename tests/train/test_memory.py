@@ -16,7 +16,7 @@ import torch
 from fluxvla_core import build
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
-from fluxvla_core.cli import run as cli
+from fluxvla_core.cli.execute import _run_section
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import (
     TinyDataset,
@@ -58,7 +58,7 @@ def test_a_gpu(error):
     told = explain(error, 7)
     assert told.what == "the GPU ran out of memory at step 7"
     assert told.cause == str(error).splitlines()[0]
-    assert "lower train_dataloader.per_device_batch_size and raise runner.grad_acc" in told.next
+    assert "lower --set train_dataloader.per_device_batch_size=… and raise --set" in told.next
     assert "--resume auto" in told.next
     assert told.exit_code == 1
 
@@ -121,7 +121,7 @@ def test_the_machine_as_a_worker_or_the_system_says_it(error, cause):
 def test_the_machine(error):
     told = explain(error)
     assert told.what == "this machine ran out of memory"
-    assert "lower train_dataloader.per_device_num_workers" in told.next
+    assert "lower --set train_dataloader.per_device_num_workers=…" in told.next
 
 
 GONE = "DataLoader worker (pid {}) is killed by signal: {}. "
@@ -139,7 +139,7 @@ SHM = (
             GONE.format(123, "Killed"),
             "a data worker (pid 123) was killed at step 7",
             "ran out of memory: dmesg tells",
-            "lower train_dataloader.per_device_num_workers or per_device_batch_size",
+            "lower --set train_dataloader.per_device_num_workers=… or",
         ),
         (
             SHM,
@@ -244,7 +244,7 @@ def test_a_setup_that_the_system_has_no_memory_for_is_told_of(tmp_path, monkeypa
     config = {"runner": {}, "train_dataloader": {"dataset": {}}}
     plan, context = SimpleNamespace(section="runner"), SimpleNamespace(config=config)
     with pytest.raises(RunFailed, match="this machine ran out of memory"):
-        cli._run_section(plan, lambda cfg, context: runner, context)
+        _run_section(plan, lambda cfg, context: runner, context)
 
 
 def test_a_run_keeps_what_it_saved_and_goes_on(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fluxvla_core import BaseTrainRunner
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.training import tiny_config
@@ -105,3 +106,8 @@ def test_no_model():
     del config["model"]
     with pytest.raises(ConfigError, match=r"my\.py: the config has no 'model' to train"):
         build(config, config_file="my.py").run_setup(10)
+
+
+def test_an_option_that_there_is_not_is_refused_in_python_too():
+    with pytest.raises(ConfigError, match=r"BaseTrainRunner: got an unexpected .* 'lr'"):
+        BaseTrainRunner(learning_rate=1e-3, collator=len, lr=1.0)

@@ -11,16 +11,16 @@ from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
-from fluxvla_core.data.parquet_dataset import ParquetDataset
 from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.transforms.images import SCALE
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import differences, unflushed
-from fluxvla_core.train import forward, pictures
-from fluxvla_core.transforms.deferral import SCALE
+from fluxvla_core.train import batches
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -132,13 +132,13 @@ def leave(monkeypatch):
     """Once called, runs leave pictures to the device; gives the dtypes that arrive there."""
     arrived = []
 
-    def spy(batch, known=forward.normalized):
+    def spy(batch, known=batches.normalized):
         arrived.append(batch["images"].dtype)
         return known(batch)
 
     def ask():
-        monkeypatch.setattr(pictures, "on_device", lambda device: True)
-        monkeypatch.setattr(forward, "normalized", spy)
+        monkeypatch.setattr(batches, "on_device", lambda device: True)
+        monkeypatch.setattr(batches, "normalized", spy)
         return arrived
 
     return ask
@@ -173,8 +173,8 @@ def test_a_run_goes_on_the_other_way_bit_for_bit(roots, tmp_path, leave):
 def test_what_is_left_travels_as_a_quarter_of_the_bytes(roots):
     collator = DictCollator(KEYS, META)
     dataset = build_dataset_from_cfg(table(roots[0]))
-    plain = pictures.source(dataset, collator, CPU)
-    left = pictures.source(dataset, collator, GPU)
+    plain = batches.loader_source(dataset, collator, CPU)
+    left = batches.loader_source(dataset, collator, GPU)
     assert plain is dataset
     assert isinstance(left, ParquetDataset)
     assert left.get_sample(0, 0)["images"].nbytes * 4 == plain.get_sample(0, 0)["images"].nbytes
@@ -183,10 +183,12 @@ def test_what_is_left_travels_as_a_quarter_of_the_bytes(roots):
 
 def test_a_worker_that_does_not_inherit_reads_it_too(roots):
     """Where processes are not forked, which is Python 3.14's default, a dataset is sent to them."""
-    left = pictures.source(build_dataset_from_cfg(mixture(roots)), DictCollator(KEYS, META), GPU)
-    batches = [next(iter(EpochSampler(len(left), 4).batches(0)))]
+    left = batches.loader_source(
+        build_dataset_from_cfg(mixture(roots)), DictCollator(KEYS, META), GPU
+    )
+    keys = [next(iter(EpochSampler(len(left), 4).batches(0)))]
     loader = make_loader(
-        left, DictCollator(KEYS, META), batches, 1, multiprocessing_context="forkserver"
+        left, DictCollator(KEYS, META), keys, 1, multiprocessing_context="forkserver"
     )
     (batch,) = loader
     assert batch["images"].dtype == torch.uint8
@@ -196,13 +198,13 @@ def test_a_worker_that_does_not_inherit_reads_it_too(roots):
 def test_a_mixture_leaves_all_or_nothing(roots):
     collator = DictCollator(KEYS, META)
     whole = build_dataset_from_cfg(mixture(roots))
-    left = pictures.source(whole, collator, GPU)
+    left = batches.loader_source(whole, collator, GPU)
     assert isinstance(left, DistributedRepeatingDataset)
     assert {left[i]["images"].dtype for i in range(len(left))} == {np.dtype(np.uint8)}
     assert {whole[i]["images"].dtype for i in range(len(whole))} == {np.dtype(np.float32)}
     strange = table(roots[1], NORMALIZE, lambda sample: sample)
     half = DistributedRepeatingDataset([table(roots[0]), strange])
-    assert pictures.source(half, collator, GPU) is half
+    assert batches.loader_source(half, collator, GPU) is half
 
 
 class Cropping(DictCollator):
@@ -228,9 +230,9 @@ class Renamed(DictCollator):
 )
 def test_only_the_cores_collator_is_given_what_is_left(roots, collator, leaves):
     dataset = build_dataset_from_cfg(table(roots[0]))
-    assert (pictures.source(dataset, collator, GPU) is not dataset) is leaves
+    assert (batches.loader_source(dataset, collator, GPU) is not dataset) is leaves
 
 
 def test_a_dataset_that_knows_nothing_of_it_is_read_as_it_is():
     dataset = [{"images": np.zeros((3, 2, 2), np.float32)}]
-    assert pictures.source(dataset, DictCollator(KEYS), GPU) is dataset
+    assert batches.loader_source(dataset, DictCollator(KEYS), GPU) is dataset

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from typing import ClassVar
 
@@ -183,7 +184,8 @@ def test_averages_are_not_dropped_without_a_word(tmp_path):
         f"{tmp_path}/checkpoints/step-000000002: ema_decay is not set, and the checkpoint's run "
         "kept averaged weights, which act\n"
         "  next: set it back: the checkpoint's config.resolved.json has its value; or begin "
-        "another run from these weights: init_from = '<this checkpoint>' and another --work-dir"
+        "another run from these weights: --set runner.init_from="
+        f"{tmp_path}/checkpoints/step-000000002 --work-dir OTHER"
     )
 
 
@@ -281,6 +283,26 @@ def test_the_same_command_started_twice_leaves_the_firsts_checkpoints_alone(tmp_
     runner.run(TinyDataset())
     assert run_ranks(1, other_run, tmp_path, left) == [0]
     assert not left.is_dir()
+
+
+@pytest.mark.parametrize("saving", [{"save_iter_interval": 1}, {"async_save": False}, {}])
+def test_a_work_dir_that_is_removed_ends_the_run_and_is_not_made_again(
+    tmp_path, saving, monkeypatch
+):
+    class Removing(TinyDataset):
+        def get_sample(self, index, epoch):
+            self.asked = getattr(self, "asked", 0) + 1
+            if self.asked == 4 * 5:
+                (tmp_path / "work").rename(tmp_path / "away")
+                shutil.rmtree(tmp_path / "away", ignore_errors=True)
+            return super().get_sample(index, epoch)
+
+    runner = make(tmp_path / "work", **{"save_iter_interval": 2, "max_steps": 9, **saving})
+    runner.run_setup(37)
+    with pytest.raises(RunFailed) as caught:
+        runner.run(Removing())
+    assert str(caught.value).startswith(f"the work dir {tmp_path}/work was taken away from this")
+    assert not (tmp_path / "work").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

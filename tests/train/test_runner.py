@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from fluxvla_core.checkpoints import disk
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
+from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed
 from fluxvla_core.plugins.registry import HOOKS
 from fluxvla_core.testing.training import (
@@ -31,7 +31,7 @@ def _fast():
 
 def test_what_a_dataset_doubts_is_said_before_the_first_step(tmp_path):
     class Doubted(TinyDataset):
-        def doubts(self):
+        def warnings(self):
             return ["state wrist never moves"]
 
     said = Said()
@@ -167,7 +167,7 @@ def test_a_nan_names_its_sample_and_spoils_no_checkpoint(tmp_path):
 
 
 def test_a_full_disk_ends_the_run_and_keeps_the_checkpoints_before(tmp_path, monkeypatch):
-    write, left = disk.Disk.write, [100]
+    write, left = Disk.write, [100]
 
     def filling(self, file, data):
         left[0] -= 1
@@ -175,7 +175,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_checkpoints_before(tmp_path, mon
             raise OSError(28, "No space left on device")
         write(self, file, data)
 
-    monkeypatch.setattr(disk.Disk, "write", filling)
+    monkeypatch.setattr(Disk, "write", filling)
     runner = make(tmp_path, save_iter_interval=1, max_keep_ckpts=0)
     runner.run_setup(37)
     with pytest.raises(RunFailed, match="the disk is full: the checkpoint of step") as caught:
@@ -195,7 +195,7 @@ def test_checkpoints_that_cannot_be_removed_are_only_warned_of(tmp_path, monkeyp
     def refuse(self, path):
         raise OSError(13, "Permission denied")
 
-    monkeypatch.setattr(disk.Disk, "remove_folder", refuse)
+    monkeypatch.setattr(Disk, "remove_folder", refuse)
     said = Said()
     run(tmp_path, save_iter_interval=2, max_keep_ckpts=1, reporter=said)
     assert "warning: old checkpoints could not be removed: [Errno 13] Permission" in said.lines[0]
@@ -366,8 +366,8 @@ def test_what_only_exists_inside_a_run_says_so(tmp_path):
     runner = make(tmp_path)
     with pytest.raises(RuntimeError, match="the world is known from _build_vla on"):
         _ = runner.world
-    with pytest.raises(RuntimeError, match=r"there is a loop only inside run\(\)"):
-        _ = runner.loop
+    with pytest.raises(RuntimeError, match=r"there is a trainer only inside run\(\)"):
+        _ = runner.trainer
     runner.run_setup(37)
     with pytest.raises(RuntimeError, match=r"a batch's arguments are known inside run\(\) only"):
         runner._training_step({})

@@ -16,7 +16,7 @@ import torch
 
 from fluxvla_core.checkpoints import tensors
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders
-from fluxvla_core.checkpoints.disk import Disk
+from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import (
     KEYS,
@@ -25,7 +25,7 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.train import saver
+from fluxvla_core.train import saving
 
 
 def config(**settings):
@@ -41,13 +41,13 @@ def run(work_dir, **settings):
 def test_it_saves_the_moment_however_long_the_copy_takes(tmp_path, monkeypatch):
     """The next step's forward pass runs during the copy; its optimizer waits for it."""
     at_once = run(tmp_path / "at once", async_save=False)
-    copy = saver.Saver._copy
+    copy = saving.Saver._copy
 
     def slow(self, place, tensor):
         time.sleep(0.01)
         return copy(self, place, tensor)
 
-    monkeypatch.setattr(saver.Saver, "_copy", slow)
+    monkeypatch.setattr(saving.Saver, "_copy", slow)
     beside = run(tmp_path / "beside")
     assert len(at_once) == len(beside) == 3
     for a, b in zip(at_once, beside, strict=True):
@@ -119,7 +119,7 @@ def test_what_is_no_error_of_the_disk_fails_the_run_too(tmp_path, monkeypatch):
     def no_memory(self, place, tensor):
         raise MemoryError("cannot allocate 7 bytes")
 
-    monkeypatch.setattr(saver.Saver, "_copy", no_memory)
+    monkeypatch.setattr(saving.Saver, "_copy", no_memory)
     with pytest.raises(RunFailed, match="of step 2 could not be saved: MemoryError: cannot alloc"):
         run(tmp_path)
 
@@ -133,7 +133,7 @@ def test_memory_is_kept_from_save_to_save(tmp_path, monkeypatch):
             made.append(threading.current_thread().name)
         return empty(*args, **kwargs)
 
-    monkeypatch.setattr(saver.torch, "empty", counted)
+    monkeypatch.setattr(saving.torch, "empty", counted)
     run(tmp_path)
     assert set(made) == {"checkpoint-2"}
 
@@ -162,8 +162,8 @@ def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, 
 
 
 def test_copies_wait_for_nothing_without_a_job():
-    world = saver.World(0, 1, 0, torch.device("cpu"))
-    idle = saver.Saver(world, True)
+    world = saving.World(0, 1, 0, torch.device("cpu"))
+    idle = saving.Saver(world, True)
     idle.copied()
     idle.close()
     assert idle.settle(wait=True) is None

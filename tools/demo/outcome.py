@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 
 def median_step_s(metrics: Path, skip: int = 3) -> float:
@@ -23,19 +24,10 @@ def median_step_s(metrics: Path, skip: int = 3) -> float:
 
 def verdict(results: Path) -> list[str]:
     """Lines on the success rates, and on whether training and the instruction made a difference."""
-    groups = json.loads(results.read_text(encoding="utf-8"))["groups"]
-    rates = {name: table["all"] for name, table in groups.items()}
-    names = {
-        "policy": "trained policy",
-        "swapped": "trained policy, told the other task",
-        "untrained": "untrained policy",
-    }
-    lines = [
-        f"{names.get(name, name)}: {rate['successes']} of {rate['episodes']} episodes succeed "
-        f"({rate['rate']:.0%}, 95 % interval {rate['low']:.0%} to {rate['high']:.0%})"
-        for name, rate in rates.items()
-        if rate["episodes"]
-    ]
+    found = json.loads(results.read_text(encoding="utf-8"))
+    rates = {name: table["all"] for name, table in found["groups"].items()}
+    obeyed = found.get("obeyed", {})
+    lines = [_line(name, rate, obeyed) for name, rate in rates.items() if rate["episodes"]]
     trained, untrained = rates.get("policy"), rates.get("untrained")
     if trained and untrained:
         if trained["low"] > untrained["high"]:
@@ -43,6 +35,20 @@ def verdict(results: Path) -> list[str]:
         else:
             lines.append("the intervals overlap: this says nothing about the training")
     return lines
+
+
+def _line(name: str, rate: Mapping[str, Any], obeyed: Mapping[str, Any]) -> str:
+    """One group's rate, in the words of the report."""
+    names = {"policy": "trained policy", "untrained": "untrained policy"}
+    who, does = names.get(name, name), "episodes succeed"
+    if name == "swapped":
+        who = "wrong instruction"
+        if name in obeyed:
+            rate, who, does = obeyed[name], f"{who}: does the task that it was told", "episodes"
+    return (
+        f"{who}: {rate['successes']} of {rate['episodes']} {does} "
+        f"({rate['rate']:.0%}, 95 % interval {rate['low']:.0%} to {rate['high']:.0%})"
+    )
 
 
 def size_of(paths: Iterable[Path]) -> str:

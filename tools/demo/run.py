@@ -15,8 +15,9 @@ from typing import Any
 from tools import shell
 from tools.demo import outcome, stages
 from tools.demo.journal import Entry, Journal, key_of
+from tools.demo.next_steps import next_steps, told
 from tools.demo.outcome import clock
-from tools.demo.sizes import Size, affordable_steps
+from tools.demo.sizes import Size, affordable_steps, expected_s, left_s
 from tools.demo.stages import Places, Stage
 
 Execute = Callable[[list[str]], object]
@@ -57,6 +58,8 @@ class Demo:
         install.seconds += installed_s
         self._before = ""
         self._number = 0
+        self._expected = expected_s(size)
+        self._took: dict[str, float] = {}
 
     def run(self) -> None:
         """All stages that are not done, then the summary.
@@ -78,7 +81,7 @@ class Demo:
             self._do(stages.robot(places, task))
         self._write_stages()
         self._do(stages.report(places))
-        self._summary()
+        self._summary(steps)
 
     def elapsed_s(self) -> float:
         """Seconds of installation and of all stages so far, over all attempts."""
@@ -90,32 +93,44 @@ class Demo:
 
         def choose() -> dict[str, Any]:
             step_s = outcome.median_step_s(self.places.speed / "metrics.jsonl")
-            steps = affordable_steps(self.size, step_s, self.elapsed_s())
+            steps = affordable_steps(self.size, step_s, self.elapsed_s(), self._pace())
             return {"step_s": step_s, "steps": steps}
 
         found = self._do(stages.measure(self.size, self.places), choose).result
-        self._say(f"a step takes {found['step_s']:.2f} s: {found['steps']} steps fit")
+        self._say(f"a step takes {found['step_s']:.2f} s: {found['steps']} steps fit\n")
+        # From here on the pace of a step is known, whatever the other stages took.
+        self._expected = expected_s(self.size, found["steps"], found["step_s"] / self._pace())
         return int(found["steps"])
+
+    def _pace(self) -> float:
+        """How many times longer than on a free machine the stages took so far."""
+        expected = sum(self._expected[name] for name in self._took)
+        return sum(self._took.values()) / expected or 1.0
+
+    def _left(self) -> str:
+        left = left_s(self._expected, self._took)
+        return f"{clock(self.elapsed_s())} so far, about {clock(left)} left"
 
     def _do(self, stage: Stage, result: Callable[[], Any] | None = None) -> Entry:
         """Run one stage unless it is done; every later stage depends on its command."""
         self._number += 1
         key = self._before = key_of(self._before, stage.command)
         old = self.journal.entries.get(stage.name)
-        head = f"[{self._number}] {stage.title}"
+        head = f"stage {self._number} of {len(self._expected)}: {stage.title}"
         if old is not None and old.key == key and old.done:
             self._say(f"{head}: done before, in {clock(old.seconds)}")
+            self._took[stage.name] = old.seconds
             return old
         words = list(stage.command)
         if old is not None and old.key == key:
             words += stage.resume
             entry = old
-            self._say(f"{head}: going on · {clock(self.elapsed_s())} so far")
+            self._say(f"{head}: going on · {self._left()}")
         else:
             self._clear(stage)
             self.journal.forget_from(stage.name)
             entry = Entry(key, command=shlex.join(stage.command))
-            self._say(f"{head} · {clock(self.elapsed_s())} so far")
+            self._say(f"{head} · {self._left()}")
         self.journal.entries[stage.name] = entry
         self.journal.save()
         before, began = entry.seconds, time.monotonic()
@@ -127,6 +142,7 @@ class Demo:
             if entry.done and result is not None:
                 entry.result = result()
             self.journal.save()
+        self._took[stage.name] = entry.seconds
         self._say(f"    took {clock(entry.seconds)}\n")
         return entry
 
@@ -146,7 +162,7 @@ class Demo:
         path = self.places.work / "stages.json"
         path.write_text(json.dumps({"stages": rows}, indent=1), encoding="utf-8")
 
-    def _summary(self) -> None:
+    def _summary(self, steps: int) -> None:
         places = self.places
         checkpoints = sorted((places.work / "checkpoints").glob("step-*"))
         self._say("Done. This is what was made:")
@@ -160,9 +176,10 @@ class Demo:
             self._say(f"  {line}")
         entries = self.journal.entries.items()
         times = ", ".join(f"{name} {clock(entry.seconds)}" for name, entry in entries)
-        activate = Path(sys.prefix) / "bin" / "activate"
-        if activate.is_file():
-            place = os.path.relpath(activate)
-            self._say(f"To go on by hand:  source {place}  and then: fluxvla --help")
         self._say(f"Time: {clock(self.elapsed_s())} in all ({times})")
+        activate = Path(sys.prefix) / "bin" / "activate"
+        first = f", after: source {os.path.relpath(activate)}" if activate.is_file() else ""
+        self._say(f"What to do next{first}")
+        for line in told(next_steps(self.size, places, steps)):
+            self._say(line)
         sys.stdout.flush()

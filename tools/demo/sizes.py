@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 
@@ -41,14 +42,50 @@ AFTER_TRAINING_S = 270.0
 AROUND_STEPS_S = 30.0
 
 
-def affordable_steps(size: Size, step_s: float, elapsed_s: float) -> int:
+def affordable_steps(size: Size, step_s: float, elapsed_s: float, pace: float = 1.0) -> int:
     """The steps that fit into the limit.
 
     Args:
         step_s: seconds that one step was measured to take.
         elapsed_s: seconds that the demo has taken so far.
+        pace: how many times longer than expected the stages took so far; so will those after
+            the training.
     """
     if size.minutes is None:
         return size.steps
-    left = size.minutes * 60 - elapsed_s - AFTER_TRAINING_S - AROUND_STEPS_S
+    around = (AFTER_TRAINING_S + AROUND_STEPS_S) * max(1.0, pace)
+    left = size.minutes * 60 - elapsed_s - around
     return max(size.fewest_steps, min(size.steps, int(left / step_s)))
+
+
+STEP_S = 0.55
+"""Seconds of a training step on two free cores; ``measure`` finds this machine's."""
+
+
+def expected_s(size: Size, steps: int | None = None, step_s: float = STEP_S) -> dict[str, float]:
+    """Seconds that each stage takes on two free cores, in the order of the stages.
+
+    Args:
+        steps: of the training; unknown before the speed is measured: as many as fit, or those of
+            the size.
+        step_s: seconds of one step.
+    """
+    collect = {"collect": 5.0 + 0.8 * size.demonstrations}
+    measure = {} if size.minutes is None else {"measure": 20.0}
+    # Two tasks; the trained policy, the other instruction, and an untrained one.
+    evaluate = 20.0 + 1.4 * 2 * 3 * size.episodes
+    after = {"evaluate": evaluate, "robot 1": 10.0, "robot 2": 10.0, "report": 2.0}
+    if steps is None:
+        before = sum((*collect.values(), *measure.values()))
+        steps = affordable_steps(size, step_s, before)
+    return {**collect, **measure, "train": AROUND_STEPS_S + steps * step_s, **after}
+
+
+def left_s(expected: Mapping[str, float], took: Mapping[str, float]) -> float:
+    """Seconds that the stages which are not in ``took`` still take.
+
+    A machine that was slower than expected so far, or faster, is expected to stay so.
+    """
+    so_far = sum(expected[name] for name in took if name in expected)
+    pace = sum(took[name] for name in took if name in expected) / so_far if so_far else 1.0
+    return pace * sum(seconds for name, seconds in expected.items() if name not in took)

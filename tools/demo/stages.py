@@ -85,7 +85,7 @@ def train(size: Size, places: Places, steps: int) -> Stage:
 
 
 def evaluate(size: Size, places: Places) -> Stage:
-    """The trained policy, the same one told the other task, and an untrained one."""
+    """The trained policy, the same one with the wrong instruction, and an untrained one."""
     words = ["fluxvla", "run", "--config", str(CONFIG), "--section", "eval"]
     words += ["--work-dir", str(places.work), "--nproc", str(cores())]
     words += ["--set", f"eval.episodes={size.episodes}"]

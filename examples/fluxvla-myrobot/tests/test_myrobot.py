@@ -12,9 +12,7 @@ import pytest
 
 from fluxvla_core import Frame
 from fluxvla_core.errors import NotReady
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import JOINT_STATE
+from fluxvla_core.ros2 import JOINT_STATE, Connection, message_class
 from fluxvla_core.testing import OperatorConformance
 from fluxvla_core.testing.ros2 import ros_domain
 

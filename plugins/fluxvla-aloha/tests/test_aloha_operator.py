@@ -13,11 +13,10 @@ from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.operator import AlohaOperator, fill_command
 from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
 
-from fluxvla_core.build import RunContext, build_operator_from_cfg
+from fluxvla_core import build_operator_from_cfg
 from fluxvla_core.errors import ConfigError, LoadFailed, NotReady, Rejected
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, ODOMETRY, TWIST
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.operators import RunContext
+from fluxvla_core.ros2 import IMAGE, JOINT_STATE, ODOMETRY, TWIST, BadMessage, message_class
 from fluxvla_core.testing import OperatorConformance
 from fluxvla_core.testing.ros2 import drivers, lasting_drivers, ros_domain
 

@@ -9,11 +9,9 @@ import pytest
 from fluxvla_aloha import embodiment
 from fluxvla_aloha.runner import AlohaInferenceRunner
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core import RUNNERS, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.plugins.registry import RUNNERS
+from fluxvla_core.operators import Frame, RunContext, SimulatedClock
 
 SPEC = embodiment.aloha_spec(cameras=())
 START_POSE = embodiment.start_pose("viperx300")

@@ -7,7 +7,7 @@ import pytest
 from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.workspace import AlohaWorkspaceBox
 
-from fluxvla_core.build import build_action_filter_from_cfg
+from fluxvla_core import build_action_filter_from_cfg
 from fluxvla_core.errors import ConfigError
 
 BOX = {"lower": (0.05, -0.4, 0.03), "upper": (0.6, 0.4, 0.6)}

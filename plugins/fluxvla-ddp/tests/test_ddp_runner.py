@@ -11,7 +11,7 @@ from fluxvla_ddp.runner import DDPTrainRunner
 
 from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.testing.train_runner import TrainRunnerConformance
+from fluxvla_core.testing import TrainRunnerConformance
 from fluxvla_core.testing.training import (
     TinyVLA,
     differences,

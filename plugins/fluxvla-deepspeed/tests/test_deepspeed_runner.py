@@ -9,11 +9,11 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import VLAS, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import ConfigError, RunFailed
-from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.testing.train_runner import TrainRunnerConformance
+from fluxvla_core.operators import RunContext
+from fluxvla_core.testing import TrainRunnerConformance
 from fluxvla_core.testing.training import (
     TinyVLA,
     checkpoint_differences,
@@ -32,6 +32,7 @@ class TestDeepSpeedTrainRunner(TrainRunnerConformance):
     """Every start of processes imports DeepSpeed for seconds: at night only."""
 
     entry_point = "DeepSpeedTrainRunner"
+    scalars = ()
 
 
 def config(batch=2, centred=False, **settings):
@@ -44,7 +45,8 @@ def config(batch=2, centred=False, **settings):
         "lr_scheduler_type": "linear-warmup+cosine-decay",
         **settings,
     }
-    return tiny_config(table, batch, dropout=0.0, centred=centred)
+    model = {"width": 7, "assorted": True, "centred": centred, "batch_norm": centred}
+    return tiny_config(table, batch, dropout=0.0, **model)
 
 
 def every_stage(work_dir, stages=STAGES):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core import VLAS
 from fluxvla_core.testing.training import TinyVLA, run_ranks, tiny_config, train
 
 

@@ -8,15 +8,16 @@ import os
 import pytest
 import torch
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, latest
-from fluxvla_core.checkpoints.disk import Disk
+from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.errors import RunFailed
+from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
 from fluxvla_core.train import distributed
-from fluxvla_core.train.loop import begin
-from fluxvla_core.train.progress import Progress
+from fluxvla_core.train.state import Progress
 from fluxvla_core.train.stop import StopRequest
+from fluxvla_core.train.trainer import Trainer
 
 
 def two_ranks(work_dir):
@@ -32,7 +33,7 @@ def two_ranks(work_dir):
         dataset = TinyDataset()
         runner.run_setup(len(dataset))
         runner.progress = Progress()
-        begin(runner, dataset, StopRequest(runner.world)).close()
+        Trainer(runner, dataset, StopRequest(runner.world)).close()
         operations = count_operations()
         train_a_step(runner)
         save(runner, folder, 1)

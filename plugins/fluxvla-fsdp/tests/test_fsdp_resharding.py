@@ -10,13 +10,14 @@ import torch
 import torch.distributed.checkpoint as dcp
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.checkpoints.tensors import read_tensors
+from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config, train
 from fluxvla_core.train import distributed
-from fluxvla_core.train.loop import begin
 from fluxvla_core.train.stop import StopRequest
+from fluxvla_core.train.trainer import Trainer
 
 TOGETHER = 12
 """Samples of a step, over all processes."""
@@ -43,7 +44,7 @@ def reload(ranks, source, work_dir):
     runner = build_runner_from_cfg(context.config["runner"], context)
     dataset = TinyDataset()
     runner.run_setup(len(dataset))
-    begin(runner, dataset, StopRequest(runner.world)).close()
+    Trainer(runner, dataset, StopRequest(runner.world)).close()
     runner.save_checkpoint(work_dir / "again", runner.progress.step, 0)
     runner.settle_saves()
     distributed.stop(runner.world)

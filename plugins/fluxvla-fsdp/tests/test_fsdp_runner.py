@@ -15,10 +15,11 @@ import pytest
 import torch
 from torch.distributed.tensor import DTensor
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.testing.train_runner import TrainRunnerConformance
+from fluxvla_core.operators import RunContext
+from fluxvla_core.testing import TrainRunnerConformance
 from fluxvla_core.testing.training import (
     checkpoint_differences,
     differences,
@@ -30,6 +31,7 @@ from fluxvla_core.testing.training import (
 
 class TestFSDPTrainRunner(TrainRunnerConformance):
     entry_point = "FSDPTrainRunner"
+    scalars = ("frozen",)
 
 
 def build(work_dir, **settings):
@@ -179,13 +181,13 @@ def test_no_device_holds_the_whole_model(tmp_path):
 WORKER = """
 import json, os, pathlib, sys
 from fluxvla_core.testing.training import train
-from fluxvla_core.cli.ranks import leave
+from fluxvla_core.cli.ranks import exit_now
 settings = json.loads(pathlib.Path(sys.argv[1]).read_text())
 folder = pathlib.Path(settings["work_dir"])
 folder.mkdir(parents=True, exist_ok=True)
 (folder / f"pid-{os.environ['RANK']}").write_text(str(os.getpid()))
 train(settings)
-leave(0)
+exit_now(0)
 """
 
 

@@ -7,9 +7,9 @@ import torch
 from fluxvla_fsdp.ties import check_ties
 from torch import nn
 
+from fluxvla_core import VLAS
 from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import Block, TinyVLA, run_ranks, tiny_config, train
 
 WIDTH = 8

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
+from fluxvla_core import VLAS
 from fluxvla_core.checkpoints.checkpoint import latest
-from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import (
     ACTIONS,
     HORIZON,

@@ -7,14 +7,19 @@ import subprocess
 import sys
 from importlib.util import find_spec
 
+import gymnasium
 import numpy as np
 import pytest
 from fluxvla_gymnasium.environment import GymnasiumEnvironment
 from fluxvla_gymnasium.parts import parts, pictures, state_row
-from fluxvla_gymnasium.success import is_done
+from fluxvla_gymnasium.success import Judge
+from fluxvla_mujoco import divergence
 
-from fluxvla_core.build import RunContext, build_environment_from_cfg, build_runner_from_cfg
+from fluxvla_core import build_environment_from_cfg, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
+from fluxvla_core.evaluate.statistics import summarise
+from fluxvla_core.evaluation import RolloutSettings, run_episode
+from fluxvla_core.operators import RunContext
 from fluxvla_core.testing import EnvironmentConformance
 
 needs_mujoco = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
@@ -153,6 +158,21 @@ def test_gym_aloha_from_a_config():
     made.close()
 
 
+@needs_aloha
+def test_a_simulation_behind_dm_control_is_watched_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
+    from dm_control.rl.control import PhysicsError
+
+    made = GymnasiumEnvironment(**aloha())
+    made.reset(5, made.spec.tasks[0].name)
+    assert divergence(made.simulation) is None
+    made.simulation.qvel[:] = 1e12
+    with pytest.raises(PhysicsError, match="BADQVEL"):  # dm_control says it by itself, as a rule
+        made.step(made.state)
+    assert divergence(made.simulation) == "MuJoCo warned of BADQVEL at index 0"
+    made.close()
+
+
 def test_a_discrete_action_is_the_nearest_one(monkeypatch):
     made = GymnasiumEnvironment("CartPole-v1", body(1, 4), success="terminated")
     given = []
@@ -192,7 +212,15 @@ def test_what_does_not_fit_is_refused_before_the_first_step(arguments, error, me
         ({"render": "nice"}, "render 'nice' is none of"),
         ({"id": "gym_aloha:gym_aloha/X-v0"}, "set module = 'gym_aloha' and id = 'gym_aloha/X-v0'"),
         ({"module": "os.path"}, "'os.path' is no name of an installed package"),
-        ({"success": "reward"}, "success 'reward' is none of info, terminated"),
+        ({"success": "reward"}, "success 'reward' is none of info, terminated, truncated"),
+        (
+            {"success_reward": 1.0, "success_return": 9.0},
+            "success_reward and success_return are two ways: give one of them",
+        ),
+        (
+            {"instruction": "balance", "instruction_from": "mission"},
+            "instruction and instruction_from both say what a policy is told",
+        ),
         ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
         ({"cameras": {"top": "render"}}, "the embodiment has no camera 'top'; it has none"),
     ],
@@ -204,14 +232,11 @@ def test_impossible_values_are_refused(arguments, message):
 
 
 def test_a_picture_that_is_not_there_is_named():
-    made = GymnasiumEnvironment("CartPole-v1", body(1, 4, [("top", 8, 8)]))
+    made = GymnasiumEnvironment("CartPole-v1", body(1, 4, [("top", 8, 8)]), success="terminated")
     made.reset(0, "CartPole-v1")
     with pytest.raises(SpecMismatch, match="has no picture 'top'; it has none") as caught:
         made.observe(made.spec.embodiment.cameras)
     assert "set cameras = {'top': '<one of these, or render>'}" in str(caught.value)
-    with pytest.raises(RunFailed, match=r"whether its task is done; its info has \[\]") as caught:
-        made.step(np.array([1.0]))
-    assert "success = 'terminated'" in str(caught.value)
     made.close()
 
 
@@ -227,17 +252,136 @@ def test_observations_are_taken_apart_by_name():
 
 
 @pytest.mark.parametrize(
-    ("how", "reward_from", "reward", "terminated", "info", "done"),
+    ("judge", "reward", "total", "terminated", "lasted", "info", "done"),
     [
-        ("info", None, 0, False, {"is_success": np.True_}, True),
-        ("info", None, 0, True, {"success": 0.0}, False),
-        ("terminated", None, 0, True, {}, True),
-        ("info", 4.0, 4.0, False, {}, True),
-        ("info", 4.0, 3.9, True, {}, False),
+        (Judge(), 0, 0, False, False, {"is_success": np.True_}, True),
+        (Judge(), 0, 0, True, False, {"success": 0.0}, False),
+        (Judge(), 0, 0, False, False, {}, False),
+        (Judge("terminated"), 0, 0, True, False, {}, True),
+        (Judge("truncated"), 0, 0, False, True, {}, True),
+        (Judge("truncated"), 0, 0, True, True, {}, False),
+        (Judge(reward=4.0), 4.0, 0, False, False, {}, True),
+        (Judge(reward=4.0), 3.9, 9, True, False, {}, False),
+        (Judge(total=9.0), 1.0, 9.0, False, False, {}, True),
+        (Judge(total=9.0), 10.0, 8.9, True, True, {}, False),
     ],
 )
-def test_success_has_four_ways_of_being_said(how, reward_from, reward, terminated, info, done):
-    assert is_done(how, reward_from, reward, terminated, info) is done
+def test_success_has_five_ways_of_being_said(judge, reward, total, terminated, lasted, info, done):
+    assert judge.done(reward, total, terminated, lasted, info) is done
+
+
+@pytest.mark.parametrize(
+    ("ways", "steps", "success"),
+    [
+        ({"success": "truncated"}, 12, True),
+        ({"success_return": 12.0}, 12, True),
+        ({"success_return": 13.0}, 12, False),
+        ({"success": "truncated", "max_steps": 8}, 8, True),
+    ],
+)
+def test_lasting_is_a_success_where_that_is_the_task(ways, steps, success):
+    """A pole that is still up when the time is: Gymnasium truncates, nothing terminates."""
+    made = GymnasiumEnvironment("CartPole-v1", body(1, 4), make={"max_episode_steps": 12}, **ways)
+    made.reset(0, "CartPole-v1")
+    for step in range(steps):
+        found = made.step(np.array([step % 2]))
+    assert found.success is success
+    assert found.ended or made.spec.tasks[0].max_steps == steps
+    made.close()
+
+
+def test_who_never_says_whether_it_is_done_is_refused_before_the_first_episode():
+    made = GymnasiumEnvironment("CartPole-v1", body(1, 4))
+    with pytest.raises(ConfigError, match="CartPole-v1 does not say whether its task is") as caught:
+        made.reset(0, "CartPole-v1")
+    assert "its info has nothing, and neither of is_success, success" in str(caught.value)
+    assert "set success = 'terminated' or 'truncated', success_reward" in str(caught.value)
+
+
+class Errand(gymnasium.Env):
+    """A place to go to, said in words that are another in each episode; a nested observation.
+
+    Says whether it is done at its end alone.
+    """
+
+    observation_space = gymnasium.spaces.Dict(
+        {
+            "mission": gymnasium.spaces.Text(20),
+            "pair": gymnasium.spaces.Tuple(
+                (gymnasium.spaces.Discrete(9), gymnasium.spaces.Box(-9, 9, (2,)))
+            ),
+        }
+    )
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.goal, self.place = int(self.np_random.integers(3, 6)), 0
+        return self._seen(), {}
+
+    def step(self, action):
+        self.place += 1 if action else -1
+        over = abs(self.place) == self.goal
+        info = {"is_success": self.place == self.goal} if over else {}
+        return self._seen(), -1.0, over, False, info
+
+    def _seen(self):
+        pair = (self.place % 9, np.array([self.place, self.goal], np.float32))
+        return {"mission": f"go to {self.goal}", "pair": pair}
+
+
+gymnasium.register("FluxErrand-v0", Errand)
+
+
+def errand(**arguments):
+    return {
+        "type": "GymnasiumEnvironment",
+        "id": "FluxErrand-v0",
+        "embodiment": body(1, 3),
+        "instruction_from": "mission",
+        "max_steps": 200,
+        **arguments,
+    }
+
+
+class Obedient:
+    """Goes right as often as it is told: what it does follows from the words alone."""
+
+    def __init__(self):
+        self.told = []
+
+    def reset(self, seed):
+        return
+
+    def predict_action(self, observation):
+        self.told.append(observation["task_description"])
+        return np.ones((1, 1))
+
+
+def test_words_of_each_episode_reach_the_policy_and_the_record():
+    made = build_environment_from_cfg(errand())
+    policy, task = Obedient(), made.spec.tasks[0]
+    records = [run_episode(made, policy, task, seed, RolloutSettings()) for seed in range(12)]
+    assert {r["instruction"] for r in records} == {"go to 3", "go to 4", "go to 5"}
+    assert all(r["success"] and r["instruction"] == f"go to {r['steps']}" for r in records)
+    assert set(policy.told) == {"go to 3", "go to 4", "go to 5"}
+    assert made.state.shape == (3,), "nested parts, and no text among them"
+    made.close()
+    counted = summarise([{**r, "group": "g", "task": "t", "status": "done"} for r in records])
+    assert counted["g"]["all"]["mean_return"] == -np.mean([r["steps"] for r in records])
+
+
+def test_what_is_no_array_of_numbers_is_refused_in_words():
+    with pytest.raises(SpecMismatch, match=r"observation's part 'odd\.1' is a set: no array of n"):
+        parts({"mission": "go", "odd": (1.0, {2})})
+    made = build_environment_from_cfg(errand(state=["mission", "pair.0"]))
+    with pytest.raises(SpecMismatch, match="the observation's part 'mission' is a text") as caught:
+        made.reset(0, "FluxErrand-v0")
+    assert "instruction_from = 'mission'" in str(caught.value)
+    made = build_environment_from_cfg(errand(instruction_from="pair.0"))
+    made.reset(0, "FluxErrand-v0")
+    with pytest.raises(SpecMismatch, match=r"has no text 'pair\.0'; it has mission"):
+        made.observe(())
 
 
 def test_importing_imports_no_simulator():

@@ -9,9 +9,9 @@ import pytest
 from fluxvla_libero.embodiment import libero_spec
 from fluxvla_libero.require import is_installed
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.commands import SilentReporter
+from fluxvla_core.operators import Camera
 from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.spec.embodiment import Camera
 
 MODEL = '''
 import torch

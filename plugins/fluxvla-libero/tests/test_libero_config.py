@@ -17,9 +17,10 @@ from fluxvla_libero.expert import LiberoExpert, plan
 from fluxvla_libero.inference_runner import LiberoInferenceRunner
 from fluxvla_libero.suites import NUM_STEPS_WAIT, SUITES, max_steps
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.config.load import load_config
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, UsageError
+from fluxvla_core.operators import RunContext
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -68,6 +69,7 @@ def test_an_unknown_suite_is_answered_with_those_there_are():
         ({"num_trials_per_task": 0}, "num_trials_per_task must be 1 to 50, got 0"),
         ({"eval_chunk_size": 0}, "eval_chunk_size must be at least 1, got 0"),
         ({"num_steps_wait": -1}, "num_steps_wait must be at least 0, got -1"),
+        ({"protocol": "openpi"}, "protocol 'openpi' is none of fluxvla, openvla"),
         ({"max_steps": -5}, "max_steps must be at least 1, got -5"),
         ({"workers": 0}, "workers must be at least 1, got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
@@ -207,6 +209,8 @@ def test_the_experts_way_leads_from_above_the_object_into_the_container():
         ({"render": "nice"}, "render 'nice' is none of cheap, coarse, reference"),
         ({"begin": "anywhere"}, "begin 'anywhere' is none of fixed, random"),
         ({"num_steps_wait": -1}, "num_steps_wait must be at least 0, got -1"),
+        ({"protocol": "openpi"}, "protocol 'openpi' is none of fluxvla, openvla"),
+        ({"protocol": "openvla", "begin": "random"}, "it cannot begin at random"),
     ],
 )
 def test_impossible_environments_are_refused(arguments, message):

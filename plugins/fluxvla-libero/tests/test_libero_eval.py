@@ -15,11 +15,10 @@ from fluxvla_libero.expert import Expert, LiberoExpert
 from fluxvla_libero.inference_runner import LiberoInferenceRunner
 from fluxvla_libero.suites import init_states, suite_tasks
 
-from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch, UsageError
-from fluxvla_core.evaluate.demonstrating import demonstrate
-from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.evaluate.collect import demonstrate
+from fluxvla_core.evaluation import RolloutSettings, find_task, run_episode
+from fluxvla_core.operators import Camera, RunContext
 
 SALAD = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
 KETCHUP = "pick_up_the_ketchup_and_place_it_in_the_basket"
@@ -54,7 +53,7 @@ class Replay:
 def act(environment, policy, seed=0, course=None, told=None, watch=None):
     task = find_task(environment.spec.tasks, SALAD)
     told = None if told is None else find_task(environment.spec.tasks, told)
-    return run_episode(environment, policy, task, seed, course or Course(), told, watch)
+    return run_episode(environment, policy, task, seed, course or RolloutSettings(), told, watch)
 
 
 def test_recorded_actions_replayed_give_the_recorded_success(environment, stock):
@@ -68,7 +67,7 @@ def test_recorded_actions_replayed_give_the_recorded_success(environment, stock)
     assert recorded["success"]
     assert recorded["steps"] == len(actions) < 280
     replay = Replay(np.array(actions))
-    replayed = act(environment, replay, course=Course(policy_seed=7))
+    replayed = act(environment, replay, course=RolloutSettings(policy_seed=7))
     assert (replayed["success"], replayed["steps"]) == (True, recorded["steps"])
     assert replayed["state_hash"] == recorded["state_hash"]
     assert (replayed["calls"], replay.seed) == (1, 7)
@@ -83,11 +82,13 @@ def test_recorded_actions_replayed_give_the_recorded_success(environment, stock)
     own.close()
     # The other way round the gripper is never closed on anything.
     flipped = np.array(actions) * [1, 1, 1, 1, 1, 1, -1]
-    assert not act(environment, Replay(flipped), course=Course(max_steps=len(actions)))["success"]
+    assert not act(environment, Replay(flipped), course=RolloutSettings(max_steps=len(actions)))[
+        "success"
+    ]
 
 
 def test_an_episode_ends_at_the_step_limit_and_counts_what_libero_cuts(environment):
-    found = act(environment, Replay(np.full((5, 7), 1.5)), course=Course((), 3, 8))
+    found = act(environment, Replay(np.full((5, 7), 1.5)), course=RolloutSettings((), 3, 8))
     assert not found["success"]
     assert (found["steps"], found["calls"], found["clamped"]) == (8, 3, 8)
 
@@ -199,9 +200,11 @@ def test_everything_is_evaluated_and_written_down(tmp_path, libero, listener):
     assert found["instruction_test"]["only_a"] == 1
     stated = found["settings"]
     assert (stated["render"], stated["num_steps_wait"], stated["begin"]) == ("coarse", 10, "fixed")
+    assert stated["protocol"] == "fluxvla"
     assert (stated["task_suite_name"], stated["policy_seed"]) == ("libero_object", 7)
     assert not any("went another way" in line for line in listener.lines)
-    (video,) = found["videos"]
+    video, beside = found["videos"]
+    assert (video["group"], beside["group"]) == ("policy", "swapped")
     with av.open(str(tmp_path / "eval" / video["path"])) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert frames[0].shape == (256, 512, 3)
@@ -252,11 +255,13 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     folder = tmp_path / "inference" / "001-2"
     on_disk = json.loads((folder / "episode.json").read_text())
     assert on_disk["state_hash"] == summary["state_hash"]
+    assert on_disk["lockstep"] is True, "a report leaves latencies out where time is simulated"
     videos = sorted(path.name for path in folder.glob("*.mp4"))
     assert videos == ["agentview.mp4", "robot0_eye_in_hand.mp4"]
     lines = [json.loads(line) for line in (folder / "trace.jsonl").read_text().splitlines()]
     assert len(lines) == summary["steps"]
     assert len(lines[0]["command"]) == 7
+    assert {line["phase"] for line in lines} == {"run"}
     assert f"success after {summary['steps']} steps" in listener.lines
     shown = pictures[0].read()
     assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
@@ -277,6 +282,9 @@ def test_inference_with_a_chunk_that_is_not_finite_fails_and_says_why(
 def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, listener, save):
     save(tmp_path)
     limited = {"policy": "checkpoint", "max_steps": 2, "eval_chunk_size": 1}
+    with pytest.raises(UsageError, match="unknown task 'wave at me'; nothing was moved"):
+        infer(tmp_path, listener, "wave at me", scene=2, **limited)
+    limited["free_tasks"] = True
     with pytest.raises(UsageError, match=r"no instruction of libero_object: in which scene\?"):
         infer(tmp_path, listener, "wave at me", **limited)
     (summary,) = infer(tmp_path, listener, "wave at me", scene=2, **limited)

@@ -19,14 +19,19 @@ from fluxvla_libero.embodiment import (
     libero_spec,
 )
 
-from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
+from fluxvla_core import build_environment_from_cfg
 from fluxvla_core.errors import FluxError, SpecMismatch
 from fluxvla_core.evaluate import worker
-from fluxvla_core.evaluate.policies import Source, fit, make_policy
-from fluxvla_core.evaluate.rollout import Course
 from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.evaluation import (
+    EnvironmentSpec,
+    RolloutSettings,
+    Source,
+    TaskSpec,
+    fit,
+    make_policy,
+)
+from fluxvla_core.operators import Camera, EmbodimentSpec
 
 
 def policy(spec=None, cameras=("agentview",), rate=20.0):
@@ -119,7 +124,7 @@ def test_a_statistics_key_of_the_checkpoint_is_used(tmp_path, save):
 
 
 def test_an_aloha_policy_is_refused_with_every_difference():
-    from fluxvla_core.spec.embodiment import Joint
+    from fluxvla_core.operators import Joint
 
     arm = tuple(Joint(f"left_{n}", "rad", -1, 1, 1, 1) for n in "abcdef")
     aloha = EmbodimentSpec("aloha", arm, (Camera("agentview", 9, 9),), 50.0)
@@ -188,6 +193,6 @@ def test_it_is_refused_before_a_scene_is_built(
     path = save(tmp_path / "work", **arguments)
     table = {"type": "LiberoEnvironment", "cameras": tuple(CAMERAS)}
     with pytest.raises(SpecMismatch) as caught:
-        EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, Course()))
+        EpisodeWorker(Settings(table, ("pick",), {"policy": source(path)}, RolloutSettings()))
     assert message in str(caught.value)
     assert made[0]._scene is None, "nothing was built, let alone moved"

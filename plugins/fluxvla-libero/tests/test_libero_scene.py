@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from fluxvla_libero.embodiment import NO_OP, axis_angle
+from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.scene import SHOWN_GROUPS, LiberoScene
 from fluxvla_libero.suites import (
     MAX_STEPS,
@@ -15,9 +18,9 @@ from fluxvla_libero.suites import (
     init_states,
     suite_tasks,
 )
+from fluxvla_mujoco import Drawing
 
 from fluxvla_core.errors import ConfigError, RunFailed
-from fluxvla_core.evaluate.drawing import Drawing
 
 
 def shake(scene, seed, steps=12):
@@ -88,6 +91,70 @@ def test_what_cannot_move_stands_where_libero_puts_it(stock):
     env.close()
     scene.close()
     scene.close()
+
+
+def openvla_loop(libero, task, states, episodes, actions):
+    """Where everything stood and ended in the first episodes of a task as OpenVLA evaluates it,
+    by LIBERO's own classes: one environment, seeded once, reset before each episode."""
+    from fluxvla_libero.require import quiet
+
+    with quiet():
+        env = libero.envs.OffScreenRenderEnv(
+            bddl_file_name=str(task.bddl), camera_heights=16, camera_widths=16
+        )
+    for name, observable in env.env._observables.items():  # drawing is what takes the time
+        observable.set_enabled("image" not in name)
+    env.seed(0)
+    kept = []
+    for episode in range(episodes):
+        env.reset()
+        env.set_init_state(states[episode])
+        model, data = env.sim.model, env.sim.data
+        fixtures = model.body_pos.copy(), model.body_quat.copy()
+        for action in (*[NO_OP] * 10, *actions):
+            env.step(action)
+        kept.append((*fixtures, data.qpos.copy(), data.qvel.copy()))
+    env.close()
+    return kept
+
+
+@pytest.mark.parametrize(
+    ("suite", "index", "episodes"),
+    [
+        ("libero_goal", 0, 2),
+        pytest.param("libero_goal", 0, 5, marks=pytest.mark.slow),
+        pytest.param("libero_10", 3, 5, marks=pytest.mark.slow),
+        pytest.param("libero_spatial", 1, 5, marks=pytest.mark.slow),
+    ],
+)
+def test_openvlas_protocol_to_the_last_bit(libero, monkeypatch, suite, index, episodes):
+    """Also when episodes are run in another order, and after others of the other protocol."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES") == "":
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    task, states = suite_tasks(suite)[index], init_states(suite, index)
+    actions = np.random.default_rng(1).uniform(-1, 1, (4, 7))
+    theirs = openvla_loop(libero, task, states, episodes, actions)
+    ours = LiberoEnvironment(suite, tasks=[index], protocol="openvla")
+    usual = LiberoEnvironment(suite, tasks=[index])
+    assert ours.spec.details["protocol"] == "openvla"
+    assert usual.spec.details["protocol"] == "fluxvla"
+    for episode in reversed(range(episodes)):
+        ours.reset(episode, task.name)
+        for action in actions:
+            ours.step(action)
+        model, data = ours.scene.model, ours.scene.data
+        for found, expected in zip(
+            (model.body_pos, model.body_quat, data.qpos, data.qvel), theirs[episode], strict=True
+        ):
+            np.testing.assert_array_equal(found, expected)
+        if episode == episodes - 1:
+            last = model.body_pos.copy()
+    ours.close()
+    usual.reset(episodes - 1, task.name)
+    assert np.abs(usual.scene.model.body_pos - last).max() > 1e-3, "the protocols differ"
+    usual.reset(0, task.name)
+    np.testing.assert_array_equal(usual.scene.model.body_pos, theirs[0][0])
+    usual.close()
 
 
 def test_a_reset_leaves_nothing_of_the_episode_before(scene):

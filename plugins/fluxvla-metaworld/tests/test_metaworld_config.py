@@ -11,9 +11,9 @@ from fluxvla_metaworld.environment import MetaWorldEnvironment
 from fluxvla_metaworld.expert import MetaWorldExpert
 from fluxvla_metaworld.tasks import INSTRUCTIONS, MT10, choose_tasks
 
-from fluxvla_core.build import build_environment_from_cfg, build_policy_from_cfg
+from fluxvla_core import build_environment_from_cfg, build_policy_from_cfg
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.operators import EmbodimentSpec
 
 
 def test_the_spec_is_known_before_a_scene_is_built():

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from fluxvla_metaworld.tasks import MT10
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
+from fluxvla_core.operators import RunContext
 
 OWN_RATE = 0.80
 

@@ -10,7 +10,7 @@ from fluxvla_metaworld.expert import MetaWorldExpert
 from fluxvla_metaworld.tasks import INSTRUCTIONS, MT10
 
 from fluxvla_core.errors import ConfigError, RunFailed
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import Camera
 
 MOVING = ("push-v3", "door-open-v3")  # a free puck; a body that stands elsewhere in each episode
 

@@ -9,7 +9,7 @@ from fluxvla_models.conv_encoder import ConvEncoder, SpatialSoftmax
 from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
-from fluxvla_core.processors.resources import resolve_model_path
+from fluxvla_core.data import resolve_model_path
 
 SMALL = {
     "vision_backbone": {"type": "ConvEncoder", "image_size": (32, 48), "channels": (8, 8, 16)},
@@ -131,7 +131,9 @@ def test_an_instructions_vector_is_the_same_bit_for_bit_in_any_batch(sentences):
 def test_the_sentence_encoder_equals_pooling_done_by_hand(sentences):
     from transformers import AutoModel
 
-    reference = AutoModel.from_pretrained(str(resolve_model_path(MINILM)), local_files_only=True)
+    reference = AutoModel.from_pretrained(
+        str(resolve_model_path(MINILM)), local_files_only=True, trust_remote_code=False
+    )
     batch = make_batch(size=2)
     ids, mask = batch["lang_tokens"][1:2], batch["lang_masks"][1:2]
     states = reference(input_ids=ids[:, :4], attention_mask=mask[:, :4].long()).last_hidden_state

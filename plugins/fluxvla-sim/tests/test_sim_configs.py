@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.build import build_operator_from_cfg, build_runner_from_cfg
+from fluxvla_core import build_operator_from_cfg, build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
 from fluxvla_core.spec.embodiment import differences

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from fluxvla_sim.environment import AlohaSimEnvironment
 
+from fluxvla_core.evaluate.divergence import check_step
+from fluxvla_core.evaluation import Diverged
 from fluxvla_core.testing import EnvironmentConformance
 
 pytest.importorskip("mujoco")
@@ -16,3 +20,16 @@ class TestAlohaSimEnvironment(EnvironmentConformance):
 
 class TestURSimEnvironment(EnvironmentConformance):
     entry_point = "URSimEnvironment"
+
+
+def test_controls_that_are_not_finite_are_noticed(tmp_path, monkeypatch):
+    """MuJoCo drops all controls then; state and reward look as if the arms had been let go."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
+    environment = AlohaSimEnvironment()
+    environment.reset(1, "lift_hold")
+    environment.step(np.full(14, np.nan))
+    with pytest.raises(Diverged, match="MuJoCo warned of BADCTRL"):
+        check_step(environment, 1)
+    environment.reset(1, "lift_hold")
+    check_step(environment, 0)
+    environment.close()

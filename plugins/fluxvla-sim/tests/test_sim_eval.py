@@ -13,12 +13,11 @@ from fluxvla_sim.eval_runner import AlohaSimEvalRunner, URSimEvalRunner
 from fluxvla_sim.expert import SimExpert
 from fluxvla_sim.operators import AlohaSimOperator
 
-from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.contracts.check import check_class
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
-from fluxvla_core.infer.base_runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.evaluation import RolloutSettings, find_task, run_episode
+from fluxvla_core.operators import BaseInferenceRunner, Camera, RunContext
 
 LIFT = "pick up the cube with the right arm and hold it"
 
@@ -33,7 +32,7 @@ def aloha():
 def episode(environment, actor, task, seed, told=None, **course):
     tasks = environment.spec.tasks
     other = None if told is None else find_task(tasks, told)
-    course = Course(**{"replan_every": 5, **course})
+    course = RolloutSettings(**{"replan_every": 5, **course})
     return run_episode(environment, actor, find_task(tasks, task), seed, course, other)
 
 
@@ -110,6 +109,7 @@ def test_an_inference_run_sends_the_commands_that_were_evaluated(tmp_path):
         context=RunContext(
             work_dir=tmp_path, section="inference", task="hand the cube over to the left arm"
         ),
+        free_tasks=True,
         policy=expert,
         operator=operator,
         execute_horizon=5,
@@ -223,8 +223,10 @@ def test_the_runner_evaluates_both_tasks_with_either_instruction(tmp_path):
     assert results["behaviours"]["swapped"][LIFT] == expected
     lines = (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()[1:]
     seeds = {(r["group"], r["seed"]) for r in map(json.loads, lines)}
-    # Scenes of both tasks are alike: the same seeds would repeat what is known.
-    assert seeds == {("policy", 500), ("swapped", 501)}
+    assert seeds == {("policy", 500), ("swapped", 500)}
+    tested = results["instruction_test"]
+    assert (tested["pairs"], tested["only_a"], tested["only_b"]) == (2, 2, 0), "paired by seed"
+    assert tested["verdict"] == "nothing shown: 2 pairs cannot show any difference"
 
 
 def test_the_runner_of_the_ur5e(tmp_path):

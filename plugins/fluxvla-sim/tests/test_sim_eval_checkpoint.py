@@ -8,10 +8,9 @@ import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.eval_runner import AlohaSimEvalRunner
 
-from fluxvla_core.build import RunContext
 from fluxvla_core.errors import SpecMismatch
+from fluxvla_core.operators import Camera, RunContext
 from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.spec.embodiment import Camera
 
 safetensors = pytest.importorskip("safetensors.torch")
 torch = pytest.importorskip("torch")

@@ -18,7 +18,7 @@ from fluxvla_sim.operators import AlohaSimOperator, URSimOperator
 from fluxvla_sim.ros2.operators import AlohaSimROSOperator
 from fluxvla_sim.ur.expert import URExpert
 
-from fluxvla_core.errors import ConfigError, NotReady, Rejected
+from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
 from fluxvla_core.spec.embodiment import check_match
 from fluxvla_core.testing import OperatorConformance
 
@@ -48,6 +48,18 @@ def aloha():
     operator.connect()
     yield operator
     operator.close()
+
+
+def test_a_simulation_that_diverges_is_a_fault_of_the_robot(aloha, tmp_path, monkeypatch):
+    """MuJoCo resets itself: the arms would be at home in the next frame, as if nothing were."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
+    aloha.scene.data.qvel[:] = 1e12
+    with pytest.raises(Faulted, match="the simulation diverged: MuJoCo warned of BADQVEL"):
+        aloha.send_action(HOME)
+    with pytest.raises(Faulted, match="the simulation diverged"):
+        aloha.send_action(HOME)
+    aloha.begin_episode("", 1)
+    aloha.send_action(HOME)
 
 
 @pytest.mark.parametrize("kind", [AlohaSimOperator, AlohaSimROSOperator])
@@ -257,3 +269,14 @@ def test_pictures_can_be_taken_from_any_thread(aloha):
     thread.join()
     np.testing.assert_array_equal(seen[0], first)
     np.testing.assert_array_equal(aloha.get_frame().images["top"], first)
+
+
+def test_an_episode_of_other_words_is_judged_by_nobody():
+    operator = AlohaSimOperator(height=48, width=64)
+    operator.connect()
+    operator.begin_episode("wave the left arm", 0)
+    assert operator.task_success() is None
+    assert not operator.task_done()
+    operator.begin_episode(operator.world.tasks[0].instruction, 1)
+    assert operator.task_success() is False
+    operator.close()

@@ -22,9 +22,7 @@ from fluxvla_ur.operator import UROperator
 
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.ros2 import Connection, Stale, message_class
 from fluxvla_core.testing.ros2 import ros_domain
 
 __all__ = ["ros_domain"]

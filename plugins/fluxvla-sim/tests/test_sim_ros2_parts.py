@@ -21,10 +21,9 @@ from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
 from fluxvla_sim.ros2.streams import stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
-from fluxvla_core.control.clock import in_lockstep
 from fluxvla_core.errors import ConfigError, NotReady, UsageError
-from fluxvla_core.ros2.faults import Fault
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.robot.clock import in_lockstep
+from fluxvla_core.ros2 import BadMessage, Fault
 from fluxvla_core.testing.ros2 import ros_domain
 
 __all__ = ["ros_domain"]

@@ -8,7 +8,7 @@ import pytest
 from fluxvla_ur.embodiment import GRIPPERS, JOINTS, SPEEDS, ur_spec
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.operators import Camera, EmbodimentSpec
 
 
 def test_the_drivers_joint_order_then_the_gripper():

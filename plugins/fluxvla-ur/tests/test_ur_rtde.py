@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -13,10 +14,9 @@ from fluxvla_ur.rtde import URRTDEOperator
 from fluxvla_ur.runner import URInferenceRunner
 from fluxvla_ur.video import VideoCamera
 
-from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, Faulted, LoadFailed, NotReady
-from fluxvla_core.ros2.trouble import BadMessage, Stale
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import Camera, RunContext
+from fluxvla_core.ros2 import BadMessage, Stale
 from fluxvla_core.testing import OperatorConformance
 
 from .fake_ur import HOME, FakeUR
@@ -226,6 +226,37 @@ class TestFaults:
 
         with pytest.raises(Stale, match=r"controller is silent for \d\.\d\d s; 0.5 s is allowed"):
             operator.get_state()
+
+    def test_a_controller_that_hangs_does_not_keep_the_program(self, robot, connect, caplog):
+        operator = connect(robot, max_age_s=0.5)
+        operator.send_action(POSE)
+        wait_for(lambda: robot.ask()["servo"])
+        robot.tell(frozen=True)
+        wait_for(operator._silent)
+
+        def end():
+            operator.stop()
+            operator.stop()
+            operator.close()
+
+        ending = threading.Thread(target=end, daemon=True)
+        ending.start()
+        # Without a bound the client waits for ever.
+        ending.join(20.0)
+        assert not ending.is_alive()
+        assert [r.message for r in caplog.records if "does not answer" in r.message] == [
+            f"{robot.ip}: the controller does not answer; its watchdog stops the arm"
+        ]
+        wait_for(lambda: robot.ask()["stops"])
+
+    def test_an_arm_that_nobody_sees_is_left_to_the_controllers_watchdog(self, connect):
+        with FakeUR(slack_s=0.0) as robot:
+            operator = connect(robot, max_age_s=0.5)
+            operator.send_action(POSE)
+            time.sleep(1.5 / PATIENT["watchdog_hz"])
+            assert robot.ask()["running"]
+            robot.tell(frozen=True)
+            wait_for(lambda: robot.ask()["ended"] == "watchdog")
 
     def test_a_controller_that_is_gone(self, robot, connect):
         operator = connect(robot)

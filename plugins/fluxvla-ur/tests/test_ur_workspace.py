@@ -7,7 +7,7 @@ import pytest
 from fluxvla_ur.embodiment import ur_spec
 from fluxvla_ur.workspace import LENGTHS, URWorkspaceBox
 
-from fluxvla_core.build import build_action_filter_from_cfg
+from fluxvla_core import build_action_filter_from_cfg
 from fluxvla_core.errors import ConfigError
 
 HOME = np.array([-np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0, 1.0])
@@ -48,7 +48,7 @@ def test_a_model_that_is_not_there_is_refused():
 
 
 def test_an_arm_of_another_make_is_refused():
-    from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+    from fluxvla_core.operators import EmbodimentSpec, Joint
 
     box = URWorkspaceBox(*BOX.values(), TOOL)
     other = EmbodimentSpec("other", (Joint("elbow", "rad", -1, 1, 1, 1),), (), 50.0)

@@ -19,16 +19,19 @@ and a robot that reads an embodiment use the same door as the trainer.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from annotated_types import Ge
+
+from fluxvla_core.bounds import Count, Positive
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file, read_manifest
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.untrusted import parse_json, read_bytes
 
 if TYPE_CHECKING:
     import torch
@@ -65,6 +68,18 @@ def step_of(path: Path) -> int | None:
     """The step in a checkpoint folder's name; None for any other name."""
     match = _STEP.fullmatch(path.name)
     return int(match[1]) if match else None
+
+
+@dataclass(frozen=True)
+class _ResolvedConfig:
+    config: dict[str, Any]
+    origins: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Policy:
+    action_rate_hz: Positive | None = None
+    horizon: Annotated[Count, Ge(1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -144,35 +159,37 @@ class Checkpoint:
         """Whether the checkpoint has the file ``name``."""
         return name in self.manifest.files
 
-    def json(self, name: str) -> dict[str, Any]:
+    def json(self, name: str, kind: type = dict) -> dict[str, Any]:
         """The JSON object in file ``name``.
 
+        Args:
+            kind: what it is checked to be; what the kind does not name is left as it is.
+
         Raises:
-            CheckpointError: the file is not there or holds something else.
+            CheckpointError: the file is not there, or holds something else.
         """
         if not self.has(name):
             raise CheckpointError(f"the checkpoint has no {name}", where=str(self.path))
         try:
-            value = json.loads((self.path / name).read_text())
-        except (OSError, ValueError) as error:
-            where = str(self.path)
-            raise CheckpointError(f"{name} cannot be read: {error}", where=where) from error
-        if not isinstance(value, dict):
-            raise CheckpointError(f"{name} holds no JSON object", where=str(self.path))
+            content = read_bytes(self.path / name, CheckpointError)
+            value = parse_json(content, dict[str, Any], CheckpointError, name)
+            parse_json(content, kind, CheckpointError, name)
+        except CheckpointError as error:
+            raise CheckpointError(f"{name}: {error.what}", where=str(self.path)) from error
         return value
 
     def config(self) -> dict[str, Any]:
         """The resolved config tree of the run that saved it: data, never executed."""
-        tree: dict[str, Any] = self.json(CONFIG)["config"]
+        tree: dict[str, Any] = self.json(CONFIG, _ResolvedConfig)["config"]
         return tree
 
     def statistics(self) -> dict[str, Any]:
         """Dataset statistics: ``{"private": {"proprio": {...}, "action": {...}}}``."""
-        return self.json(STATISTICS)
+        return self.json(STATISTICS, dict[str, dict[str, Any]])
 
     def policy(self) -> dict[str, Any]:
         """``action_rate_hz`` (Hz) and ``horizon`` (actions per chunk), null where unknown."""
-        return self.json(POLICY)
+        return self.json(POLICY, _Policy)
 
     def embodiment(self) -> EmbodimentSpec | None:
         """The robot that it was trained for; None when the dataset named none."""

@@ -8,23 +8,28 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.bounds import Count
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.untrusted import parse_json, read_bytes
 
 NAME = "manifest.json"
 FORMAT = "fluxvla-checkpoint-1"
 _BLOCK = 1 << 20
+_LARGEST = 16 << 20  # bytes: 100,000 files, of which 1,000 ranks write fewer than 3,000
+_CHANGED = "it was changed, or the disk lost a part of it, after it was saved"
 
 
 @dataclass(frozen=True)
 class FileEntry:
     """One file: bytes and SHA-256 in hexadecimal."""
 
-    size: int
+    size: Count
     sha256: str
 
 
@@ -51,38 +56,71 @@ class Manifest:
         return (json.dumps(body, indent=1) + "\n").encode()
 
 
+@dataclass(frozen=True)
+class _Body:
+    format: str
+    sha256: str
+    step: Count
+    epoch: Count
+    files: dict[str, FileEntry]
+
+
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of the checkpoint in ``folder``.
 
     Raises:
-        CheckpointError: it is missing, damaged, or of another format version.
+        CheckpointError: it is missing, damaged, of another format version, or names a file outside
+            the folder.
     """
     path = folder / NAME
+    if not os.path.lexists(path):
+        raise CheckpointError(f"{NAME} is missing, so this is no checkpoint", where=str(folder))
     try:
-        body = json.loads(path.read_bytes())
-        stated = body.pop("sha256")
-        if body.get("format") != FORMAT:
-            raise CheckpointError(
-                f"the checkpoint has format {body.get('format')!r}; this version reads {FORMAT!r}",
-                where=str(path),
-                cause="it was written by another version of FluxVLA",
-            )
-        if stated != _digest(body):
-            raise ValueError("its own SHA-256 does not fit")
-        files = {name: FileEntry(int(e["size"]), e["sha256"]) for name, e in body["files"].items()}
-        return Manifest(int(body["step"]), int(body["epoch"]), files)
-    except FileNotFoundError:
+        content = read_bytes(path, CheckpointError, at_most=_LARGEST)
+    except CheckpointError as error:
+        raise CheckpointError(f"{NAME} {error.what}", where=str(folder)) from error
+    try:
+        raw = parse_json(content, dict[str, Any], CheckpointError, str(path))
+    except CheckpointError as error:
+        raise _damaged(folder, error.what) from error
+    written = raw.get("format")
+    if isinstance(written, str) and written != FORMAT:
         raise CheckpointError(
-            f"{NAME} is missing, so this is no checkpoint", where=str(folder)
-        ) from None
-    except OSError as error:
-        raise CheckpointError(f"{NAME} cannot be read: {error}", where=str(folder)) from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+            f"the checkpoint has format {written[:80]!r}; this version reads {FORMAT!r}",
+            where=str(path),
+            cause="it was written by another version of FluxVLA",
+        )
+    try:
+        body = parse_json(content, _Body, CheckpointError, str(path))
+    except CheckpointError as error:
+        raise _damaged(folder, error.what) from error
+    if raw.pop("sha256") != _digest(raw):
+        raise _damaged(folder, "its own SHA-256 does not fit")
+    _check_inside(folder, body.files)
+    return Manifest(body.step, body.epoch, body.files)
+
+
+def _damaged(folder: Path, how: str) -> CheckpointError:
+    return CheckpointError(f"{NAME} is damaged: {how}", where=str(folder), cause=_CHANGED)
+
+
+def _check_inside(folder: Path, names: Iterable[str]) -> None:
+    """Refuse files that do not lie in ``folder``: a checkpoint would read, or copy, any other."""
+    root = os.path.realpath(folder)
+    for name in names:
+        parts = name.split("/")
+        if {"", ".", ".."} & set(parts) or "\0" in name or "\\" in name:
+            why = "is no path inside the checkpoint's folder"
+        elif os.path.commonpath([root, os.path.realpath(os.path.join(root, *parts))]) != root:
+            why = "leads out of the checkpoint's folder by a symbolic link"
+        else:
+            continue
         raise CheckpointError(
-            f"{NAME} is damaged: {error}",
+            f"{NAME} lists {name[:200]!r}, which {why}",
             where=str(folder),
-            cause="it was changed, or the disk lost a part of it, after it was saved",
-        ) from error
+            cause="the checkpoint was put together by hand, or is meant to do harm",
+            next="copy it with its links replaced by the files (cp -rL, rsync -L)",
+        )
 
 
 def hash_file(path: Path) -> str:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import IO
 from weakref import WeakValueDictionary
 
-from fluxvla_core.errors import UsageError
+from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.errors import RunFailed, UsageError
 
 LOCK = "run.lock"
 PATIENCE_S = 5.0
@@ -29,19 +30,65 @@ class Claim:
     """A work dir that is this process's until it is closed; ``claim`` makes it.
 
     Args:
+        work_dir: absolute, with symbolic links as they are: one may be made to lead elsewhere.
         file: the lock; None where there is none to give back.
         outer: the claim that this process has already; it lives as long as this one.
     """
 
-    def __init__(self, file: IO[str] | None, outer: Claim | None = None) -> None:
-        self._file, self._outer = file, outer
+    def __init__(self, work_dir: Path, file: IO[str] | None, outer: Claim | None = None) -> None:
+        self.work_dir, self._file, self._outer, self.active = work_dir, file, outer, False
+        self._place = os.open(work_dir, os.O_RDONLY)
         self.active = True
+
+    def __del__(self) -> None:
+        self.close()
 
     def close(self) -> None:
         """Let others have it; any number of times."""
+        if self.active:
+            os.close(self._place)
         file, self._file, self._outer, self.active = self._file, None, None, False
         if file is not None:
             file.close()
+
+    def check(self) -> None:
+        """See that the work dir is still the one that was claimed, before anything is written.
+
+        A training that went on would fill a place that somebody cleared, or another one's.
+
+        Raises:
+            RunFailed: it was removed, moved or replaced; says where what was saved is.
+        """
+        if self._outer is not None:
+            self._outer.check()
+            return
+        same = _is_at(self._place, self.work_dir)
+        if not same:
+            raise self._lost(_path_of(self._place))
+        if self._file is not None and not _is_at(self._file.fileno(), self.work_dir / LOCK):
+            cause = f"{LOCK} in it was removed or replaced: another training may have begun there"
+            raise self._lost(self.work_dir, cause)
+
+    def _lost(self, now: Path | None, cause: str | None = None) -> RunFailed:
+        if cause is None:
+            cause = "it was removed" if now is None else f"it is at {now} now"
+            if self.work_dir.exists():
+                cause += "; what is there now is not this training's, and was left as it is"
+        saved = folders(now) if now is not None else []
+        advice = "start it again with a --work-dir that stays"
+        if now is None:
+            cause += "; what was saved there is gone with it"
+        elif saved:
+            cause += f"; the newest checkpoint is {saved[-1]}"
+            advice = f"go on with --work-dir {now} --resume auto, when no other training is there"
+        else:
+            cause += "; nothing was saved there yet"
+        return RunFailed(
+            f"the work dir {self.work_dir} was taken away from this training, which has stopped",
+            cause=cause,
+            next=advice,
+            reason="work dir lost",
+        )
 
     @property
     def held(self) -> bool:
@@ -62,10 +109,11 @@ def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
     Raises:
         UsageError: another process has it; says which.
     """
-    path = work_dir.resolve() / LOCK
+    # realpath, because resolve() fails on links that lead to themselves.
+    place, path = work_dir.absolute(), Path(os.path.realpath(work_dir)) / LOCK
     before = _held.get((os.getpid(), path))
     if before is not None and before.active:
-        return Claim(None, before)
+        return Claim(place, None, before)
     try:
         file = _locked(path)
     except OSError as error:
@@ -74,8 +122,28 @@ def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
             f"{path} cannot be locked ({error.strerror or error}): nothing keeps a second training "
             "out of this work dir"
         )
-    found = _held[os.getpid(), path] = Claim(file)
+    found = _held[os.getpid(), path] = Claim(place, file)
     return found
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether ``path`` still names what is open as ``descriptor``.
+
+    Only what says that it does not counts: a server that does not answer may do so again.
+    """
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except OSError as error:
+        return error.errno not in (errno.ENOENT, errno.ENOTDIR, errno.ESTALE)
+
+
+def _path_of(descriptor: int) -> Path | None:
+    """Where an open folder is now, if the system tells (Linux); None if it was removed."""
+    try:
+        found = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+    except OSError:
+        return None
+    return found if _is_at(descriptor, found) else None
 
 
 def _locked(path: Path) -> IO[str]:

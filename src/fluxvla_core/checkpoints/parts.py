@@ -10,17 +10,28 @@ memory as a whole, and neither can be summed, flushed and failed one operation a
 from __future__ import annotations
 
 import json
+import os
+import struct
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
 
-from fluxvla_core.checkpoints.dtensor import is_dtensor, splits
+from fluxvla_core.bounds import Count
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.untrusted import parse_json
+
+if TYPE_CHECKING:
+    from torch.distributed.tensor import DTensor
+
+
+T = TypeVar("T")
 
 PLACES = "DCP_SHARDING_INFO"
 """Header entry: JSON of ``{name: {"saved_offsets": [...]}}``."""
@@ -159,6 +170,11 @@ class Stored:
         return out
 
 
+@dataclass(frozen=True)
+class _Place:
+    saved_offsets: tuple[Count, ...]
+
+
 class StoredTensors(Mapping[str, Stored]):
     """The tensors of one or several safetensors files, by name; parts of one belong together.
 
@@ -167,25 +183,26 @@ class StoredTensors(Mapping[str, Stored]):
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        from safetensors import SafetensorError, safe_open
-
         self._tensors: dict[str, Stored] = {}
         for path in paths:
-            try:
-                file = safe_open(path, framework="pt")
-                self._enter(file, file.metadata() or {})  # type: ignore[no-untyped-call]
-            except (OSError, KeyError, ValueError, SafetensorError) as error:
-                raise CheckpointError(
-                    f"{path.name} cannot be read: {error}", where=str(path)
-                ) from error
+            with reading(path):
+                file = open_tensors(path)
+                self._enter(path, file, file.metadata() or {})
 
-    def _enter(self, file: Any, header: Mapping[str, str]) -> None:
-        places = json.loads(header.get(PLACES, "{}"))
-        shapes = json.loads(header.get(SHAPES, "{}"))
+    def _enter(self, path: Path, file: Any, header: Mapping[str, str]) -> None:
+        def table(name: str, kind: type[T]) -> T:
+            return parse_json(header.get(name, "{}"), kind, CheckpointError, f"{path}: {name}")
+
+        places = table(PLACES, dict[str, _Place])
+        shapes = table(SHAPES, dict[str, tuple[Count, ...]])
         for name in file.keys():  # noqa: SIM118 - it is no mapping
             sizes = tuple(file.get_slice(name).get_shape())
-            offsets = tuple(places[name]["saved_offsets"]) if places else (0,) * len(sizes)
+            if places and name not in places:
+                raise CheckpointError(f"{path.name} does not say where {name} belongs")
+            offsets = places[name].saved_offsets if places else (0,) * len(sizes)
             shape = shapes.get(name, sizes)
+            if not len(offsets) == len(sizes) == len(shape):
+                raise CheckpointError(f"{path.name} contradicts itself about {name}")
             self._tensors.setdefault(name, Stored(name, shape)).add(file, Region(offsets, sizes))
 
     def __getitem__(self, name: str) -> Stored:
@@ -196,3 +213,65 @@ class StoredTensors(Mapping[str, Stored]):
 
     def __len__(self) -> int:
         return len(self._tensors)
+
+
+# A model of 7 billion parameters has 300 to 3,000 tensors of some 150 bytes of header each, its
+# optimizer's state twice as many; a mixture of 10,000 experts still fits.
+_LARGEST_HEADER = 16 << 20
+_MOST_TENSORS = 100_000
+
+
+def open_tensors(path: Path) -> Any:
+    """The file as safetensors opens it.
+
+    Raises:
+        ValueError, OSError, SafetensorError: as :func:`reading` expects them.
+    """
+    from safetensors import safe_open
+
+    _check_header(path)
+    return safe_open(path, framework="pt")
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Let whatever goes wrong with the file in the block be a CheckpointError."""
+    from safetensors import SafetensorError
+
+    try:
+        yield
+    except (OSError, KeyError, ValueError, TypeError, SafetensorError) as error:
+        raise CheckpointError(f"{path.name} cannot be read: {error}", where=str(path)) from error
+
+
+def _check_header(path: Path) -> None:
+    """Refuse a header that would take minutes, before it is parsed."""
+    if not os.path.isfile(path):
+        raise ValueError("it is missing, or no regular file")
+    with path.open("rb") as file:
+        (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
+        if length > _LARGEST_HEADER:
+            raise ValueError(
+                f"its header of {length} bytes is larger than {_LARGEST_HEADER >> 20} MiB"
+            )
+        count = file.read(length).count(b'"data_offsets"')
+    if count > _MOST_TENSORS:
+        raise ValueError(f"it lists {count} tensors, {_MOST_TENSORS} are the most that are read")
+
+
+def is_dtensor(tensor: object) -> TypeGuard[DTensor]:
+    """Whether ``tensor`` is a DTensor; where nobody has imported their module there are none."""
+    return isinstance(tensor, getattr(sys.modules.get("torch.distributed.tensor"), "DTensor", ()))
+
+
+def splits(tensor: DTensor) -> dict[int, int]:
+    """Dimension of the mesh -> dimension of ``tensor`` that is cut along it."""
+    from torch.distributed.tensor import Shard
+
+    return {d: p.dim for d, p in enumerate(tensor.placements) if isinstance(p, Shard)}
+
+
+def local(tensor: Tensor) -> Tensor:
+    """This rank's part of ``tensor``, without its gradient: all of it if it is not a DTensor."""
+    tensor = tensor.detach()
+    return tensor.to_local() if is_dtensor(tensor) else tensor

@@ -18,10 +18,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fluxvla_core.checkpoints.dtensor import is_dtensor, local
-from fluxvla_core.checkpoints.parts import Region, Stored, describe_parts, is_split
+from fluxvla_core.checkpoints.parts import (
+    Region,
+    Stored,
+    describe_parts,
+    is_dtensor,
+    is_split,
+    local,
+    open_tensors,
+    reading,
+)
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.untrusted import parse_json
 
 _DTYPES: Mapping[torch.dtype, str] = {
     torch.float64: "F64",
@@ -172,14 +181,14 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     Raises:
         CheckpointError: the file cannot be read as that format.
     """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            aliases = json.loads((file.metadata() or {}).get(_ALIASES, "{}"))
-    except (OSError, ValueError, SafetensorError) as error:
-        raise CheckpointError(f"{path.name} cannot be read: {error}", where=str(path)) from error
+    with reading(path), open_tensors(path) as file:
+        header = file.metadata() or {}
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    place = f"{path}: {_ALIASES}"
+    aliases = parse_json(header.get(_ALIASES, "{}"), dict[str, str], CheckpointError, place)
+    lacking = sorted(set(aliases.values()) - set(tensors))
+    if lacking:
+        raise CheckpointError(f"{path.name} has no {lacking[0]!r}, which it names", where=str(path))
     return tensors | {key: tensors[first] for key, first in aliases.items()}
 
 

@@ -11,21 +11,25 @@ import contextlib
 import errno
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
+from fluxvla_core.atomic import FULL
 from fluxvla_core.checkpoints.checkpoint import FOLDER, step_name
-from fluxvla_core.checkpoints.disk import Disk, aside, files_below
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file
-from fluxvla_core.checkpoints.shelf import PARTIAL
 from fluxvla_core.errors import RunFailed
 
-_FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+_RESUME = "run the same command with --resume auto; the checkpoints before it are as they were"
 T = TypeVar("T")
+
+PARTIAL = ".partial"
+"""End of the name of a folder that is being written."""
 
 
 class CheckpointWriter:
@@ -42,6 +46,8 @@ class CheckpointWriter:
         rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
             by :meth:`report` and :meth:`join`.
         final: another folder than that of the step.
+        what, go_on: what is written, and how to go on where it cannot be, for the message; by
+            default a training's checkpoint.
     """
 
     def __init__(
@@ -52,7 +58,11 @@ class CheckpointWriter:
         disk: Disk | None = None,
         rank: int = 0,
         final: Path | None = None,
+        what: str | None = None,
+        go_on: str = _RESUME,
     ) -> None:
+        self._what = what or f"the checkpoint of step {step}"
+        self._go_on = go_on
         self.disk = disk or Disk()
         self.step, self.epoch, self.rank = step, epoch, rank
         self.final = final or work_dir / FOLDER / step_name(step)
@@ -78,8 +88,9 @@ class CheckpointWriter:
         if self.rank == 0:
             if self.folder.exists():
                 self.attempt(self.disk.remove_folder, self.folder)
-            for folder in (self.folder, *(self.folder / name for name in folders)):
-                self.attempt(self.disk.make_folder, folder)
+            self.attempt(self.disk.make_folder, self.folder, True)
+            for name in folders:
+                self.attempt(self.disk.make_folder, self.folder / name)
 
     def attempt(self, operation: Callable[..., T], *arguments: Any) -> T | None:
         """``operation(*arguments)``, or None if it or anything before it failed."""
@@ -170,15 +181,25 @@ class CheckpointWriter:
         self.attempt(self._put_in_place)
         if self._error is not None:
             self.discard()
-            raise _failure(self._error, self.step, self.final) from self._error
+            raise self._failure(self._error) from self._error
         return self.final
+
+    def _failure(self, error: OSError) -> RunFailed:
+        full = error.errno in FULL
+        what = f"{self._what} could not be saved"
+        return RunFailed(
+            f"the disk is full: {what}" if full else f"{what}: {error}",
+            where=str(self.final),
+            cause=f"{error.strerror}, or a quota or a limit on file sizes" if full else None,
+            next=f"{'make room' if full else 'mend the disk or the folder'}, then {self._go_on}",
+        )
 
     def _put_in_place(self) -> None:
         for folder in sorted({(self.folder / name).parent for name in self.files}):
             self.disk.sync_folder(folder)
         self.disk.sync_folder(self.folder)
         if self.final.exists():
-            self.disk.rename(self.final, aside(self.final))
+            self.disk.rename(self.final, free_name(self.final))
         self.disk.rename(self.folder, self.final)
         self.disk.sync_folder(self.final.parent)
 
@@ -201,8 +222,11 @@ class HashedFile:
 
     def _create(self, path: Path) -> BinaryIO:
         # Other ranks' folders are there, or are those of a disk that the first rank does not see.
-        if self._writer.rank == 0 and not path.parent.exists():
-            self._writer.disk.make_folder(path.parent)
+        if self._writer.rank == 0:
+            inside = path.relative_to(self._writer.folder).parents
+            for folder in (self._writer.folder / name for name in reversed(inside[:-1])):
+                if not folder.exists():
+                    self._writer.disk.make_folder(folder)
         return self._writer.disk.create(path)
 
     def write(self, data: bytes | memoryview) -> None:
@@ -245,17 +269,51 @@ def json_bytes(name: str, value: Mapping[str, Any]) -> bytes:
         ) from error
 
 
-def _failure(error: OSError, step: int, path: Path) -> RunFailed:
-    full = error.errno in _FULL
-    if full:
-        what = f"the disk is full: the checkpoint of step {step} could not be saved"
-        mend = "make room, then run the same command with --resume auto"
-    else:
-        what = f"the checkpoint of step {step} could not be saved: {error}"
-        mend = "mend the disk or the folder, then run the same command with --resume auto"
-    return RunFailed(
-        what,
-        where=str(path),
-        cause=f"{error.strerror}, or a quota or a limit on file sizes" if full else None,
-        next=f"{mend}; the checkpoints before it are as they were",
-    )
+class Disk:
+    """Plain POSIX file operations; every one raises OSError as the system does."""
+
+    def make_folder(self, path: Path, parents: bool = False) -> None:
+        """By default in one that exists: what was removed meanwhile is not made again."""
+        path.mkdir(parents=parents)
+
+    def create(self, path: Path) -> BinaryIO:
+        return path.open("xb")
+
+    def write(self, file: BinaryIO, data: bytes | memoryview) -> None:
+        file.write(data)
+
+    def finish(self, file: BinaryIO) -> None:
+        """Flush to the device and close: after a crash the file is whole or not there."""
+        try:
+            file.flush()
+            os.fsync(file.fileno())
+        finally:
+            file.close()
+
+    def sync_folder(self, path: Path) -> None:
+        """Make the names in ``path`` durable; a rename is only then certain to survive a crash."""
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, source: Path, target: Path) -> None:
+        os.rename(source, target)
+
+    def remove_folder(self, path: Path) -> None:
+        shutil.rmtree(path)
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Every regular file below ``folder``, in a fixed order."""
+    yield from sorted(p for p in folder.rglob("*") if p.is_file())
+
+
+def free_name(path: Path) -> Path:
+    """A free name beside ``path`` that no reader takes for a checkpoint."""
+    number, free = 1, path.with_name(path.name + ".set-aside")
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}.set-aside-{number}")
+    return free

@@ -9,8 +9,11 @@ from typing import Any
 
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
 from fluxvla_core.cli.plan import choose_section
-from fluxvla_core.config import Config, apply_overrides, examine, keys, load_config
-from fluxvla_core.config.check import Use
+from fluxvla_core.cli.terminal import say
+from fluxvla_core.config.check import Use, examine
+from fluxvla_core.config.load import load_config
+from fluxvla_core.config.overrides import apply_overrides
+from fluxvla_core.config.tree import Config, join_key, leaves
 from fluxvla_core.plugins.files import load_plugin_files
 
 
@@ -29,7 +32,7 @@ class Show:
     def run(self, args: argparse.Namespace) -> int:
         config = apply_overrides(load_config(args.file), args.overrides)
         for line in listing(config, origin=args.origin):
-            print(line)
+            say(line)
         return 0
 
 
@@ -54,29 +57,27 @@ class Check:
             choose_section(config, checked, args.section)
         if checked.problems:
             raise checked.error()
-        print(f"{config.file}: no problems; sections: {', '.join(checked.sections) or 'none'}")
+        say(f"{config.file}: no problems; sections: {', '.join(checked.sections) or 'none'}")
         for line in used(checked.uses):
-            print(line)
+            say(line)
         return 0
 
 
 def listing(config: Config, origin: bool) -> list[str]:
     """``key = value`` lines; with ``origin`` each ends in its ``# file:line``."""
-    leaves = list(keys.leaves(config.tree))
-    texts = [f"{key} = {literal(value)}" for key, value in leaves]
+    found = list(leaves(config.tree))
+    texts = [f"{key} = {literal(value)}" for key, value in found]
     if not origin:
         return texts
     width = min(max(map(len, texts), default=0), 60)
-    places = [_places(config, key, value) for key, value in leaves]
+    places = [_places(config, key, value) for key, value in found]
     return [f"{text:{width}}  # {place}" for text, place in zip(texts, places, strict=True)]
 
 
 def _places(config: Config, key: str, value: Any) -> str:
     """Where ``key`` was written, and what was appended to it on the command line."""
     items = range(len(value)) if isinstance(value, list) else ()
-    appended = [
-        place for i in items if (place := config.where(keys.child(key, i))).startswith("--")
-    ]
+    appended = [place for i in items if (place := config.where(join_key(key, i))).startswith("--")]
     return ", ".join(dict.fromkeys([config.where(key), *appended]))
 
 

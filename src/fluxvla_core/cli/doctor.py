@@ -12,14 +12,14 @@ import os
 import sys
 from collections.abc import Iterator
 
-from fluxvla_core.cli.main import STRICT
+from fluxvla_core.cli.main import COMMANDS, STRICT
 from fluxvla_core.cli.parser import Parser, positive
-from fluxvla_core.cli.table import COMMANDS
+from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.resolve import installed
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, PluginError
-from fluxvla_core.plugins import trial
+from fluxvla_core.plugins import import_check
 from fluxvla_core.plugins._metadata import Plugin, index
-from fluxvla_core.plugins.groups import GROUPS, PREFIX
+from fluxvla_core.registries import GROUPS, PREFIX
 
 
 class Doctor:
@@ -38,22 +38,22 @@ class Doctor:
         parser.once(
             "--limit",
             type=positive,
-            default=trial.LIMIT_S,
+            default=import_check.LIMIT_S,
             metavar="SECONDS",
-            help=f"how long one import may take (default {trial.LIMIT_S})",
+            help=f"how long one import may take (default {import_check.LIMIT_S})",
         )
 
     def run(self, args: argparse.Namespace) -> int:
         healthy = True
         for text in self._findings(args):
             healthy = False
-            print(text, flush=True)
+            say(text)
         if not healthy:
             return EXIT_FAILED
         plugins = [p for many in index().plugins.values() for p in many]
         dists = {p.dist for p in plugins}
         looked = " in metadata and sources" if args.no_import else ""
-        print(f"no problems{looked}: {len(plugins)} plugin(s) of {len(dists)} distribution(s)")
+        say(f"no problems{looked}: {len(plugins)} plugin(s) of {len(dists)} distribution(s)")
         return EXIT_DONE
 
     def _findings(self, args: argparse.Namespace) -> Iterator[str]:
@@ -67,7 +67,7 @@ class Doctor:
                 yield f"{plugin.group}: {text}"
         if not args.no_import:
             traces = os.environ.get(STRICT) == "1"
-            yield from trial.problems(importable, args.limit, traces, _show_progress)
+            yield from import_check.problems(importable, args.limit, traces, _show_progress)
 
 
 def collisions() -> Iterator[str]:
@@ -98,13 +98,13 @@ def _cannot_work(plugin: Plugin) -> str | None:
     try:
         installed(plugin)
     except PluginError as error:
-        return trial.in_one_line(error)
+        return import_check.in_one_line(error)
     return None
 
 
-def _show_progress(plugins: trial.Plugins) -> None:
+def _show_progress(plugins: import_check.Plugins) -> None:
     if sys.stderr.isatty():
-        print(f"importing {plugins[0].origin} ({len(plugins)} plugin(s)) ...", file=sys.stderr)
+        say(f"importing {plugins[0].origin} ({len(plugins)} plugin(s)) ...", sys.stderr)
 
 
 def _unknown_group(plugin: Plugin) -> str:

@@ -6,6 +6,7 @@ import ctypes
 import logging
 import os
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -15,20 +16,23 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.cli import ranks
+from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
+from fluxvla_core.signals import requests_to_stop
 
 _STOP_S = 30
 """What torch's agent gives the others when a rank has failed: they have nothing left to save."""
+_HERE = "127.0.0.1"
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def launch(
-    nproc: int, words: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = ranks.GRACE_S
+    nproc: int, argv: Sequence[str], work_dir: Path, restarts: int = 0, grace: int = ranks.GRACE_S
 ) -> tuple[int, int]:
-    """Run ``fluxvla run *words`` in ``nproc`` processes with RANK, WORLD_SIZE and their likes set.
+    """Run ``fluxvla run *argv`` in ``nproc`` processes with RANK, WORLD_SIZE and the like set.
 
-    Ranks share this terminal; rank 0 alone talks. When one fails the others are stopped. Up to
-    ``restarts`` times all are started again, from the newest checkpoint; after that the words and
+    Ranks share this terminal; rank 0 alone reports. When one fails the others are stopped. Up to
+    ``restarts`` times all are started again, from the newest checkpoint; after that the message and
     the exit code of the one that failed first are this command's. Asked to stop, they have
     ``grace`` seconds to save in ``work_dir``; then they are killed.
 
@@ -57,28 +61,31 @@ def launch(
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (cores or 1) // nproc)))
-    # Its agent reports failures in its own way; ours are in the ranks' own words.
+    # Its agent reports failures in its own way; ours are the ranks' own messages.
     logging.disable(logging.CRITICAL)
     try:
         with _scratch() as folder:
             os.environ[ranks.ERROR_DIR] = folder
             os.environ[ranks.LAUNCHER] = str(os.getpid())
+            store = _store()
             config = LaunchConfig(
                 min_nodes=1,
                 max_nodes=1,
                 nproc_per_node=nproc,
                 run_id=uuid.uuid4().hex,
-                rdzv_backend="c10d",
-                rdzv_endpoint="127.0.0.1:0",
-                local_addr="127.0.0.1",
+                rdzv_backend="static",
+                rdzv_endpoint=f"{_HERE}:{store.port}",
+                rdzv_configs={"rank": 0},
+                local_addr=_HERE,
                 max_restarts=restarts,
+                signals_to_handle=",".join(signal.Signals(n).name for n in requests_to_stop()),
                 shutdown_timeout=grace,
                 logs_specs=DefaultLogsSpecs(log_dir=folder),
             )
             agent = elastic_launch(config, sys.executable)
             try:
-                code = _watch(agent, words, Path(folder), ChildFailedError)
-                return code, max(ranks.done(Path(folder)).values(), default=0)
+                code = _watch(agent, argv, Path(folder), ChildFailedError)
+                return code, max(ranks.finished(Path(folder)).values(), default=0)
             except SignalException as error:
                 number = signal.Signals(error.sigval)
                 return _signalled(number, Path(folder), nproc, work_dir, grace)
@@ -88,8 +95,24 @@ def launch(
         logging.disable(logging.NOTSET)
 
 
+def _store() -> Any:
+    """The store by which agent and ranks find each other, listening to this machine alone.
+
+    Whoever reaches such a store can change what is in it, and by that where ranks connect to. torch
+    has it listen on all interfaces unless it is given the socket; the rendezvous of kind "static",
+    which has nothing pickled in it, takes the one that this process has at its port already.
+    """
+    from torch.distributed import TCPStore  # type: ignore[attr-defined]
+
+    listener = socket.create_server((_HERE, 0))
+    port = listener.getsockname()[1]
+    return TCPStore(
+        _HERE, port, 1, is_master=True, multi_tenant=True, master_listen_fd=listener.detach()
+    )
+
+
 def _scratch() -> tempfile.TemporaryDirectory[str]:
-    """Where ranks leave their words.
+    """A temporary folder for the messages of ranks.
 
     Raises:
         RunFailed: there is no place for it.
@@ -105,11 +128,11 @@ def _scratch() -> tempfile.TemporaryDirectory[str]:
         ) from error
 
 
-def _watch(agent: Any, words: Sequence[str], folder: Path, failed: type[Any]) -> int:
+def _watch(agent: Any, argv: Sequence[str], folder: Path, failed: type[Any]) -> int:
     try:
-        agent("-m", "fluxvla_core", "run", *words)
+        agent("-m", "fluxvla_core", "run", *argv)
     except failed as error:
-        return _tell(ranks.root_cause(_all(error.failures, ranks.failures(folder))))
+        return _report_failure(ranks.root_cause(_all(error.failures, ranks.failures(folder))))
     return 0
 
 
@@ -117,7 +140,7 @@ def _signalled(
     number: signal.Signals, folder: Path, nproc: int, work_dir: Path, grace: int
 ) -> tuple[int, int]:
     """How this command ends after a signal: well, if all ranks had done all by then."""
-    done, said = ranks.done(folder), list(ranks.failures(folder).values())
+    done, said = ranks.finished(folder), list(ranks.failures(folder).values())
     if len(done) == nproc:
         return EXIT_DONE, number
     unsaved = _unsaved(nproc - len(done) - len(said), nproc, work_dir, grace)
@@ -128,12 +151,14 @@ def _stopped(number: signal.Signals, said: list[ranks.Failure], unsaved: RunFail
     """How this command ends after a signal, by what the ranks said of it."""
     failed = [f for f in said if not f.asked and f.code != EXIT_INTERRUPTED]
     if failed:
-        return _tell(ranks.root_cause(failed))
+        return _report_failure(ranks.root_cause(failed))
     if number == signal.SIGINT:
-        raise KeyboardInterrupt(_after("interrupted", said) if unsaved is None else str(unsaved))
+        if unsaved is not None:
+            raise KeyboardInterrupt(str(unsaved)) from unsaved
+        raise KeyboardInterrupt(_after("interrupted", said))
     if unsaved is not None:
         raise unsaved
-    return _tell(ranks.root_cause(said))
+    return _report_failure(ranks.root_cause(said))
 
 
 def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed | None:
@@ -166,21 +191,30 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
         ours = late or process.exitcode == -signal.SIGTERM
         text = f"ended without a word: {_ending(process.exitcode)}"
         if process.exitcode == -signal.SIGKILL:
-            text += "\n  likely cause: killed from outside, most often for want of memory"
-        found.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=ours, wordless=True))
+            text += (
+                "\n  likely cause: this machine, or its container, ran out of memory (dmesg "
+                "tells), or somebody killed it"
+            )
+        elif process.exitcode < 0:
+            text += (
+                "\n  likely cause: a crash below Python; python -X faulthandler shows where, or "
+                "somebody sent it the signal"
+            )
+        text += "\n  next: go on with the same command and --resume auto"
+        found.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=ours, silent=True))
     return found
 
 
-def _tell(failure: ranks.Failure) -> int:
-    """Say what the rank would have said."""
-    join = " " if failure.wordless else " failed:\n"
+def _report_failure(failure: ranks.Failure) -> int:
+    """Print what the rank would have printed; its exit code."""
+    join = " " if failure.silent else " failed:\n"
     text = failure.text if failure.expected else f"rank {failure.rank}{join}{failure.text}"
-    print(text, file=sys.stderr)
+    say(text, sys.stderr)
     return failure.code
 
 
 def _after(prefix: str, said: list[ranks.Failure]) -> str:
-    """What an interrupted rank added (where it saved), without the word itself."""
+    """What an interrupted rank added (where it saved), without the prefix itself."""
     texts = [
         f.text.removeprefix(prefix).removeprefix(": ") for f in said if f.code == EXIT_INTERRUPTED
     ]

@@ -1,5 +1,8 @@
 """``fluxvla``: find the command, run it, turn errors into messages and exit codes.
 
+A command is a class with ``help``, ``add_arguments(parser)`` and ``run(args) -> exit code``
+(``contracts.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
+
 Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 """
 
@@ -8,14 +11,77 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fluxvla_core.cli.table import COMMANDS
-from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, FluxError, UsageError
+from fluxvla_core.cli.terminal import OutputFailed, give_up, prepare, say
+from fluxvla_core.errors import (
+    EXIT_DONE,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EndReason,
+    FluxError,
+    RunFailed,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    import argparse
+
+    from fluxvla_core.cli.parser import Parser
 
 STRICT = "FLUXVLA_STRICT"
 USAGE = "usage: fluxvla COMMAND ...   (fluxvla COMMAND --help says what it takes)"
+
+
+class Entry(NamedTuple):
+    """``target`` is ``module:Class``."""
+
+    target: str
+    help: str
+
+
+COMMANDS: Mapping[str, Entry] = {
+    "run": Entry("fluxvla_core.cli.run:Run", "run a section of a config: train, evaluate, deploy"),
+    "config show": Entry(
+        "fluxvla_core.cli.config_commands:Show", "print the config as it resolves"
+    ),
+    "config check": Entry(
+        "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
+    ),
+    "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
+    "plugins show": Entry(
+        "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
+    ),
+    "plugins doctor": Entry(
+        "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"
+    ),
+    "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
+    "data validate": Entry(
+        "fluxvla_core.cli.data_commands:Validate", "read every row, decode every frame"
+    ),
+    "data stats": Entry(
+        "fluxvla_core.cli.data_commands:Stats", "print exact statistics of a dataset"
+    ),
+    "data convert": Entry(
+        "fluxvla_core.cli.data_commands:Convert", "write recordings, or LeRobot v2, as v3.0"
+    ),
+    "data finish": Entry(
+        "fluxvla_core.cli.data_commands:Finish", "finish a recording that was cut short"
+    ),
+    "data collect": Entry(
+        "fluxvla_core.cli.data_commands:Collect", "record demonstrations of a scripted expert"
+    ),
+    "eval compare": Entry(
+        "fluxvla_core.cli.policy_commands:Compare", "compare two evaluations, pair by pair"
+    ),
+    "export": Entry(
+        "fluxvla_core.cli.policy_commands:Export", "write what acts of a checkpoint into a folder"
+    ),
+    "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
+}
+"""Name -> where the command is and its help line, so that only one is imported."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,16 +89,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     ``FLUXVLA_STRICT=1`` prints the traceback of every error, expected ones too.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    prepare()
+    code = _run(list(sys.argv[1:] if argv is None else argv))
     try:
-        return dispatch(words)
-    except BrokenPipeError:  # `fluxvla plugins list | head`
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the interpreter flushes it at exit
-        return EXIT_FAILED
+        if sys.stdout is not None:  # `fluxvla ... >&-`
+            sys.stdout.flush()  # what a plugin's command, or argparse, printed
+    except OSError as error:
+        return give_up(error)
+    return code
+
+
+def _run(argv: list[str]) -> int:
+    try:
+        return dispatch(argv)
+    except (BrokenPipeError, OutputFailed) as error:
+        return give_up(error)
     except SystemExit as end:  # argparse's --help, or a plugin's own exit
         if isinstance(end.code, str):
-            print(end.code, file=sys.stderr)
-            return EXIT_FAILED
+            return _complain(end.code, EXIT_FAILED)
         return end.code or EXIT_DONE
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - reported with its traceback
         return report(error)
@@ -50,8 +124,22 @@ def report(error: BaseException) -> int:
             text = _trace(error).rstrip()
     else:
         text, code = _trace(error).rstrip(), EXIT_FAILED
-    if not ranks.record(text, code, expected=isinstance(error, FluxError)):
-        print(text, file=sys.stderr)
+    expected = isinstance(error, FluxError)
+    if not ranks.record_failure(text, code, expected=expected, reason=_end_reason(error)):
+        _complain(text, code)
+    return code
+
+
+def _end_reason(error: BaseException | None) -> EndReason | None:
+    """Why a run ended, if that is known; of an error that closing met, why it was closed."""
+    while isinstance(error, Exception) and not isinstance(error, FluxError):
+        error = error.__cause__ or error.__context__
+    return error.reason if isinstance(error, RunFailed) else None
+
+
+def _complain(text: str, code: int) -> int:
+    with suppress(OSError):  # stderr is full, or gone: there is nowhere to say it
+        say(text, sys.stderr)
     return code
 
 
@@ -61,60 +149,66 @@ def _trace(error: BaseException) -> str:
     return "".join(traceback.format_exception(type(error), error, error.__traceback__))
 
 
-def dispatch(words: list[str]) -> int:
-    """Run the command that ``words`` begin with.
+def dispatch(argv: list[str]) -> int:
+    """Run the command that ``argv`` begin with.
 
     Raises:
         UsageError: there is no such command, or its arguments are wrong.
     """
-    if not words or words[0] in {"-h", "--help", "help"}:
-        print(overview())
+    if not argv or argv[0] in {"-h", "--help", "help"}:
+        say(overview())
         return EXIT_DONE
-    if words[0] == "--version":
-        words = ["version"]
+    if argv[0] == "--version":
+        argv = ["version"]
     for length in (2, 1):
-        name = " ".join(words[:length])
-        if name in COMMANDS and len(words) >= length:
+        name = " ".join(argv[:length])
+        if name in COMMANDS and len(argv) >= length:
             module, _, attribute = COMMANDS[name].target.partition(":")
-            return execute(
-                name, getattr(importlib.import_module(module), attribute), words[length:]
-            )
-    inside = [name for name in COMMANDS if name.startswith(f"{words[0]} ")]
+            return execute(name, getattr(importlib.import_module(module), attribute), argv[length:])
+    inside = [name for name in COMMANDS if name.startswith(f"{argv[0]} ")]
     if inside:
-        return _group(words, inside)
+        return _group(argv, inside)
     from fluxvla_core.plugins.registry import BY_NAME
 
     plugins = BY_NAME["commands"]
-    if words[0] in plugins:
-        return execute(words[0], plugins.get(words[0]), words[1:])
-    raise _unknown(words[0], [*COMMANDS, *plugins])
+    if argv[0] in plugins:
+        return execute(argv[0], plugins.get(argv[0]), argv[1:])
+    from fluxvla_core.plugins import first_party
+
+    owner = first_party.owner("commands", argv[0])
+    if owner is not None:
+        raise UsageError(
+            f"fluxvla {argv[0]} comes with {owner}, which is not installed",
+            next=f"pip install {owner}",
+        )
+    raise _unknown(argv[0], [*COMMANDS, *plugins])
 
 
-def execute(name: str, command: Any, words: list[str]) -> int:
-    """Parse ``words`` for ``command`` (a class of the Command contract) and run it."""
+def execute(name: str, command: Any, argv: list[str]) -> int:
+    """Parse ``argv`` for ``command`` (a class of the Command contract) and run it."""
     from fluxvla_core.cli.parser import Parser
 
     made = command()
     parser = Parser(f"fluxvla {name}", str(made.help))
     made.add_arguments(parser)
-    return int(made.run(parser.parse(words)))
+    return int(made.run(parser.parse(argv)))
 
 
-def _group(words: list[str], inside: list[str]) -> int:
-    if len(words) == 1 or words[1] in {"-h", "--help"}:
-        print("\n".join(_rows(inside)))
+def _group(argv: list[str], inside: list[str]) -> int:
+    if len(argv) == 1 or argv[1] in {"-h", "--help"}:
+        say("\n".join(_rows(inside)))
         return EXIT_DONE
-    near = _close(words[1], [name.split()[1] for name in inside])
-    hint = f"; did you mean 'fluxvla {words[0]} {near[0]}'?" if near else ""
+    near = _close(argv[1], [name.split()[1] for name in inside])
+    hint = f"; did you mean 'fluxvla {argv[0]} {near[0]}'?" if near else ""
     raise UsageError(
-        f"fluxvla {words[0]} has no {words[1]!r}{hint}", next=f"fluxvla {words[0]} --help"
+        f"fluxvla {argv[0]} has no {argv[1]!r}{hint}", next=f"fluxvla {argv[0]} --help"
     )
 
 
-def _close(word: str, names: list[str]) -> list[str]:
+def _close(name: str, names: list[str]) -> list[str]:
     import difflib  # with traceback above, a tenth of what `fluxvla --help` may take
 
-    return difflib.get_close_matches(word, names, 1)
+    return difflib.get_close_matches(name, names, 1)
 
 
 def _unknown(word: str, names: list[str]) -> UsageError:
@@ -128,7 +222,8 @@ def _unknown(word: str, names: list[str]) -> UsageError:
 
 
 def overview() -> str:
-    """What ``fluxvla --help`` prints; plugins' commands are listed, not imported."""
+    """What ``fluxvla --help`` prints; of plugins' commands it reads the source, without import."""
+    from fluxvla_core.config.signature import read_help
     from fluxvla_core.plugins._metadata import index
 
     lines = [USAGE, "", *_rows(list(COMMANDS))]
@@ -138,10 +233,10 @@ def overview() -> str:
         if group == "fluxvla.commands"
     }
     width = _width(list(COMMANDS))
-    lines += [
-        f"  {name:{width}}  (from {', '.join(p.origin for p in providers)})"
-        for name, providers in theirs.items()
-    ]
+    for name, providers in theirs.items():
+        origin = f"(from {', '.join(p.origin for p in providers)})"
+        about = read_help(providers[0]).partition(". ")[0].rstrip(".")
+        lines.append(f"  {name:{width}}  {about + ' ' if about else ''}{origin}")
     return "\n".join(lines)
 
 
@@ -152,3 +247,19 @@ def _rows(names: list[str]) -> list[str]:
 
 def _width(names: list[str]) -> int:
     return max(len(name) for name in names)
+
+
+class Version:
+    api = "1.0"
+    help = "Print the versions of the core and of Python."
+
+    def add_arguments(self, parser: Parser) -> None:
+        return
+
+    def run(self, args: argparse.Namespace) -> int:
+        import platform
+
+        from fluxvla_core import __version__
+
+        say(f"fluxvla-core {__version__}, Python {platform.python_version()}")
+        return 0

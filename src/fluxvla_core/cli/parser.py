@@ -83,7 +83,7 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="set a key of the config (a TOML value); += adds a key or appends to a list",
+        help="set a key of the config (a TOML value); += appends to a list, or adds any key",
     )
     parser.add_argument(
         "--cfg-options",

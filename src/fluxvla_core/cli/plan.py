@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fluxvla_core.config import Checked, Config, apply_overrides, check_config, examine, load_config
-from fluxvla_core.config.check import Use, type_key
-from fluxvla_core.config.resolved import CONFIG_FILE
+from fluxvla_core.config.check import Checked, Use, check_config, examine, type_key
+from fluxvla_core.config.load import load_config
+from fluxvla_core.config.overrides import apply_overrides
+from fluxvla_core.config.snapshot import CONFIG_FILE
+from fluxvla_core.config.tree import Config, join_key
 from fluxvla_core.errors import UsageError
+
+CKPT_PATH = "ckpt_path"
+"""The key under which a section names the checkpoint that it uses."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +46,12 @@ def make_plan(
         UsageError: no config is named, or the section is not one that can run.
         ConfigError: whatever is wrong with the config.
     """
+    overrides = tuple(overrides)
     if file is None:
         raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
     config = apply_overrides(load_config(file), overrides)
     examined = examine(config, section)
+    config = _of_checkpoint(config, Path(file), examined, {f"--set {o}" for o in overrides})
     name = choose_section(config, examined, section)
     config = _with_settings(config, name, settings or {})
     checked = check_config(config, name)
@@ -52,9 +60,34 @@ def make_plan(
     return Plan(config, name, name in checked.trains, place, checked.uses)
 
 
-def _with_settings(config: Config, section: str, settings: Mapping[str, str]) -> Config:
+def _of_checkpoint(config: Config, file: Path, examined: Checked, given: Collection[str]) -> Config:
+    """The config of a checkpoint means that checkpoint, unless the command names another."""
+    if not _in_checkpoint(file):
+        return config
+    for use in examined.uses:
+        signature = use.found.signature
+        if use.key not in examined.sections or signature is None or signature.trains:
+            continue
+        named = config.origins.get(join_key(use.key, CKPT_PATH)) in given
+        if CKPT_PATH in signature.names and not named:
+            config = _with_settings(config, use.key, {CKPT_PATH: str(file.parent)}, str(file))
+    return config
+
+
+def _in_checkpoint(file: Path) -> bool:
+    if file.name != CONFIG_FILE:
+        return False
+    from fluxvla_core.checkpoints import manifest  # brings what checks it
+
+    return (file.parent / manifest.NAME).is_file()
+
+
+def _with_settings(
+    config: Config, section: str, settings: Mapping[str, str], place: str | None = None
+) -> Config:
     tree = {**config.tree, section: {**config.tree[section], **settings}}
-    origins = {**config.origins, **{f"{section}.{key}": f"--{key}" for key in settings}}
+    places = {join_key(section, key): place or f"--{key}" for key in settings}
+    origins = {**config.origins, **places}
     return replace(config, tree=tree, origins=origins)
 
 
@@ -78,7 +111,7 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
         if wanted in names:
             return wanted
         if type_key(wanted) in {problem.key for problem in checked.problems}:
-            raise checked.error()  # without its plugin nothing tells that it is a runner's table
+            raise checked.error()  # without its plugin nothing shows that it is a runner's table
         if wanted in config.tree:
             what = f"section {wanted!r} cannot be run: it is no table whose type is a runner"
         else:
@@ -114,6 +147,8 @@ def default_work_dir(file: Path, sections: Collection[str] = ()) -> Path:
     folder = file.parent
     if folder.parent.name == "checkpoints":
         return folder.parent.parent
+    if _in_checkpoint(file):  # exported: nothing of a run is written into it
+        return Path("work_dirs") / folder.name
     of_section = folder.name in sections and (folder.parent / CONFIG_FILE).is_file()
     return folder.parent if of_section else folder
 
@@ -133,7 +168,8 @@ def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
 
     if resume == "auto":
         return
-    if resume is not None and Path(resume).resolve().is_relative_to(work_dir.resolve()):
+    here = os.path.realpath(work_dir)
+    if resume is not None and Path(os.path.realpath(resume)).is_relative_to(here):
         return
     found = folders(work_dir)
     if found:

@@ -1,7 +1,7 @@
-"""What a process knows of being one of several, and how it tells its launcher why it failed.
+"""Ranks: what a process knows of being one of several, and how it reports to its launcher.
 
 Each rank of ``fluxvla run --nproc N`` writes its error to a file instead of the terminal: when
-one fails the others fail of it, and only the first one's words help.
+one fails the others fail because of it, and only the first error helps.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fluxvla_core.errors import EndReason, RunFailed
+
 ERROR_DIR = "FLUXVLA_ERROR_DIR"
 LAUNCHER = "FLUXVLA_LAUNCHER_PID"
 JOB = "run.job"
 """In a work dir: which job of several processes began to train there last."""
+_TAKEN = "taken"  # in the agent's folder: its job's work dir was taken away, with the message
 _NO_ID = "none"  # torchrun's --rdzv-id, of any job that was given none
 GRACE_S = 600
 """Seconds for a checkpoint, between asking ranks to stop and killing them."""
@@ -41,21 +44,21 @@ def attempt() -> int:
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
-def resume(asked: str | None, work_dir: Path) -> str | None:
+def resume_from(asked: str | None, work_dir: Path) -> str | None:
     """What a training goes on from: ``--resume``, and after a restart what there is by then.
 
     That only where this job had begun: an attempt that was refused is refused again, and does not
     go on with what others left.
     """
-    if attempt() == 0 or not _began(work_dir):
+    if attempt() == 0 or not _started_here(work_dir):
         return asked
     from fluxvla_core.checkpoints.checkpoint import folders
 
     return "auto" if asked is None or folders(work_dir) else asked
 
 
-def begin(work_dir: Path) -> None:
-    """Leave word that this job trains in ``work_dir``; to be called when nothing refused it."""
+def mark_started(work_dir: Path) -> None:
+    """Mark that this job trains in ``work_dir``; to be called when nothing refused it."""
     from fluxvla_core.atomic import write_text
 
     if rank() != 0:
@@ -66,7 +69,24 @@ def begin(work_dir: Path) -> None:
         (work_dir / JOB).unlink(missing_ok=True)
 
 
-def _began(work_dir: Path) -> bool:
+def refuse_lost_work_dir() -> None:
+    """A job whose work dir was taken away does not begin in what is there now when it is restarted.
+
+    Raises:
+        RunFailed: what it ended with.
+    """
+    place = _agent_folder()
+    if attempt() and place is not None and (place / _TAKEN).exists():
+        raise RunFailed((place / _TAKEN).read_text(encoding="utf-8"))
+
+
+def _agent_folder() -> Path | None:
+    """The agent's own folder, which it makes once: AGENT/attempt_N/RANK/error.json is in it."""
+    file = os.environ.get("TORCHELASTIC_ERROR_FILE", "")
+    return Path(file).parents[2] if file.count(os.sep) > 2 else None
+
+
+def _started_here(work_dir: Path) -> bool:
     """Whether it is this job that began last in ``work_dir``."""
     ours = _job()
     try:
@@ -80,31 +100,36 @@ def _began(work_dir: Path) -> bool:
 
 
 def _job() -> dict[str, str]:
-    """What stays over a job's restarts, and tells it from others."""
+    """What stays over a job's restarts, and distinguishes it from others."""
     import socket
 
-    # AGENT/attempt_N/RANK/error.json: the agent makes that folder once, with a name of its own.
-    # The parent is it too, but in containers all have the same number, and a script may be between.
-    file = os.environ.get("TORCHELASTIC_ERROR_FILE", "")
-    agent = str(Path(file).parents[2]) if file.count(os.sep) > 2 else str(os.getppid())
+    # The parent is the agent too, but in containers all have the same number, and a script may be
+    # between.
+    agent = str(_agent_folder() or os.getppid())
     job = os.environ.get("TORCHELASTIC_RUN_ID", _NO_ID)
     return {"id": job, "host": socket.gethostname(), "agent": agent}
 
 
-def restarted() -> list[str]:
-    """What to say first after a restart: which one it is, and why there was need for one."""
+def restart_notice() -> list[str]:
+    """What to report first after a restart: which one it is, and why there was need for one."""
     if attempt() == 0:
         return []
-    said = failures(Path(os.environ[ERROR_DIR]), attempt() - 1) if launched() else {}
-    found = [failure for failure in said.values() if not failure.asked]
     why = "a process ended without a word"
-    if found:
-        first = root_cause(found)
-        why = f"rank {first.rank} failed:\n{first.text.rstrip()}"
+    if launched():
+        folder = Path(os.environ[ERROR_DIR])
+        said = failures(folder, attempt() - 1)
+        ended = {*said, *dict(_read_records(folder, "done", attempt() - 1))}
+        silent = [str(rank) for rank in range(world_size() or 1) if rank not in ended]
+        found = [failure for failure in said.values() if not failure.asked]
+        if found:
+            first = root_cause(found)
+            why = f"rank {first.rank} failed:\n{first.text.rstrip()}"
+        elif silent:
+            why = f"rank {', '.join(silent)} ended without a word: killed, or crashed below Python"
     return [f"restart {attempt()}: {why}"]
 
 
-def leave(code: int) -> NoReturn:
+def exit_now(code: int) -> NoReturn:
     """End this rank's process at once, with everything it said written out.
 
     gloo's threads can outlive the interpreter and then abort it ("terminate called without an
@@ -134,7 +159,7 @@ class Failure:
         time: monotonic seconds, which all processes of a machine share.
         expected: a FluxError, whose text says everything.
         asked: it ended because another rank had: stopped from outside, or cut off from it.
-        wordless: it left no record: killed, or crashed below Python.
+        silent: it left no record: killed, or crashed below Python.
     """
 
     rank: int
@@ -143,42 +168,51 @@ class Failure:
     code: int
     expected: bool = False
     asked: bool = False
-    wordless: bool = False
+    silent: bool = False
 
 
-def record(text: str, code: int, *, expected: bool) -> bool:
-    """Leave an error for the launcher; False if there is none to read it."""
+def record_failure(
+    text: str, code: int, *, expected: bool, reason: EndReason | None = None
+) -> bool:
+    """Leave an error for the launcher; False if there is none to read it.
+
+    Args:
+        expected: it is a FluxError.
+        reason: what ended this rank's work, where that is known.
+    """
+    place = _agent_folder()
+    if reason == "work dir lost" and place is not None and place.is_dir():
+        with suppress(OSError):  # what follows says it too
+            (place / _TAKEN).write_text(text, encoding="utf-8")
     if not launched():
         return False
-    # What training, robot loops and this command line say of a SIGTERM, and training of a rank
-    # that is gone.
-    asked = "stopped by SIGTERM" in text or "lost another rank" in text
+    asked = reason in ("stopped", "rank lost")
     failure = Failure(rank(), time.monotonic(), text, code, expected, asked)
-    return _leave("rank", asdict(failure))
+    return _write_record("rank", asdict(failure))
 
 
-def record_done(late: int) -> None:
-    """Leave word that this rank did all it had to.
+def record_finished(late: int) -> None:
+    """Report to the launcher that this rank did all it had to.
 
     Args:
         late: the signal that asked it to stop when there was nothing left to stop, or 0.
     """
     if launched():
-        _leave("done", [rank(), late])
+        _write_record("done", [rank(), late])
 
 
 def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
     """What ranks recorded, by rank, in the ``which``-th attempt; in the last one by default."""
-    found = [Failure(**said) for said in _left(folder, "rank", which)]
+    found = [Failure(**said) for said in _read_records(folder, "rank", which)]
     return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
 
 
-def done(folder: Path) -> dict[int, int]:
+def finished(folder: Path) -> dict[int, int]:
     """The ranks that did all they had to in the last attempt, with the signal that came late."""
-    return dict(_left(folder, "done"))
+    return dict(_read_records(folder, "done"))
 
 
-def _leave(kind: str, said: object) -> bool:
+def _write_record(kind: str, said: object) -> bool:
     """Write a record for the launcher; False if that cannot be."""
     from fluxvla_core.atomic import write_text
 
@@ -190,7 +224,7 @@ def _leave(kind: str, said: object) -> bool:
     return True
 
 
-def _left(folder: Path, kind: str, which: int | None = None) -> list[Any]:
+def _read_records(folder: Path, kind: str, which: int | None = None) -> list[Any]:
     """The records of an attempt, the last one by default."""
     paths = {path: int(path.name.split(".")[1]) for path in folder.glob("*-*.*.json")}
     if which is None:
@@ -205,9 +239,9 @@ def _left(folder: Path, kind: str, which: int | None = None) -> list[Any]:
 
 
 def root_cause(found: Sequence[Failure]) -> Failure:
-    """The failure that the others followed from, as well as can be told.
+    """The failure that the others followed from, as well as one can see.
 
     A rank that was asked to stop never is. A FluxError names a cause; a rank that was killed
     explains the broken connections of the others; else the earliest is.
     """
-    return min(found, key=lambda f: (f.asked, not f.expected, not f.wordless, f.time))
+    return min(found, key=lambda f: (f.asked, not f.expected, not f.silent, f.time))

@@ -5,37 +5,71 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TextIO
 
+from rich import markup
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TaskID,
     TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
 )
+from rich.table import Column
+from rich.text import Text
 
-from fluxvla_core.cli.reporters import shown
+from fluxvla_core.cli.reporters import RunReporter, clock, shown
+from fluxvla_core.errors import printable
+
+NARROW = 100
+"""Columns of a terminal below which the bar is short."""
 
 
-class RichReporter:
-    """A bar for each named progress, lines above them."""
+def escape(text: str) -> str:
+    """``text`` as it stands: no markup, and nothing that steers the terminal."""
+    return markup.escape(printable(text))
+
+
+class Left(ProgressColumn):
+    """``5:12 left``; what it took at the end; how long it goes on where nobody knows the end."""
+
+    def render(self, task: Task) -> Text:
+        if task.total is None or task.finished:
+            return Text(clock(task.finished_time or task.elapsed or 0.0))
+        left = "-:--" if task.time_remaining is None else clock(task.time_remaining)
+        return Text(f"{left} left")
+
+
+class Count(MofNCompleteColumn):
+    """``12/300``, and nothing where the total is not known and nothing is counted."""
+
+    def render(self, task: Task) -> Text:
+        return Text("") if task.total is None and not task.completed else super().render(task)
+
+
+class RichReporter(RunReporter):
+    """A bar for each named progress, lines above them.
+
+    Name, count, bar and time left are always there; what is shown beside them has the rest of
+    the line.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._console = Console(file=stream)
+        whole, rest = Column(no_wrap=True), Column(no_wrap=True, ratio=1, overflow="ellipsis")
         self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("[dim]{task.fields[beside]}"),
+            TextColumn("{task.description}", table_column=whole),
+            Count(table_column=whole.copy()),
+            BarColumn(bar_width=12 if self._console.width < NARROW else 24),
+            Left(table_column=whole.copy()),
+            TextColumn("[dim]{task.fields[beside]}", table_column=rest),
             console=self._console,
             refresh_per_second=4,
+            expand=True,
         )
         self._tasks: dict[str, TaskID] = {}
+        self._silence: TaskID | None = None
 
     def info(self, text: str) -> None:
         self._console.print(escape(text), highlight=False)
@@ -51,15 +85,26 @@ class RichReporter:
             self._tasks[name], completed=done, total=total, beside=escape(shown(fields))
         )
 
+    def still_working(self, what: str, seconds: float) -> None:
+        """Nothing was said for ``seconds`` since ``what``, and the work goes on."""
+        if self._silence is None:
+            self._bars.start()
+            self._silence = self._bars.add_task("working", total=None, beside="")
+        self._bars.update(self._silence, beside=escape(f"since: {what}"))
+
+    def end_silence(self) -> None:
+        """The silence is over."""
+        if self._silence is not None:
+            self._bars.remove_task(self._silence)
+            self._silence = None
+
     def settle(self) -> None:
         """Leave the terminal to whoever types: a bar would draw over it. The next one is new."""
+        self.end_silence()
         self._bars.stop()
         for task in self._tasks.values():
             self._bars.remove_task(task)
         self._tasks.clear()
-
-    def event(self, kind: str, **fields: object) -> None:
-        return
 
     def artifact(self, kind: str, path: Path) -> None:
         self.info(f"{kind}: {path}")

@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import json
+import os
+import shlex
 import signal
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import replace
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from fluxvla_core.atomic import prepare_folder
-from fluxvla_core.cli import following, ranks
+from fluxvla_core.cli import ranks
+from fluxvla_core.cli.execute import (
+    execute,
+    folders_to_make,
+    full_disk_explained,
+    remove_folders,
+    stopped_by_signals,
+)
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files, natural, positive
 from fluxvla_core.cli.plan import Plan, make_plan, refuse_overwriting
-from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import RunFailed, UsageError
+from fluxvla_core.cli.terminal import say
+from fluxvla_core.config.check import check_config
+from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, UsageError
 from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.signals import handling
+
+EVALUATION = "eval"
+_OF_A_RANK = ("MASTER_", "TORCHELASTIC_", "GROUP_", "ROLE_")
+_OF_ONE_RANK = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "TORCH_NCCL_ASYNC_HANDLING")
 
 
 class Run:
@@ -39,13 +50,17 @@ class Run:
         )
         parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
         parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
+        parser.add_argument(
+            "--free-task",
+            action="store_true",
+            help="also take instructions that the config does not know",
+        )
         parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
         parser.once(
             "--nproc",
             type=positive,
-            default=1,
             metavar="N",
-            help="processes that train, or workers that evaluate (default 1)",
+            help="processes that train (default 1), or workers that evaluate (default: its own)",
         )
         parser.once(
             "--max-restarts",
@@ -85,38 +100,81 @@ class Run:
         load_plugin_files(args.plugin_files)
         settings = {"record": args.record} if args.record is not None else {}
         plan = make_plan(args.config, args.section, args.overrides, args.work_dir, settings)
-        _check_fit(args, plan)
-        after = following.plan_evaluation(args, plan) if args.eval_after_train else None
+        _check_options(args, plan)
+        after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
-            print(_outline(plan, args.log_format))
+            say(_outline(plan, args.log_format))
             return 0
+        if plan.trains:
+            ranks.refuse_lost_work_dir()
+        if ranks.launched():
+            return self._perform(plan, args, after)
+        made = folders_to_make(plan)
+        try:
+            with _resume_hint(plan):
+                code = self._perform(plan, args, after)
+        except FluxError as error:
+            if error.exit_code == EXIT_BAD_INPUT and ranks.rank() == 0:
+                remove_folders(made)
+            raise
+        if code == EXIT_BAD_INPUT:  # of a process that this one started
+            remove_folders(made)
+        return code
+
+    def _perform(self, plan: Plan, args: argparse.Namespace, after: list[str] | None) -> int:
         if ranks.rank() == 0 and not ranks.launched():
             prepare_folder(plan.work_dir, "work dir", "name another one: --work-dir DIR")
             if plan.trains:
-                asked = ranks.resume(args.resume, plan.work_dir)
+                asked = ranks.resume_from(args.resume, plan.work_dir)
                 configured = plan.config.tree[plan.section].get("resume_from")
                 refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
             from fluxvla_core.cli.launch import launch
+            from fluxvla_core.cli.reporters import make_reporter
 
             grace = args.grace or ranks.GRACE_S
-            with _terminable(), _disk_full(plan.work_dir):
-                words, restarts = _words(args), args.max_restarts
-                code, late = launch(args.nproc, words, plan.work_dir, restarts, grace)
+            reporter = make_reporter(args.log_format)
+            reporter.info(f"starting {args.nproc or 1} processes")
+            reporter.close()
+            with stopped_by_signals(), full_disk_explained(plan.work_dir):
+                argv, restarts = _command_line(args), args.max_restarts
+                code, late = launch(args.nproc or 1, argv, plan.work_dir, restarts, grace)
         else:
-            with _terminable(), _disk_full(plan.work_dir):
-                late = _execute(plan, args)
-                ranks.record_done(late)
+            with stopped_by_signals(), full_disk_explained(plan.work_dir):
+                late = execute(plan, args)
+                ranks.record_finished(late)
             code = 0
         if code == 0 and after is not None and ranks.rank() == 0:
-            following.evaluate(after, late)
+            _evaluate(after, late)
         return code
 
 
-def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
+@contextmanager
+def _resume_hint(plan: Plan) -> Iterator[None]:
+    """Ctrl-C says what is kept, and how the work goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if isinstance(error.__cause__, FluxError):  # which says itself how
+            raise
+        (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
+        said = str(error)
+        if plan.trains:
+            way = "go on with the same command and --resume auto"
+        elif signature is not None and "episodes" in signature.names:
+            said = said or "finished episodes are kept"
+            way = "go on with the same command"
+        else:
+            raise
+        raise KeyboardInterrupt(f"{said}\n  next: {way}" if said else way) from error
+
+
+def _check_options(args: argparse.Namespace, plan: Plan) -> None:
     """Options that this kind of section has no use for are slips."""
     if plan.trains and (args.task is not None or args.tasks is not None):
         raise UsageError(f"--task says what a robot is to do, and section {plan.section!r} trains")
+    if plan.trains and args.free_task:
+        raise UsageError(f"--free-task is for a robot, and section {plan.section!r} trains")
     if args.task is not None and args.tasks is not None:
         raise UsageError("--task and --tasks both say what to do: give one of them")
     if not plan.trains and args.resume is not None:
@@ -132,7 +190,7 @@ def _check_fit(args: argparse.Namespace, plan: Plan) -> None:
             "--grace is for the processes that --nproc or --max-restarts starts",
             next="leave it out: this one saves when it is stopped, however long that takes",
         )
-    if args.nproc > 1 and not _divides(plan):
+    if (args.nproc or 1) > 1 and not _divides(plan):
         raise UsageError(
             "--nproc is for processes that train or evaluate together, and section "
             f"{plan.section!r} runs in one",
@@ -155,129 +213,19 @@ def _divides(plan: Plan) -> bool:
 
 def _launches(args: argparse.Namespace) -> bool:
     """Whether a training is done by other processes, which this one starts."""
-    return bool(args.nproc > 1 or args.max_restarts)
+    return bool((args.nproc or 1) > 1 or args.max_restarts)
 
 
-def _words(args: argparse.Namespace) -> list[str]:
+def _command_line(args: argparse.Namespace) -> list[str]:
     """This command's arguments again, for its ranks."""
-    words = ["--config", args.config]
+    argv = ["--config", args.config]
     for name in ("section", "work_dir", "resume"):
         value = getattr(args, name)
         if value is not None:
-            words += [f"--{name.replace('_', '-')}", value]
+            argv += [f"--{name.replace('_', '-')}", value]
     for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
-        words += [word for value in values for word in (name, value)]
-    return [*words, "--log-format", args.log_format]
-
-
-def _execute(plan: Plan, args: argparse.Namespace) -> int:
-    """Build the section's runner and run it, reporting.
-
-    Returns:
-        The signal that asked to stop it when it was done, or 0.
-    """
-    from fluxvla_core.build import RunContext, build_runner_from_cfg
-    from fluxvla_core.cli.reporters import make_reporter
-    from fluxvla_core.config import freeze
-    from fluxvla_core.contracts.reporter import SilentReporter
-
-    context = RunContext(
-        config=freeze(plan.config.tree),
-        section=plan.section,
-        work_dir=plan.work_dir,
-        resume=ranks.resume(args.resume, plan.work_dir) if plan.trains else None,
-        origins=plan.config.origins,
-        config_file=plan.config.file,
-        task=args.task,
-        task_file=args.tasks,
-        nproc=ranks.world_size() or args.nproc,
-    )
-    if ranks.rank() != 0:
-        context = replace(context, reporter=SilentReporter())
-        return _run_section(plan, build_runner_from_cfg, context)[1]
-    reporter = make_reporter(args.log_format)
-    try:
-        with _owned(plan, reporter):
-            _leave_records(plan)
-            reporter.event("start", section=plan.section, work_dir=plan.work_dir)
-            for text in ranks.restarted():
-                reporter.warn(text)
-            context = replace(context, reporter=reporter)
-            result, late = _run_section(plan, build_runner_from_cfg, context)
-        if isinstance(result, Mapping):
-            for name, value in result.items():
-                if isinstance(value, (bool, int, float, str)):
-                    reporter.info(
-                        f"{name}: {value:.6g}" if isinstance(value, float) else f"{name}: {value}"
-                    )
-            reporter.event("result", section=plan.section, result=result)
-        reporter.artifact("work dir", plan.work_dir)
-        return late
-    except Exception as error:
-        reporter.event("error", type=type(error).__name__, text=str(error))
-        raise
-    finally:
-        reporter.close()
-
-
-def _owned(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
-    """A training has its work dir for itself, from before it leaves the first file there."""
-    if not plan.trains:
-        return nullcontext()
-    from fluxvla_core.checkpoints.owner import claim
-
-    plan.work_dir.mkdir(parents=True, exist_ok=True)
-    return closing(claim(plan.work_dir, reporter.warn))
-
-
-def _run_section(plan: Plan, build: Any, context: Any) -> tuple[Any, int]:
-    """The call order of the specification: construct, ``run_setup``, ``run``.
-
-    Returns:
-        What the section gave, and the signal that asked to stop it when it was done, or 0.
-    """
-    from fluxvla_core.contracts.check import is_train_runner
-
-    runner = build(context.config[plan.section], context)
-    if not is_train_runner(type(runner)):
-        runner.run_setup()
-        return runner.run(), 0
-    from fluxvla_core.build import build_dataset_from_cfg
-
-    dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
-    try:
-        runner.run_setup(n_train_examples=len(dataset))
-        ranks.begin(plan.work_dir)
-        return runner.run(dataset), getattr(runner, "late_stop", 0)
-    except (RuntimeError, MemoryError, OSError) as error:
-        from fluxvla_core.train.memory import explain
-
-        known = explain(error)
-        if known is None:
-            raise
-        raise known from error
-
-
-def _leave_records(plan: Plan) -> None:
-    """``config.resolved.json`` and ``environment.json``.
-
-    A training's own stay at the top of its work dir; what is evaluated there later leaves its
-    own in a folder of its section.
-    """
-    from fluxvla_core.config.resolved import (
-        CONFIG_FILE,
-        ENVIRONMENT_FILE,
-        environment,
-        write_json,
-        write_resolved,
-    )
-
-    folder = plan.work_dir
-    if not plan.trains and (folder / CONFIG_FILE).exists():
-        folder = folder / plan.section
-    folder.mkdir(parents=True, exist_ok=True)
-    write_resolved(folder / CONFIG_FILE, plan.config)
-    write_json(folder / ENVIRONMENT_FILE, environment())
+        argv += [word for value in values for word in (name, value)]
+    return [*argv, "--log-format", args.log_format]
 
 
 def _outline(plan: Plan, log_format: str) -> str:
@@ -308,35 +256,49 @@ def _outline(plan: Plan, log_format: str) -> str:
     return "\n".join(lines)
 
 
-class _Terminated(BaseException):
-    """SIGTERM. Not an ``Exception``: nobody's ``except`` may swallow it."""
+# -- --eval-after-train -----------------------------------------------------------------------
 
 
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM unwinds the stack as Ctrl-C does, so that everything that was opened is closed.
+def _plan_evaluation(args: argparse.Namespace, plan: Plan) -> list[str]:
+    """The arguments of the command that evaluates, checked before anything is trained.
 
-    Loops that know better (a robot's, a training's) take the signal over while they run.
+    Raises:
+        UsageError: the config has no section ``eval`` that evaluates.
+        ConfigError: what is wrong with it.
     """
+    checked = check_config(plan.config)
+    if EVALUATION not in checked.sections or EVALUATION in checked.trains:
+        others = [name for name in checked.sections if name not in checked.trains]
+        raise UsageError(
+            f"--eval-after-train needs a section {EVALUATION!r} that evaluates",
+            where=plan.config.file,
+            next=f"sections that do not train: {', '.join(others) or 'none'}",
+        )
+    argv = ["run", "--config", args.config, "--section", EVALUATION]
+    argv += ["--work-dir", str(plan.work_dir), "--log-format", args.log_format]
+    for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
+        argv += [word for value in values for word in (name, value)]
+    return argv
 
-    def handle(number: int, frame: Any) -> None:
-        raise _Terminated
 
-    try:
-        with handling(handle, signal.SIGTERM):
-            yield
-    except _Terminated:
-        raise RunFailed("stopped by SIGTERM") from None
+def _evaluate(argv: list[str], late: int = 0) -> None:
+    """Become the process that evaluates: it keeps this one's id, terminal and signals.
 
-
-@contextmanager
-def _disk_full(work_dir: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise RunFailed(
-            f"no space left on the disk while writing {error.filename or work_dir}",
-            next="make room and run the same command again, training with --resume auto",
-        ) from error
+    Args:
+        late: a signal that asked to stop when training was done: then nothing new is begun.
+    """
+    if late:
+        say(
+            f"training is complete and saved, but not evaluated: {signal.Signals(late).name} came "
+            f"at its end\n  next: fluxvla {shlex.join(argv)}",
+            sys.stderr,
+        )
+        return
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(_OF_A_RANK) and name not in _OF_ONE_RANK
+    }
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(sys.executable, [sys.executable, "-m", "fluxvla_core", *argv], environment)

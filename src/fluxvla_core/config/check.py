@@ -10,27 +10,25 @@ import difflib
 from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.config import keys
-from fluxvla_core.config.constructor import Signature
-from fluxvla_core.config.requirements import requirement_problems
-from fluxvla_core.config.resolve import SECTIONS, SLOTS, Found, resolve
-from fluxvla_core.config.tree import Config
+from fluxvla_core.config.resolve import (
+    INJECTED,
+    LOADER_KEYS,
+    LOADERS,
+    SECTIONS,
+    SLOTS,
+    Found,
+    resolve,
+)
+from fluxvla_core.config.signature import Signature
+from fluxvla_core.config.tree import Config, all_keys, join_key
 from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem
+from fluxvla_core.plugins._metadata import canonical, version
+from fluxvla_core.plugins.first_party import FIRST_PARTY
 from fluxvla_core.plugins.load import LIST
 
-INJECTED = ("cfg", "context")
-"""Constructor parameters that are filled in when the run starts; a config may not set them."""
-
-LOADERS = ("train_dataloader", "val_dataloader")
-LOADER_KEYS = (
-    "per_device_batch_size",
-    "per_device_num_workers",
-    "shuffle_episodes",
-    "dataset",
-)
-"""What the core's own train runners read of ``train_dataloader``."""
-
-_NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, "requires", "hooks")
+REQUIRES = "requires"
+"""The key of ``requires = ["fluxvla-ur>=0.3"]``: what a config says it needs (PEP 508)."""
+_NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, REQUIRES, "hooks")
 # Keys under which a table without ``type`` can only be a slip.
 _NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filters"}
 
@@ -84,26 +82,26 @@ def examine(config: Config, section: str | None = None) -> Checked:
     walk = _Walk(config)
     for name, value in config.tree.items():
         walk.top(name, value)
-    problems = walk.problems + requirement_problems(config)
+    problems = walk.problems + _requirement_problems(config)
     sections = tuple(walk.sections)
     trains = frozenset(walk.trains)
     for name in sections:
         if name in trains and section in (None, name):
             problems += _loader_problems(config, name)
     missing = walk.missing
-    # Where a section's runner is missing, only its being asked for tells that it is a section.
+    # Where a section's runner is missing, only its being asked for shows that it is a section.
     asked = section is not None and type_key(section) in {p.key for p in missing}
     if section is not None and (section in sections or asked):
         needed = _needed(config, section, section not in walk.runs, sections)
         missing = [p for p in missing if p.key.partition(".")[0] in needed]
-    order = {p: i for i, p in enumerate(keys.every(config.tree))}
+    order = {p: i for i, p in enumerate(all_keys(config.tree))}
     problems = sorted([*problems, *missing], key=lambda p: order.get(p.key, -1))
     return Checked(sections, trains, tuple(walk.uses), tuple(problems), bool(missing))
 
 
 def type_key(section: str) -> str:
     """The key that names the runner of ``section``."""
-    return keys.child(keys.child("", section), "type")
+    return join_key(join_key("", section), "type")
 
 
 def _needed(config: Config, section: str, trains: bool, sections: tuple[str, ...]) -> set[str]:
@@ -131,7 +129,7 @@ def _loader_problems(config: Config, section: str) -> list[Problem]:
         # Another runner may read keys of its own; one that nearly is one of ours is a typo.
         near = difflib.get_close_matches(name, LOADER_KEYS, 1, 0.75)
         if near and name not in LOADER_KEYS:
-            key = keys.child("train_dataloader", name)
+            key = join_key("train_dataloader", name)
             found.append(config.problem(key, f"unknown key; did you mean {near[0]!r}?"))
     return found
 
@@ -151,7 +149,7 @@ class _Walk:
 
     def top(self, name: str, value: Any) -> None:
         """One top-level name: a section, a known table, or a variable to compose from."""
-        key = keys.child("", name)
+        key = join_key("", name)
         if name in LOADERS:
             if isinstance(value, dict):
                 self.children(key, value, whole=True)
@@ -174,7 +172,7 @@ class _Walk:
     def children(self, key: str, table: dict[str, Any], whole: bool) -> None:
         for name, value in table.items():
             if name != "type":
-                self.value(keys.child(key, name), value, name, whole)
+                self.value(join_key(key, name), value, name, whole)
 
     def value(self, key: str, value: Any, slot: str, whole: bool) -> None:
         """``slot`` is the name that ``value``, or the list that it is in, stands under.
@@ -184,12 +182,12 @@ class _Walk:
         registry = SLOTS.get(slot)
         if isinstance(value, list):
             for index, item in enumerate(value):
-                self.value(keys.child(key, index), item, slot, whole)
+                self.value(join_key(key, index), item, slot, whole)
         elif registry == "hooks" and isinstance(value, str):
             self.component(key, {"type": value}, registry, whole, at=key)
         elif isinstance(value, dict):
             if "type" in value:
-                self.component(key, value, registry, whole, at=keys.child(key, "type"))
+                self.component(key, value, registry, whole, at=join_key(key, "type"))
                 return
             if whole and slot in _NEEDS_TYPE and value:
                 self.add(key, f"this table needs type = '<one of fluxvla.{registry}>'")
@@ -232,7 +230,7 @@ class _Walk:
     def arguments(self, key: str, table: dict[str, Any], signature: Signature, whole: bool) -> None:
         given = [name for name in table if name != "type"]
         for name in given:
-            inner = keys.child(key, name)
+            inner = join_key(key, name)
             if name in INJECTED:
                 self.add(inner, f"{name!r} is filled in when the run starts and cannot be set")
             elif name not in signature.names and not signature.open:
@@ -257,7 +255,7 @@ class _Walk:
             text += f" (defined at {signature.place})"
         elif near[0] in table:
             # Inherited, more often than not, so that a misspelt key stands beside the right one.
-            set_at = self.config.where(keys.child(key, near[0]))
+            set_at = self.config.where(join_key(key, near[0]))
             text += f"; did you mean {near[0]!r}? (set at {set_at})"
         else:
             text += f"; did you mean {near[0]!r}? (defined at {places[near[0]]})"
@@ -266,13 +264,13 @@ class _Walk:
 
     def _left_over(self, key: str, name: str) -> str:
         """What to do about a key that was written for another class; empty if it was not."""
-        here, there = (self.config.where(keys.child(key, n)) for n in (name, "type"))
+        here, there = (self.config.where(join_key(key, n)) for n in (name, "type"))
         if _typed(here):
             return ""
         text = f"it was written for the class that {there} replaced: "
         if _typed(there):
             return f"{text}set the whole table: --set '{key}={{type = ...}}'"
-        if keys.child(key, name) in self.config.left_over:
+        if join_key(key, name) in self.config.left_over:
             return f"{text}add _delete_=True to that table, or override the whole table {key!r}"
         return ""
 
@@ -280,3 +278,37 @@ class _Walk:
 def _typed(place: str) -> bool:
     """Whether a place is an option of the command line and no line of a file."""
     return place.startswith("--")
+
+
+def _requirement_problems(config: Config) -> list[Problem]:
+    """One problem for each requirement of ``config`` that does not hold or cannot be read."""
+    wanted = config.tree.get(REQUIRES)
+    if wanted is None:
+        return []
+    if not isinstance(wanted, list) or not all(isinstance(text, str) for text in wanted):
+        return [
+            config.problem(REQUIRES, f"must be a list like ['fluxvla-ur>=0.3'], got {wanted!r}")
+        ]
+    found = [(join_key(REQUIRES, i), _unmet(text)) for i, text in enumerate(wanted)]
+    return [config.problem(key, what) for key, what in found if what]
+
+
+def _unmet(text: str) -> str | None:
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    try:
+        requirement = Requirement(text)
+    except InvalidRequirement as error:
+        return f"{text!r} is no requirement (PEP 508): {str(error).splitlines()[0]}"
+    if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+        return None
+    have = version(requirement.name)
+    if have is None:
+        command = f": pip install {requirement.name}"
+        # Only names that we ship are put into a command; see plugins.first_party.
+        return f"needs {text}, which is not installed" + (
+            command if canonical(requirement.name) in FIRST_PARTY else ""
+        )
+    if not requirement.specifier.contains(have, prereleases=True):
+        return f"needs {text}, but {requirement.name} {have} is installed"
+    return None

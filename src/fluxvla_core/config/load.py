@@ -5,20 +5,26 @@ from __future__ import annotations
 import ast
 import difflib
 import json
+import os
 import types
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.config import keys
-from fluxvla_core.config.merge import join_bases, merge
-from fluxvla_core.config.py_positions import py_positions
-from fluxvla_core.config.tree import Config, plain, shown, strip
+from fluxvla_core.config.positions import py_positions
+from fluxvla_core.config.tree import Config, all_keys, join_bases, merge, plain, shown, strip
 from fluxvla_core.errors import ConfigError, Problem
-from fluxvla_core.plugins.locate import locate
+from fluxvla_core.plugins.load import locate
+from fluxvla_core.untrusted import AT_MOST, read_bytes
 
 BASE = "_base_"
 FORMAT = "fluxvla-config-1"
 SUFFIXES = (".py", ".toml", ".json")
+DEEPEST = 100
+"""Levels of tables and lists in a config; this project's own have fewer than 10."""
+MOST_KEYS = 5_000
+"""Of all tables together; this project's own configs have fewer than 500."""
+_LONGEST_CHAIN = 50  # files
+_LONGEST_FILE = 1 << 20  # bytes
 
 
 def load_config(path: str | Path) -> Config:
@@ -32,15 +38,30 @@ def load_config(path: str | Path) -> Config:
         ConfigError: it is missing, no file, of another kind, has a syntax error, raises, holds
             something else than plain data, or its inheritance does not work out.
     """
-    return _load(Path(path), ())
+    return _load(Path(path), (), {})
 
 
-def _load(path: Path, chain: tuple[Path, ...]) -> Config:
+def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:
+    """``path``, which the files of ``chain`` inherit; ``loaded`` holds those that were read by now.
+
+    Each file is read once: of 25 files that each name the next one twice, the last would else be
+    read 16 million times.
+    """
     _check_there(path)
-    real = path.resolve()
+    real = Path(os.path.realpath(path))
     if real in chain:
         names = " -> ".join(shown(p) for p in (*chain[chain.index(real) :], real))
         raise ConfigError(f"{BASE} goes round in a circle: {names}", where=shown(chain[-1]))
+    if len(chain) >= _LONGEST_CHAIN:
+        raise ConfigError(
+            f"a chain of more than {_LONGEST_CHAIN} files by {BASE}", where=shown(chain[0])
+        )
+    if real not in loaded:
+        loaded[real] = _load_file(path, (*chain, real), loaded)
+    return loaded[real]
+
+
+def _load_file(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:
     name = shown(path)
     if path.suffix == ".json":
         return _from_json(_read(path), name)
@@ -59,8 +80,8 @@ def _load(path: Path, chain: tuple[Path, ...]) -> Config:
     places = {k: v for k, v in own.origins.items() if k.partition(".")[0] != BASE}
     if not listed:
         return Config(strip(own.tree), places, name)
-    loaded = [_load(_base_path(b, path, own.where(BASE)), (*chain, real)) for b in listed]
-    return merge(join_bases(loaded), Config(own.tree, places, name))
+    found = [_load(_base_path(b, path, own.where(BASE)), chain, loaded) for b in listed]
+    return merge(join_bases(found), Config(own.tree, places, name))
 
 
 def _check_there(path: Path) -> None:
@@ -92,14 +113,17 @@ def _check_there(path: Path) -> None:
 
 
 def _read(path: Path) -> str:
+    # A resolved config may list episodes by the thousand, each with its place; people's do not.
+    at_most = AT_MOST if path.suffix == ".json" else _LONGEST_FILE
     try:
-        return path.read_text(encoding="utf-8")
+        text = read_bytes(path, ConfigError, at_most=at_most).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"not a text file in UTF-8 (byte {error.start})", where=shown(path)
         ) from error
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", where=shown(path)) from error
+    except ConfigError as error:
+        raise ConfigError(error.what, where=shown(path)) from error
+    return text.replace("\r\n", "\n")
 
 
 def _base_path(base: str, child: Path, where: str) -> Path:
@@ -121,6 +145,28 @@ def _base_path(base: str, child: Path, where: str) -> Path:
     if not path.exists():
         raise ConfigError(f"{BASE} names {base!r}, but {package} has no {inside!r}", where=where)
     return path
+
+
+def _check_size(values: Any, name: str) -> None:
+    """Refuse what is larger than people write: checking it, and listing what is wrong, would take
+    minutes, and recursion over it could end in the middle."""
+    level, count = [values], 0
+    for _ in range(DEEPEST + 1):
+        count += sum(len(table) for table in level if isinstance(table, dict))
+        level = [
+            item
+            for table in level
+            for item in (table.values() if isinstance(table, dict) else table)
+            if isinstance(item, (dict, list, tuple))
+        ]
+    if level:
+        raise _too_deep(name)
+    if count > MOST_KEYS:
+        raise ConfigError(f"{count} keys; {MOST_KEYS} are the most that are read", where=name)
+
+
+def _too_deep(name: str) -> ConfigError:
+    return ConfigError(f"tables and lists are nested deeper than {DEEPEST}", where=name)
 
 
 def _finish(values: dict[str, Any], origins: dict[str, str], name: str) -> Config:
@@ -148,6 +194,8 @@ def _from_python(text: str, name: str, path: Path) -> Config:
         ) from error
     except ValueError as error:  # null bytes, before Python 3.12
         raise ConfigError(f"not Python: {error}", where=name) from error
+    except (RecursionError, MemoryError) as error:
+        raise _too_deep(name) from error
     values: dict[str, Any] = {"__file__": str(path.resolve()), "__name__": "fluxvla_config"}
     try:
         exec(code, values)
@@ -159,6 +207,7 @@ def _from_python(text: str, name: str, path: Path) -> Config:
             where=f"{name}:{_line(error, name)}",
         ) from error
     data = {k: v for k, v in values.items() if k == BASE or _is_data(k, v)}
+    _check_size(data, name)
     return _finish(data, py_positions(tree, name), name)
 
 
@@ -186,7 +235,7 @@ def _quote(text: str | None) -> str:
 def _from_toml(text: str, name: str) -> Config:
     import tomli
 
-    from fluxvla_core.config.toml_positions import toml_positions
+    from fluxvla_core.config.positions import toml_positions
 
     try:
         values = tomli.loads(text)
@@ -196,6 +245,11 @@ def _from_toml(text: str, name: str) -> Config:
             f"syntax error: {error.msg} (column {error.colno}){_quote(line[0] if line else None)}",
             where=f"{name}:{error.lineno}",
         ) from error
+    except ValueError as error:  # a whole number of thousands of digits
+        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
+    except RecursionError as error:
+        raise _too_deep(name) from error
+    _check_size(values, name)
     return _finish(values, toml_positions(text, name), name)
 
 
@@ -204,17 +258,22 @@ def _from_json(text: str, name: str) -> Config:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ConfigError(f"syntax error: {error.msg}", where=f"{name}:{error.lineno}") from error
+    except ValueError as error:  # a whole number of thousands of digits
+        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
+    except RecursionError as error:
+        raise _too_deep(name) from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else None
         raise ConfigError(
             f"a .json config is the config.resolved.json of a run (format {FORMAT!r}), "
-            f"this has format {found!r}",
+            f"this has format {found if found is None else str(found)[:80]!r}",
             where=name,
             next="write configs as .py or .toml",
         )
     tree, origins = data.get("config"), data.get("origins", {})
     if not isinstance(tree, dict) or not isinstance(origins, dict):
         raise ConfigError("'config' and 'origins' must be tables", where=name)
+    _check_size(tree, name)
     problems = tuple(
         Problem(name, key, f"an origin must be 'file:line', got {value!r}")
         for key, value in origins.items()
@@ -222,4 +281,5 @@ def _from_json(text: str, name: str) -> Config:
     )
     if problems:
         raise ConfigError.from_problems(problems)
-    return Config(tree, {k: v for k, v in origins.items() if k in set(keys.every(tree))}, name)
+    there = set(all_keys(tree))
+    return _finish(tree, {k: v for k, v in origins.items() if k in there}, name)

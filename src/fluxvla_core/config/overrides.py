@@ -5,12 +5,23 @@ from __future__ import annotations
 import copy
 import difflib
 import re
+import shlex
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from fluxvla_core.config import keys
-from fluxvla_core.config.tree import Config, plain
+from fluxvla_core.config.resolve import INJECTED, table_signature
+from fluxvla_core.config.tree import (
+    NO_TEXT,
+    Config,
+    all_keys,
+    is_text,
+    is_within,
+    join_key,
+    parent_key,
+    plain,
+    split_key,
+)
 from fluxvla_core.errors import ConfigError, Problem
 
 _PYTHON = {"True": True, "False": False, "None": None}
@@ -20,10 +31,11 @@ _SPLIT = re.compile(r"\s*(\+?)=\s*")
 def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
     """``config`` with each ``key=value`` set, in order.
 
-    ``key`` is dotted, with list indices (``transforms.0.height``) and ``\\.`` for a dot in a name,
-    and must exist; ``key+=value`` adds a key, or appends to a list. A value is TOML (numbers,
-    ``true``, ``"text"``, ``[1, 2]``, ``{type = "X"}``), Python's ``True``, ``False`` and ``None``,
-    or else a bare word or sentence taken as it is. A table replaces the one that is there.
+    ``key`` is dotted, with list indices (``transforms.0.height``) and ``\\.`` for a dot in a name.
+    It is in the config, or the class of its table takes it; ``key+=value`` appends to a list, or
+    adds a key of which nothing is known. A value is TOML (numbers, ``true``, ``"text"``,
+    ``[1, 2]``, ``{type = "X"}``), Python's ``True``, ``False`` and ``None``, or else a bare word
+    or sentence taken as it is. A table replaces the one that is there.
 
     Raises:
         ConfigError: all that do not fit, with a did-you-mean.
@@ -34,12 +46,12 @@ def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
         place = f"--set {text}"
         try:
             key, add, value = _parse(text)
-            written = _put(tree, key, value, add)
+            written = _put(tree, key, value, add, text)
         except _BadOverride as bad:
             problems.append(Problem(place, "", str(bad)))
             continue
         for key in written:
-            for old in [k for k in origins if keys.within(k, key)]:
+            for old in [k for k in origins if is_within(k, key)]:
                 del origins[old]
             origins[key] = place
     if problems:
@@ -63,6 +75,8 @@ def parse_value(text: str) -> Any:
     import tomli
 
     text = text.strip()
+    if not is_text(text):
+        raise _BadOverride(NO_TEXT)
     if text in _PYTHON:
         return _PYTHON[text]
     if "\n" in text:
@@ -78,6 +92,10 @@ def parse_value(text: str) -> Any:
                 f"{text!r} is no TOML number; write it as {number}, or '\"{text}\"' for text"
             ) from error
         return text
+    except (ValueError, RecursionError) as error:
+        raise _BadOverride(
+            "the value is nested too deeply, or a number of thousands of digits"
+        ) from error
     found: list[tuple[str, str]] = []
     data = plain(value, "", found)
     return text if found else data  # TOML's dates and times: keep what was typed
@@ -92,14 +110,14 @@ def _number(text: str) -> float | int | None:
     return int(number) if number.is_integer() else number
 
 
-def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> list[str]:
-    """Set ``key`` in ``tree``; returns the keys that now hold what was given."""
-    *above, last = keys.split(key)
+def _put(tree: dict[str, Any], key: str, value: Any, add: bool, text: str) -> list[str]:
+    """Set ``key`` in ``tree`` as ``text`` says; returns the keys that now hold what was given."""
+    *above, last = split_key(key)
     at: Any = tree
     done = ""
-    for part in above:
-        at = _step(tree, at, part, key)
-        done = keys.child(done, part)
+    for depth, part in enumerate(above):
+        at = _step(tree, at, above[:depth], part, key, text)
+        done = join_key(done, part)
     if isinstance(at, list):
         index = _index(at, last, key)
         at[index], written = _added(at[index], value, key) if add else (value, [key])
@@ -107,7 +125,7 @@ def _put(tree: dict[str, Any], key: str, value: Any, add: bool) -> list[str]:
     if not isinstance(at, dict):
         raise _BadOverride(f"{done!r} is a single value, it has no {last!r}")
     if last not in at and not add:
-        raise _BadOverride(f"no {key!r} in the config{_hint(tree, key, last)}")
+        _check_taken(at, above, last, key, text)
     if last not in at or not add:
         at[last] = value
         return [key]
@@ -119,31 +137,58 @@ def _added(old: Any, value: Any, key: str) -> tuple[Any, list[str]]:
     """``value`` added to what ``key`` holds, and the keys of what is new."""
     if isinstance(old, list):
         more = value if isinstance(value, list) else [value]
-        return [*old, *more], [keys.child(key, len(old) + i) for i in range(len(more))]
+        return [*old, *more], [join_key(key, len(old) + i) for i in range(len(more))]
     if isinstance(old, dict) and isinstance(value, dict):
-        return {**old, **value}, [keys.child(key, name) for name in value]
+        return {**old, **value}, [join_key(key, name) for name in value]
     raise _BadOverride(f"it is there already, as {old!r}; += adds a key or appends, = replaces")
 
 
-def _step(tree: dict[str, Any], at: Any, part: str, key: str) -> Any:
+def _step(tree: dict[str, Any], at: Any, path: list[str], part: str, key: str, text: str) -> Any:
     if isinstance(at, list):
         return at[_index(at, part, key)]
     if isinstance(at, dict) and part in at:
         return at[part]
-    raise _BadOverride(f"no {key!r} in the config{_hint(tree, key, None)}")
+    signature = table_signature(path, at) if isinstance(at, dict) else None
+    if signature is not None and part in signature.names:
+        whole = ".".join(split_key(key)[: len(path) + 1])
+        inner = key[len(whole) + 1 :]
+        raise _BadOverride(
+            f"no {whole!r} in the config yet: give the whole table, "
+            f"--set '{whole}={{{inner} = ...}}'"
+        )
+    near = difflib.get_close_matches(key, list(all_keys(tree)), 1, 0.75)
+    hint = _meant(text, near[0]) if near else ""
+    raise _BadOverride(f"no {key!r} in the config{hint}")
 
 
 def _index(at: list[Any], part: str, key: str) -> int:
-    if not part.isdigit():
+    if not (part.isascii() and part.isdigit() and len(part) <= 9):
         raise _BadOverride(f"{key!r}: {part!r} must be a number, it counts items of a list from 0")
     if int(part) >= len(at):
         raise _BadOverride(f"{key!r}: there is no item {part}, the list has {len(at)}")
     return int(part)
 
 
-def _hint(tree: dict[str, Any], key: str, missing: str | None) -> str:
-    near = difflib.get_close_matches(key, list(keys.every(tree)), 1, 0.75)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    if missing is not None:
-        hint += f" [to add a new key: --set {key}+=...]"
-    return hint
+def _check_taken(table: dict[str, Any], above: list[str], name: str, key: str, text: str) -> None:
+    """Refuse a new ``name`` in ``table``, unless its class is known to take it."""
+    signature = table_signature(above, table)
+    missing, adding = f"no {key!r} in the config", f" [to add it: {_as_set(text, key, '+=')}]"
+    takes = {n for n in signature.names if n not in INJECTED} if signature is not None else set()
+    if name in takes:
+        return
+    near = difflib.get_close_matches(name, {*takes, *table}, 1)
+    hint = _meant(text, join_key(parent_key(key), near[0])) if near else ""
+    if signature is not None and not signature.open:
+        missing, adding = f"{missing}, and {signature.name} takes no {name!r}", ""
+    raise _BadOverride(missing + hint + adding)
+
+
+def _meant(text: str, key: str) -> str:
+    return f"; did you mean {_as_set(text, key, '=')}?"
+
+
+def _as_set(text: str, key: str, sign: str) -> str:
+    """The override ``text`` for another key, as it is to be typed."""
+    match = _SPLIT.search(text)
+    assert match is not None  # it was parsed
+    return f"--set {shlex.quote(f'{key}{sign}{text[match.end() :]}')}"

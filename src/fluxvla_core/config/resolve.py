@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from fluxvla_core.config import constructor
-from fluxvla_core.config.constructor import Signature
+from fluxvla_core.config.inspection import inspect_signature
+from fluxvla_core.config.signature import Parameter, Signature, read_signature
 from fluxvla_core.config.source import Opaque, flaw, lacks
 from fluxvla_core.config.source import find as find_source
 from fluxvla_core.contracts.check import check_api
-from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
-from fluxvla_core.plugins import known
+from fluxvla_core.errors import (
+    AmbiguousPlugin,
+    IncompatiblePlugin,
+    LoadFailed,
+    MissingPlugin,
+    PluginError,
+)
+from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical
-from fluxvla_core.plugins.groups import PREFIX
-from fluxvla_core.plugins.load import LIST, find, unmet
-from fluxvla_core.plugins.locate import locate
+from fluxvla_core.plugins.load import LIST, find, locate, unmet
 from fluxvla_core.plugins.registry import BY_NAME
+from fluxvla_core.registries import PREFIX
 
 SECTIONS = ("runner", "inference", "eval")
 
@@ -44,6 +50,18 @@ SLOTS: Mapping[str, str] = {
     "policy": "policies",
 }
 """Key -> the registry that a table under it is built from."""
+
+INJECTED = ("cfg", "context")
+"""Constructor parameters that are filled in when the run starts; a config may not set them."""
+
+LOADERS = ("train_dataloader", "val_dataloader")
+LOADER_KEYS = (
+    "per_device_batch_size",
+    "per_device_num_workers",
+    "shuffle_episodes",
+    "dataset",
+)
+"""What the core's own train runners read of ``train_dataloader``."""
 
 SEARCHED = tuple(name for name in BY_NAME if name != "commands")
 
@@ -82,10 +100,25 @@ def resolve(name: str, registry: str | None = None) -> Found:
             )
     here = BY_NAME[registry].registered(name)
     if here is not None:
-        signature = constructor.of_class(here)
+        signature = inspect_signature(here)
         return Found(registry, name, "registered in this process", None, signature)
     plugin = find(PREFIX + registry, name, tuple(BY_NAME[registry]))
     return installed(plugin)
+
+
+def table_signature(path: Sequence[str], table: Mapping[str, Any]) -> Signature | None:
+    """What the table at ``path`` of a config takes; None where that is not known."""
+    if len(path) == 1 and path[0] in LOADERS:
+        takes = tuple(Parameter(name, False, "") for name in LOADER_KEYS)
+        return Signature(path[0], "", takes, open=True)
+    kind = table.get("type")
+    if not isinstance(kind, str):
+        return None
+    slots = [part for part in path if not part.isdigit()]
+    try:
+        return resolve(kind, SLOTS.get(slots[-1]) if slots else None).signature
+    except PluginError:  # the check of the whole config says what is wrong with it
+        return None
 
 
 def installed(plugin: Plugin) -> Found:
@@ -94,7 +127,7 @@ def installed(plugin: Plugin) -> Found:
     why = unmet(plugin)
     if why:
         raise IncompatiblePlugin(why)
-    signature = constructor.of_plugin(plugin)
+    signature = read_signature(plugin)
     if signature is None:
         if locate(plugin.module) is None:
             raise LoadFailed(
@@ -130,14 +163,14 @@ def _only_registry(name: str) -> str:
         )
     short = name.rpartition(":")[2]
     for registry in SEARCHED:
-        owner = known.owner(registry, short)
+        owner = first_party.owner(registry, short)
         if owner:
             raise MissingPlugin(
                 f"no plugin named {name!r}; {owner} provides it and is not installed: "
                 f"pip install {owner}",
                 next=LIST,
             )
-    names = {n for r in SEARCHED for n in (*BY_NAME[r], *known.names(r))}
+    names = {n for r in SEARCHED for n in (*BY_NAME[r], *first_party.names(r))}
     near = difflib.get_close_matches(short, sorted(names), 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise MissingPlugin(f"no plugin named {name!r} in any registry{hint}", next=LIST)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from fluxvla_core.plugins.locate import locate, place
+from fluxvla_core.plugins.load import locate, place
 
 # Bases that no constructor parameter of ours comes from; parsing torch would take a second.
 _PLAIN = frozenset(
@@ -98,7 +98,7 @@ def parse(name: str) -> Module | None:
     try:
         tree = ast.parse(path.read_bytes(), str(path))
     except (SyntaxError, ValueError):
-        return None  # ``flaw`` tells
+        return None  # ``flaw`` says why
     names: dict[str, ast.AST] = {}
     stars = []
     for node in _top(tree.body):
@@ -172,12 +172,31 @@ def find(module: str, dotted: str, seen: frozenset[tuple[str, str]] = frozenset(
 
 
 def _inside(parsed: Module, node: ast.ClassDef, rest: str, whole: str) -> Base:
-    for part in filter(None, rest.split(".")):
-        inner = [n for n in node.body if isinstance(n, ast.ClassDef) and n.name == part]
-        if not inner:
-            return Opaque(whole)
-        node = inner[-1]
-    return Source(parsed, node)
+    """The class ``rest`` in the body of ``node``, or of a class in there that is named."""
+    if not rest:
+        return Source(parsed, node)
+    part, _, rest = rest.partition(".")
+    inner = member(Source(parsed, node), part)
+    if isinstance(inner, Source) and isinstance(inner.node, ast.ClassDef):
+        return _inside(inner.module, inner.node, rest, whole)
+    return Opaque(whole)
+
+
+def member(cls: Source, name: str) -> Base | None:
+    """What the class attribute ``name`` in the body of ``cls`` is; None if it states none.
+
+    It is a nested class, or names a class: ``Name = module.Class``.
+    """
+    found: Base | None = None
+    for node in cls.node.body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            found = Source(cls.module, node)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(t, ast.Name) and t.id == name for t in targets):
+                named = dotted_name(node.value)
+                found = find(cls.module.name, named) if named else Opaque(ast.unparse(node.value))
+    return found
 
 
 def _imported(

@@ -1,35 +1,40 @@
-"""The contracts between the core and its plugins."""
+"""The contracts between the core and its plugins, as base classes."""
 
-from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
-from fluxvla_core.contracts.protocols import (
-    API,
-    Clock,
-    Command,
+from fluxvla_core.contracts.policy import Actor, Continuation, Policy
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.robot import ActionFilter, Clock, Operator
+from fluxvla_core.contracts.runner import Command, Hook, Runner, TrainRunner
+from fluxvla_core.contracts.training import (
+    VLA,
+    Collator,
     Dataset,
-    Operator,
-    Policy,
+    Metric,
+    Optimizer,
     RandomTransform,
-    Runner,
-    TrainRunner,
+    Tokenizer,
     Transform,
 )
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 
 __all__ = [
-    "API",
     "STATE",
+    "VLA",
+    "ActionFilter",
     "Actor",
     "Clock",
+    "Collator",
     "Command",
     "Continuation",
     "Dataset",
     "Environment",
     "EnvironmentSpec",
     "Frame",
+    "Hook",
+    "Metric",
     "Observation",
     "Operator",
+    "Optimizer",
     "Policy",
     "RandomTransform",
     "Reporter",
@@ -38,6 +43,7 @@ __all__ = [
     "SilentReporter",
     "Step",
     "TaskSpec",
+    "Tokenizer",
     "TrainRunner",
     "Transform",
 ]

@@ -1,28 +1,80 @@
 """Explicit contract checks, made when a class is loaded.
 
-``isinstance`` on a runtime protocol accepts a method with the wrong arguments and an attribute
-that is no method at all; here every method must be there, be callable, and take what the core
-will pass.
+``isinstance`` accepts a method with the wrong arguments and an attribute that is no method at all;
+here every method of the contract's base class must be there, be callable, and take what the core
+will pass. That follows from the base class itself: its abstract and its optional methods, and their
+signatures.
 """
 
 from __future__ import annotations
 
+import functools
+import importlib
 import inspect
-from typing import Any
+import math
+from collections.abc import Mapping
+from inspect import Parameter
+from typing import Any, SupportsFloat, SupportsIndex, cast
 
-from fluxvla_core.contracts.methods import (
-    FULL_OPERATOR,
-    MAY_HAVE,
-    NEEDS,
-    RANDOM_TRANSFORM,
-    TRAIN_RUNNER,
-    Arguments,
-    Methods,
+from fluxvla_core.contracts.contract import (
+    Contract,
+    abstract_methods,
+    implements,
+    public_methods,
 )
-from fluxvla_core.contracts.protocols import API
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.runner import TrainRunner
+from fluxvla_core.contracts.training import RandomTransform
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
+from fluxvla_core.registries import BY_NAME
+from fluxvla_core.spec.embodiment import EmbodimentSpec
 
+Arguments = int | tuple[str, ...] | None
+"""What a method is given, without ``self``: so many positional arguments, keywords of these names,
+or (None) what the class itself says that it wants."""
+
+Methods = Mapping[str, Arguments]
+
+ANY_OTHER = "any other"
+"""No name that a parameter can have: only ``**more`` takes it."""
+ON_A_ROBOT = ("embodiment", "action_rate_hz", "horizon")
+"""What a policy says of itself, to drive a robot."""
 _MISSING = "is missing"
+
+
+@functools.cache
+def contract_of(registry: str) -> type[Contract]:
+    """The base class of ``registry``; where it has none, ``Contract``, which asks for nothing."""
+    module, _, name = (BY_NAME[registry].contract or "").partition(":")
+    if not module:
+        return Contract
+    return cast("type[Contract]", getattr(importlib.import_module(module), name))
+
+
+def needs(contract: type[Contract], cls: type) -> tuple[Methods, ...]:
+    """Sets of methods, one of which ``cls`` must have as a whole."""
+    abstract = abstract_methods(contract)
+    sets = (abstract,) if abstract and issubclass(cls, contract) else contract._enough(cls)
+    every = methods(contract)
+    return tuple({name: every.get(name) for name in names} for names in sets)
+
+
+def methods(contract: type[Contract]) -> Methods:
+    """Every method of ``contract``, required and optional, with what it is given."""
+    found = {name: _arguments(contract, f) for name, f in public_methods(contract).items()}
+    return {**found, **contract._besides}
+
+
+def _arguments(contract: type[Contract], function: Any) -> Arguments:
+    if contract._any_arguments:
+        return None
+    taken = list(inspect.signature(function).parameters.values())[1:]
+    keywords = [p.name for p in taken if p.kind is Parameter.KEYWORD_ONLY]
+    if keywords:
+        more = any(p.kind is Parameter.VAR_KEYWORD for p in taken)
+        return (*keywords, ANY_OTHER) if more else tuple(keywords)
+    return len(taken)
 
 
 def check_class(registry: str, cls: Any, origin: str) -> None:
@@ -38,10 +90,13 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
             f"{origin}: {name} in fluxvla.{registry} is a {type(cls).__name__}, not a class"
         )
     check_api(registry, cls, origin)
+    contract = _contract_for(registry, cls)
     problems = [] if registry != "vlas" or _is_module(cls) else ["it is no torch.nn.Module"]
-    problems += _problems(cls, _needs(registry, cls))
-    besides = MAY_HAVE.get(registry, {})
-    problems += _wrong(cls, {m: n for m, n in besides.items() if _lookup(cls, m) is not None})
+    problems += _problems(contract, cls, needs(contract, cls))
+    named = {m: n for m, n in methods(contract).items() if not m.startswith("__")}
+    problems += _wrong(
+        contract, cls, {m: n for m, n in named.items() if _lookup(contract, cls, m) is not None}
+    )
     if problems:
         raise LoadFailed(
             f"{origin}: {name} does not fulfil the contract of fluxvla.{registry}: "
@@ -50,17 +105,17 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
         )
 
 
-def _needs(registry: str, cls: type) -> tuple[Methods, ...]:
+def _contract_for(registry: str, cls: type) -> type[Contract]:
     if registry == "runners" and is_train_runner(cls):
-        return (TRAIN_RUNNER,)
+        return TrainRunner
     if registry == "transforms" and getattr(cls, "needs_rng", False):
-        return (RANDOM_TRANSFORM,)
-    return NEEDS.get(registry, ({},))
+        return RandomTransform
+    return contract_of(registry)
 
 
-def _problems(cls: type, sets: tuple[Methods, ...]) -> list[str]:
+def _problems(contract: type[Contract], cls: type, sets: tuple[Methods, ...]) -> list[str]:
     """What keeps ``cls`` from having one of ``sets``; nothing if it has one."""
-    tried = [_wrong(cls, one) for one in sets]
+    tried = [_wrong(contract, cls, one) for one in sets]
     if not all(tried):
         return []
     if len(sets) == 1:
@@ -70,8 +125,8 @@ def _problems(cls: type, sets: tuple[Methods, ...]) -> list[str]:
     return [f"it needs {choice}", *there]
 
 
-def _wrong(cls: type, methods: Methods) -> list[str]:
-    return [text for m, n in methods.items() if (text := _method_problem(cls, m, n))]
+def _wrong(contract: type[Contract], cls: type, named: Methods) -> list[str]:
+    return [text for m, n in named.items() if (text := _method_problem(contract, cls, m, n))]
 
 
 def _is_module(cls: type) -> bool:
@@ -87,9 +142,9 @@ def check_api(registry: str, cls: type, origin: str) -> None:
     Raises:
         IncompatiblePlugin: too old or too new, with the upgrade that mends it.
     """
-    speaks = API.get(registry)
+    speaks = BY_NAME[registry].api
     written = getattr(cls, "api", None)
-    if speaks is None or written is None:
+    if written is None:
         return
     have, want = _version(speaks), _version(str(written))
     if want is None or have is None:
@@ -115,30 +170,96 @@ def is_train_runner(cls: type) -> bool:
 def missing_operator_methods(operator: object) -> list[str]:
     """What an operator of the specification's shape lacks of the full contract."""
     cls = type(operator)
-    lacks = [f"{m}()" for m, n in FULL_OPERATOR.items() if _method_problem(cls, m, n)]
+    full = {m: n for m, n in methods(Operator).items() if m in abstract_methods(Operator)}
+    lacks = [f"{m}()" for m, n in full.items() if _method_problem(Operator, cls, m, n)]
     if not hasattr(operator, "embodiment"):
         lacks.insert(0, "embodiment")
     return lacks
 
 
-def _lookup(cls: type, method: str) -> Any:
+def check_operator(operator: object) -> None:
+    """Check an operator that was built: its class, and that its own attributes hide no method.
+
+    A constructor that says ``self.stop = threading.Event()`` takes the robot its ``stop()``.
+
+    Raises:
+        LoadFailed, IncompatiblePlugin: see ``check_class``.
+    """
+    cls = type(operator)
+    check_class("operators", cls, f"{cls.__module__}:{cls.__qualname__}")
+    own = getattr(operator, "__dict__", {})
+    named = [m for m in methods(Operator) if m in own]
+    hidden = [f"{m} is a {type(own[m]).__name__}" for m in named if not callable(own[m])]
+    if hidden:
+        raise LoadFailed(
+            f"the constructor of {cls.__name__} hides methods of its class: {', '.join(hidden)}",
+            next="give the attribute another name",
+        )
+
+
+def check_policy(policy: Any) -> None:
+    """Check that a policy says of itself what driving a robot with it takes.
+
+    Raises:
+        LoadFailed: it has no ``embodiment``, ``action_rate_hz`` or ``horizon``, or one that cannot
+            be; or its ``cameras`` are no names.
+    """
+    said = [n for n in ON_A_ROBOT if hasattr(policy, n) and implements(policy, Actor, n)]
+    lacks = [name for name in ON_A_ROBOT if name not in said]
+    name = type(policy).__name__
+    if lacks:
+        raise LoadFailed(
+            f"{name} cannot drive a robot: it has no {', '.join(lacks)}",
+            cause="it is for evaluations, whose environments say what it does not",
+            next="choose another policy, or see docs/writing-a-plugin.md for what one has",
+        )
+    problems = chunk_problems(policy.action_rate_hz, policy.horizon)
+    if not isinstance(policy.embodiment, EmbodimentSpec):
+        problems.append(f"embodiment is a {type(policy.embodiment).__name__}, no EmbodimentSpec")
+    cameras = getattr(policy, "cameras", ())
+    if not isinstance(cameras, (tuple, list)) or not all(isinstance(c, str) for c in cameras):
+        problems.append(f"cameras is {cameras!r}, and no tuple of names")
+    if problems:
+        raise LoadFailed(f"{name} cannot drive a robot: {'; '.join(problems)}")
+
+
+def chunk_problems(action_rate_hz: object, horizon: object) -> list[str]:
+    """Why chunks of so many actions at this rate cannot be played, in words."""
+    problems = []
+    rate = action_rate_hz if isinstance(action_rate_hz, SupportsFloat) else math.nan
+    if isinstance(action_rate_hz, (bool, str)) or not 0.0 < float(rate) < math.inf:
+        problems.append(f"action_rate_hz is {action_rate_hz!r}; it must be positive and finite")
+    if isinstance(horizon, bool) or not isinstance(horizon, SupportsIndex) or int(horizon) < 1:
+        problems.append(f"horizon is {horizon!r}; it must be a whole number of at least 1")
+    return problems
+
+
+def _lookup(contract: type[Contract], cls: type, method: str) -> Any:
     """What ``cls`` or a base defines as ``method``, as it stands there; None if nothing.
 
-    Not what its metaclass has: every class is callable, and its objects need not be.
+    Not what its metaclass has: every class is callable, and its objects need not be. Nor what the
+    contract has: that is either a default, or abstract.
     """
-    found = next((vars(base)[method] for base in cls.__mro__ if method in vars(base)), None)
+    bases = [base for base in cls.__mro__ if base not in contract.__mro__]
+    found = next((vars(base)[method] for base in bases if method in vars(base)), None)
     # Stands in torch.nn.Module for the forward that a subclass is to bring.
     return None if getattr(found, "__name__", "") == "_forward_unimplemented" else found
 
 
-def _method_problem(cls: type, method: str, arguments: Arguments) -> str | None:
-    found = _lookup(cls, method)
+def _method_problem(
+    contract: type[Contract], cls: type, method: str, arguments: Arguments
+) -> str | None:
+    found = _lookup(contract, cls, method)
     if found is None:
         return f"{method}() {_MISSING}"
     bound: list[object] = [] if isinstance(found, staticmethod) else [cls]
     function = found.__func__ if isinstance(found, (staticmethod, classmethod)) else found
     if not callable(function):
         return f"{method} is a {type(function).__name__}, not a method"
+    if inspect.iscoroutinefunction(function) or inspect.isasyncgenfunction(function):
+        return f"{method}() is async, and nobody awaits it: called, it does nothing"
+    if getattr(function, "__isabstractmethod__", False):
+        return f"{method}() is abstract"
     if arguments is None:
         return None
     names = arguments if isinstance(arguments, tuple) else ()

@@ -7,10 +7,12 @@ depends neither on the process that ran it nor on the episodes before it.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
@@ -85,59 +87,66 @@ class Step:
     behaviours: Mapping[str, bool] | None = None
 
 
-class Environment(Protocol):
-    """Tasks to be done, in the process that made it.
+class Environment(Contract):
+    """Simulated tasks, in the process that made them."""
 
-    It may have ``state_hash() -> str``, equal for equal courses of an episode (the states of all
-    steps are hashed where there is none), and what :class:`Retellable` adds.
-    """
+    expert: ClassVar[str | None] = None
+    """``type`` of the registered policy that does its tasks."""
 
-    @property
-    def spec(self) -> EnvironmentSpec: ...
+    @required
+    def spec(self) -> EnvironmentSpec:
+        """Valid before anything is built."""
 
-    @property
+    @required
     def state(self) -> npt.NDArray[np.float64]:
         """``(state_dim,)`` now; what ``observe`` gives as ``qpos`` is this, rounded."""
 
+    @abstractmethod
     def reset(self, seed: int, task: str) -> None:
         """Begin an episode of ``task``; everything random in it follows from ``seed``."""
 
+    @abstractmethod
     def step(self, action: npt.NDArray[np.float64]) -> Step:
         """One control step with an action ``(dim,)`` in the embodiment's units."""
 
+    @abstractmethod
     def observe(self, cameras: Sequence[Camera]) -> Observation:
         """What is there now, with a picture of each camera, in its size where that can be had.
+
+        ``task_description`` is what the policy is told: the task's instruction, or words of the
+        environment's own for this episode.
 
         Called when somebody looks, not after every step: drawing is what takes the time.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Give everything back; any number of times."""
 
+    # -- optional abilities ----------------------------------------------------------------------
 
-class Retellable(Environment, Protocol):
-    """An environment in whose scenes something else could be asked for, too."""
+    def divergence(self) -> str | None:
+        """What went wrong in the simulation since the last reset; asked after every step."""
+        return None
+
+    def drawn_by(self) -> str:
+        """What renders its pictures, for results: OpenGL backend and renderer; "" if unknown."""
+        return ""
+
+    @attribute
+    def distributions(self) -> Sequence[str]:
+        """Installed packages that outcomes follow from, beside those that its own requires."""
+        return ()
+
+    def state_hash(self) -> str | None:
+        """Equal for equal courses of an episode; None: the states of all steps are hashed."""
+        return None
 
     def others(self, task: str) -> Sequence[str]:
         """Tasks that could also be done in the scene of ``task``; none of them is it."""
+        return ()
 
     def tell(self, task: str) -> None:
         """After ``reset``: the policy is told the instruction of ``task`` in this episode, which
         ends when that is done, too. ``success`` stays that of the scene's own task."""
-
-
-class Actor(Protocol):
-    """What an environment needs of a policy.
-
-    The Policy contract's ``embodiment``, ``cameras`` and ``action_rate_hz`` are checked and used
-    where they are there. With ``enter(environment)`` a policy is told where it acts: that is how
-    scripted experts see what others must look for. After ``predict_action``, ``executed`` may hold
-    ``(N, dim)`` commands that lead to the chunk's first action in other words than a straight
-    line: what a demonstrator does, which may be noisier than what it means.
-    """
-
-    def reset(self, seed: int) -> None:
-        """Begin an episode; everything random in it follows from ``seed``."""
-
-    def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
-        """``(T, dim)``: the next T actions."""
+        raise NotImplementedError(f"{type(self).__name__} has no scene with two tasks")

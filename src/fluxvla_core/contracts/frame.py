@@ -42,4 +42,4 @@ class Observation(TypedDict):
 
 
 Sample = dict[str, Any]
-"""One training sample on its way through the transforms; keys as ``data.parquet_dataset`` says."""
+"""One training sample on its way through the transforms; keys as ``ParquetDataset`` says."""

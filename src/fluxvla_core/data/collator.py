@@ -1,4 +1,4 @@
-"""Samples to one batch."""
+"""``DictCollator``: collate samples to one batch of tensors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from fluxvla_core.contracts.training import Collator
+from fluxvla_core.data.transforms.images import SCALE
 from fluxvla_core.errors import DataError
-from fluxvla_core.transforms.deferral import SCALE
 
 
-class DictCollator:
-    """Stacks the keys that a model computes with and lists the ones that describe.
+class DictCollator(Collator):
+    """Collate samples: stack the keys that a model computes with, list the others.
 
     Args:
         keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.

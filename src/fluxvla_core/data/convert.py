@@ -1,8 +1,8 @@
-"""Datasets of LeRobot v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
+"""Convert LeRobot datasets of v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
 
-Rows, with pictures that stand in them, and video packets are copied as they are. Statistics are
-computed anew, exactly: version 2 has no quantiles, and estimates its pictures from samples. That
-decodes every frame, so what comes out is known to be whole.
+Rows, with the images in them, and video packets are copied as they are. Statistics are recomputed,
+exactly: version 2 has no quantiles, and estimates those of images from samples. That decodes every
+frame, so the result is known to be complete.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.data import lerobot_v3 as v3
+from fluxvla_core.data import lerobot
 from fluxvla_core.data.assemble import (
     MEGABYTE,
     flat_statistics,
@@ -25,15 +25,12 @@ from fluxvla_core.data.assemble import (
     write_tables,
     write_videos,
 )
-from fluxvla_core.data.columns import all_of, read_columns
-from fluxvla_core.data.encode import Clip, whole_clip
-from fluxvla_core.data.files import read_table, write_json
+from fluxvla_core.data.columns import has_width, read_columns
+from fluxvla_core.data.files import arrow, built_aside, parquet, read_table, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.optional import arrow, parquet
 from fluxvla_core.data.statistics import LEVELS, as_lists, image_histogram
-from fluxvla_core.data.stored_images import ImageColumn
-from fluxvla_core.data.video import Source, open_source
-from fluxvla_core.data.writer import built_aside
+from fluxvla_core.data.video_decode import ImageColumn, Source, open_source
+from fluxvla_core.data.video_encode import Clip, whole_clip
 from fluxvla_core.errors import DataError
 
 Counts = npt.NDArray[np.int64]
@@ -43,34 +40,34 @@ Columns = dict[str, npt.NDArray[Any]]
 def convert(root: str | Path, out: str | Path, reporter: Reporter | None = None) -> Path:
     """Write the dataset below ``root`` as version 3.0 to ``out``; returns ``out``.
 
-    ``root`` stays as it is. ``out`` appears in one step when it is whole.
+    ``root`` is not changed. ``out`` appears in one step when it is complete.
 
     Raises:
         DataError: ``root`` is damaged, or of version 3.0 already; ``out`` exists.
         RunFailed: the disk is full.
     """
-    say = reporter or SilentReporter()
+    reporter = reporter or SilentReporter()
     source, target = Path(root), Path(out)
     meta = read_metadata(source)
-    if meta.version == v3.VERSION:
-        raise DataError(f"{source}: is of version {v3.VERSION} already")
+    if meta.version == lerobot.VERSION:
+        raise DataError(f"{source}: is of version {lerobot.VERSION} already")
     checked = read_columns(meta, meta.vectors)
     with built_aside(target, f"{source} is as it was", "make room and convert again") as staging:
-        _write(meta, checked["task_index"], staging, say)
+        _write(meta, checked["task_index"], staging, reporter)
         made = read_metadata(staging)
         read_columns(made, made.vectors)
     return target
 
 
-def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) -> None:
+def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, reporter: Reporter) -> None:
     episodes = meta.episodes
     rows: list[dict[str, Any]] = []
     for i, (start, end) in enumerate(zip(episodes.first_row, episodes.end_row, strict=True)):
-        said = dict.fromkeys(meta.tasks[t] for t in tasks[start:end])
+        texts = dict.fromkeys(meta.tasks[t] for t in tasks[start:end])
         rows.append(
             {
                 "episode_index": i,
-                "tasks": list(said),
+                "tasks": list(texts),
                 "length": int(end - start),
                 "dataset_from_index": int(start),
                 "dataset_to_index": int(end),
@@ -85,7 +82,8 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
     for part, key in enumerate(meta.cameras):
         clips, parameters = [], []
         for i, length in enumerate(map(int, episodes.lengths)):
-            source: Source = ImageColumn(meta.data_file(episodes.files[i]), key)
+            table = meta.data_file(episodes.files[i])
+            source: Source = ImageColumn(table, key, meta.picture_size(key))
             period = 1.0
             if key in episodes.videos:
                 source = meta.video_file(key, episodes.videos[key].files[i])
@@ -95,7 +93,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
                 period = 1 / meta.fps
             histograms[i][key] = _count_pixels(source, length, period)
             done = part * frames + int(episodes.end_row[i])
-            say.progress("convert frames", done, total, camera=v3.camera_name(key))
+            reporter.progress("convert frames", done, total, camera=lerobot.camera_name(key))
         if clips:
             groups = _groups(clips, parameters)
             write_videos(key, clips, groups, rows, out, meta.fps)
@@ -105,21 +103,21 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, say: Reporter) ->
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in meta.cameras}
     stats = statistics_of(totals, whole)
-    write_json(out / v3.STATS, {key: as_lists(entry) for key, entry in stats.items()})
-    if (meta.root / v3.EMBODIMENT).is_file():
-        shutil.copyfile(meta.root / v3.EMBODIMENT, out / v3.EMBODIMENT)
+    write_json(out / lerobot.STATS, {key: as_lists(entry) for key, entry in stats.items()})
+    if (meta.root / lerobot.EMBODIMENT).is_file():
+        shutil.copyfile(meta.root / lerobot.EMBODIMENT, out / lerobot.EMBODIMENT)
     gone = ("total_chunks", "total_videos")
     info = {
         **{key: value for key, value in meta.info.items() if key not in gone},
-        "codebase_version": v3.VERSION,
+        "codebase_version": lerobot.VERSION,
         "total_tasks": len(meta.tasks),
-        "chunks_size": v3.CHUNK_FILES,
-        "data_files_size_in_mb": v3.DATA_FILE_MB,
-        "video_files_size_in_mb": v3.VIDEO_FILE_MB,
-        "data_path": v3.DATA,
-        "video_path": v3.VIDEO if episodes.videos else None,
+        "chunks_size": lerobot.CHUNK_FILES,
+        "data_files_size_in_mb": lerobot.DATA_FILE_MB,
+        "video_files_size_in_mb": lerobot.VIDEO_FILE_MB,
+        "data_path": lerobot.DATA,
+        "video_path": lerobot.VIDEO if episodes.videos else None,
     }
-    write_json(out / v3.INFO, info)
+    write_json(out / lerobot.INFO, info)
 
 
 def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> list[Columns]:
@@ -129,13 +127,13 @@ def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> lis
 
     paths = [meta.data_file(file) for file in meta.episodes.files]
     sizes = [path.stat().st_size for path in paths]
-    metadata = {"huggingface": v3.datasets_schema(meta.features)}
+    metadata = {"huggingface": lerobot.datasets_schema(meta.features)}
     names = [key for key, f in meta.features.items() if f["dtype"] != "video"]
     columns: list[Columns] = []
     schema: Any = None
-    for number, group in enumerate(split_by_size(sizes, v3.DATA_FILE_MB * MEGABYTE)):
-        chunk, file = v3.file_of(number)
-        path = out / v3.DATA.format(chunk_index=chunk, file_index=file)
+    for number, group in enumerate(split_by_size(sizes, lerobot.DATA_FILE_MB * MEGABYTE)):
+        chunk, file = lerobot.file_of(number)
+        path = out / lerobot.DATA.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         writer: Any = None
         for i in group:
@@ -181,7 +179,7 @@ def _numbers(table: Any) -> Columns:
         )
         width = len(flat) // len(column)
         whole = not flat.null_count and len(flat) == len(column) * width
-        if number and whole and (not lists or all_of(column, width)):
+        if number and whole and (not lists or has_width(column, width)):
             values = flat.to_numpy(zero_copy_only=False)
             found[name] = values.reshape(len(column), -1) if lists else values
     return found
@@ -201,7 +199,7 @@ def _count_pixels(source: Source, frames: int, period: float) -> Counts:
 def _groups(clips: Sequence[Clip], parameters: Sequence[bytes]) -> list[list[int]]:
     """Consecutive clips that make a file: not too large, and all of one encoder's parameters."""
     groups: list[list[int]] = []
-    for group in split_by_size([clip.size for clip in clips], v3.VIDEO_FILE_MB * MEGABYTE):
+    for group in split_by_size([clip.size for clip in clips], lerobot.VIDEO_FILE_MB * MEGABYTE):
         for place, i in enumerate(group):
             if place == 0 or parameters[i] != parameters[i - 1]:
                 groups.append([])

@@ -1,4 +1,4 @@
-"""What a dataset holds, for people and programs: ``fluxvla data inspect`` and ``stats``."""
+"""Describe a dataset and compute its statistics: ``fluxvla data inspect`` and ``stats``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.columns import read_columns
+from fluxvla_core.data import lerobot
+from fluxvla_core.data.columns import make_track, read_columns
 from fluxvla_core.data.files import read_json, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.recording import make_track
 from fluxvla_core.data.statistics import (
     LEVELS,
     Stats,
@@ -23,7 +22,7 @@ from fluxvla_core.data.statistics import (
     histogram_statistics,
     image_histogram,
 )
-from fluxvla_core.data.video import open_source
+from fluxvla_core.data.video_decode import open_source
 from fluxvla_core.errors import DataError
 
 SHOWN = ("min", "q01", "mean", "q50", "q99", "max", "std")
@@ -31,7 +30,7 @@ _TASKS_SHOWN = 12
 
 
 def describe(root: Path) -> dict[str, Any]:
-    """A dataset's facts as JSON values; reads its tables and sizes, decodes nothing.
+    """Describe a dataset as JSON values, from its tables and file sizes; decodes nothing.
 
     Raises:
         DataError: it cannot be read.
@@ -47,7 +46,7 @@ def describe(root: Path) -> dict[str, Any]:
         "version": meta.version,
         "robot_type": meta.info.get("robot_type"),
         "embodiment": None if spec is None else spec.name,
-        "fps": v3.number(meta.fps),
+        "fps": lerobot.number(meta.fps),
         "episodes": len(lengths),
         "frames": int(lengths.sum()),
         "seconds": round(float(lengths.sum()) / meta.fps, 3),
@@ -65,7 +64,7 @@ def describe(root: Path) -> dict[str, Any]:
 
 
 def lines(facts: Mapping[str, Any]) -> list[str]:
-    """``describe``'s facts as people read them."""
+    """Format ``describe``'s facts for the terminal."""
     most, least = facts["episode_frames"]["max"], facts["episode_frames"]["min"]
     robot = facts["embodiment"] or "does not say (a config then says embodiment=)"
     out = [
@@ -92,7 +91,7 @@ def lines(facts: Mapping[str, Any]) -> list[str]:
 def dataset_statistics(
     root: Path, pixels: bool, reporter: Reporter
 ) -> tuple[Metadata, dict[str, Stats]]:
-    """Exact statistics of every vector and, with ``pixels``, every camera (all frames decoded).
+    """Compute exact statistics of every vector and, with ``pixels``, camera (decodes all frames).
 
     Raises:
         DataError: the dataset cannot be read.
@@ -123,40 +122,40 @@ def dataset_statistics(
 
 
 def table(meta: Metadata, stats: Mapping[str, Stats]) -> list[str]:
-    """Statistics as people read them: a line for each entry of each feature."""
+    """Format statistics for the terminal: a line for each entry of each feature."""
     out = []
     for key, entry in stats.items():
         out.append(f"{key}: {int(entry['count'][0])} frames")
-        said = ["red", "green", "blue"] if key in meta.cameras else meta.names(key)
-        names = said or [str(i) for i in range(entry["mean"].size)]
+        known = ["red", "green", "blue"] if key in meta.cameras else meta.names(key)
+        names = known or [str(i) for i in range(entry["mean"].size)]
         width = max(6, *(len(name) for name in names))
         out.append(f"  {'':{width}}" + "".join(f"{name:>11}" for name in SHOWN))
         flat = {name: entry[name].ravel() for name in SHOWN}
         for i, name in enumerate(names):
             numbers = "".join(f"{flat[s][i]:11.4g}" for s in SHOWN)
-            out.append(f"  {name:{width}}{numbers}{_still({s: flat[s][i] for s in SHOWN})}")
+            out.append(f"  {name:{width}}{numbers}{_idle_note({s: flat[s][i] for s in SHOWN})}")
     return out
 
 
-def _still(values: Mapping[str, float]) -> str:
-    """What a normalisation divides by next to nothing."""
+def _idle_note(values: Mapping[str, float]) -> str:
+    """A note on dimensions that a normalisation would divide by next to nothing."""
     if values["min"] == values["max"]:
         return "  never moves"
     return "  moves in under 2 % of the frames" if values["q01"] == values["q99"] else ""
 
 
 def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
-    """Replace what ``meta/stats.json`` says about the features of ``stats``, in one step.
+    """Replace the entries of ``stats`` in ``meta/stats.json``, in one step.
 
     Raises:
         DataError: the dataset is of version 2, which keeps other statistics.
     """
-    if meta.version != v3.VERSION:
+    if meta.version != lerobot.VERSION:
         raise DataError(
             f"{meta.root}: {meta.version} keeps its statistics by episode, without quantiles",
             next=f"fluxvla data convert {meta.root} OUT",
         )
-    path = meta.root / v3.STATS
+    path = meta.root / lerobot.STATS
     before = read_json(path) if path.is_file() else {}
     after = {**before, **{key: as_lists(entry) for key, entry in stats.items()}}
     write_json(path, after)
@@ -166,10 +165,10 @@ def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
 def _camera(meta: Metadata, key: str) -> dict[str, Any]:
     feature = meta.features[key]
     height, width = meta.picture_size(key)
-    said = feature.get("info") or feature.get("video_info") or {}
+    stated = feature.get("info") or feature.get("video_info") or {}
     places = meta.episodes.videos.get(key)
     files = {meta.video_file(key, file) for file in places.files} if places else set()
-    codec = said.get("video.codec")
+    codec = stated.get("video.codec")
     return {"height": height, "width": width, "codec": codec, **_size(files)}
 
 

@@ -1,46 +1,55 @@
-"""The pictures of samples: decoded when asked for, or all at once into memory."""
+"""Camera frames of samples: decoded on demand by a few threads, or cached in memory.
+
+libav releases the GIL while it decodes, and half of the cost of a sample with video is decoding.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.data.lanes import Lanes
-from fluxvla_core.data.recording import Recorded, Track
+from fluxvla_core.data.columns import LoadedDataset, Track
+from fluxvla_core.data.video_decode import FrameReader, Image, Source
 from fluxvla_core.errors import DataError
 
-Image = npt.NDArray[np.uint8]
 Place = tuple[int, int]
 AT_ONCE = 128
-"""Pictures that are decoded between two words of progress; so many are in memory twice."""
+"""Frames that are decoded between two reports of progress; so many are in memory twice."""
+MAX_THREADS = 4
+"""Decoder threads of a process: each keeps files open; to use more cores, load with workers."""
+MAX_OPEN_FILES = 32
+"""Of all decoder threads of a dataset together."""
 
 
 class Frames:
-    """Pictures by place: ``(recording, row)``.
+    """Camera frames by place: ``(dataset, row)``.
 
     Args:
-        recordings: whose tracks to read.
+        datasets: whose tracks to read.
         cache: keep every usable frame in memory, uint8, once :meth:`prepare` was called.
     """
 
-    def __init__(self, recordings: Sequence[Recorded], cache: bool) -> None:
-        self._tracks = [r.tracks for r in recordings]
-        self._rows = [r.rows for r in recordings]
-        self._lanes = Lanes()
+    def __init__(self, datasets: Sequence[LoadedDataset], cache: bool) -> None:
+        self._tracks = [d.tracks for d in datasets]
+        self._rows = [d.rows for d in datasets]
+        self._decoders = DecoderThreads()
         self._cache = cache
-        self._kept: list[list[Image]] | None = None
+        self._cached: list[list[Image]] | None = None
 
     def prepare(self, reporter: Reporter) -> None:
-        """Fill the cache, if there is to be one; a second call does nothing.
+        """Fill the cache, if there is one; a second call does nothing.
 
         Raises:
             DataError: memory does not suffice, or a frame cannot be decoded.
         """
-        if not self._cache or self._kept is not None:
+        if not self._cache or self._cached is not None:
             return
         needed = sum(
             len(rows) * t.height * t.width * 3
@@ -51,7 +60,8 @@ class Frames:
         if free is not None and needed > 0.8 * free:
             raise DataError(
                 f"cache_frames=True needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
-                next="set cache_frames=False, or resize the pictures when recording",
+                next="--set train_dataloader.dataset.cache_frames=false, or resize the pictures "
+                "when recording",
             )
         total = sum(len(r) * len(t) for t, r in zip(self._tracks, self._rows, strict=True))
         done = 0
@@ -61,20 +71,20 @@ class Frames:
             for track in tracks:
                 kept[-1].append(self._decode_all(track, rows, reporter, done, total))
                 done += len(rows)
-        self._kept = kept
-        self._lanes.close()
+        self._cached = kept
+        self._decoders.close()
 
     def read(self, places: Sequence[Place]) -> list[list[Image]]:
-        """For each place one ``(3, height, width)`` uint8 array a camera (views of HWC memory).
+        """Each place's ``(3, height, width)`` uint8 arrays, one a camera (views of HWC memory).
 
         Raises:
             DataError: a frame is missing or cannot be decoded.
         """
-        if self._kept is not None:
+        if self._cached is not None:
             return [
                 [
                     kept[np.searchsorted(self._rows[part], row)].transpose(2, 0, 1)
-                    for kept in self._kept[part]
+                    for kept in self._cached[part]
                 ]
                 for part, row in places
             ]
@@ -86,7 +96,7 @@ class Frames:
         ]
         # In the order of the files: neighbours share an open decoder, sometimes a group of frames.
         wanted.sort(key=lambda w: (str(w[0]), *w[1:]))
-        images = self._lanes.read([(source, time) for source, time, _, _ in wanted])
+        images = self._decoders.read([(source, time) for source, time, _, _ in wanted])
         for (_, _, i, camera), image in zip(wanted, images, strict=True):
             found[i][camera] = image.transpose(2, 0, 1)
         return found
@@ -104,7 +114,7 @@ class Frames:
         for first in range(0, len(order), AT_ONCE):
             some = order[first : first + AT_ONCE]
             wanted = [(track.files[track.file[row]], float(track.time[row])) for row in rows[some]]
-            images = self._lanes.read(wanted)
+            images = self._decoders.read(wanted)
             for i, image, (source, _) in zip(some, images, wanted, strict=True):
                 if image.shape != out.shape[1:]:
                     raise DataError(
@@ -117,8 +127,50 @@ class Frames:
         return out
 
 
+class DecoderThreads:
+    """Decodes frames of any files in threads that each keep files open. Call it from one thread."""
+
+    def __init__(self) -> None:
+        self._readers: list[FrameReader] = []
+
+    def read(self, wanted: Sequence[tuple[Source, float]]) -> list[Image]:
+        """Decode the frames shown at those times, ``(height, width, 3)`` uint8 RGB each.
+
+        Give them in the order of the files: each thread reads one stretch, so that neighbours
+        share an open decoder, and the next call finds the same files open.
+
+        Raises:
+            DataError: a frame is missing or cannot be decoded.
+        """
+        readers = self._prepared(thread_count())
+        if len(readers) == 1 or len(wanted) < 2:
+            return _read(readers[0], wanted)
+        ends = [len(wanted) * i // len(readers) for i in range(len(readers) + 1)]
+        stretches = [wanted[a:b] for a, b in pairwise(ends)]
+        # Threads end with each call: a fork for data workers would lose ones that stayed.
+        with ThreadPoolExecutor(len(readers)) as pool:
+            return [image for images in pool.map(_read, readers, stretches) for image in images]
+
+    def close(self) -> None:
+        for reader in self._readers:
+            reader.close()
+        self._readers = []
+
+    def _prepared(self, count: int) -> list[FrameReader]:
+        if len(self._readers) != count:
+            self.close()
+            self._readers = [FrameReader(MAX_OPEN_FILES // count) for _ in range(count)]
+        return self._readers
+
+
+def thread_count() -> int:
+    """Threads that may decode: no more than torch may use, which is one in a data worker."""
+    torch = sys.modules.get("torch")
+    return min(MAX_THREADS, int(torch.get_num_threads())) if torch is not None else 1
+
+
 def available_memory() -> int | None:
-    """Bytes that can be had without swapping; None where the system does not say."""
+    """Bytes of memory available without swapping; None where the system does not say."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             for line in file:
@@ -127,3 +179,7 @@ def available_memory() -> int | None:
     except OSError:
         return None
     return None
+
+
+def _read(reader: FrameReader, wanted: Sequence[tuple[Source, float]]) -> list[Image]:
+    return [reader.read(source, time) for source, time in wanted]

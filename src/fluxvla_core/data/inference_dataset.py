@@ -1,4 +1,4 @@
-"""One observation of a robot as a model's batch of one."""
+"""``PrivateInferenceDataset``: a robot's observation as a model's batch of one."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.data.lerobot_v3 import camera_name
+from fluxvla_core.data.lerobot import camera_name
+from fluxvla_core.data.transforms.images import stack_images
+from fluxvla_core.data.transforms.pipeline import Pipeline
+from fluxvla_core.data.transforms.state_action import load_statistics
 from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.transforms.images import stack
-from fluxvla_core.transforms.normalize import load_statistics
-from fluxvla_core.transforms.pipeline import Pipeline
 
 Sample = dict[str, Any]
 
@@ -85,7 +85,7 @@ class PrivateInferenceDataset:
         if self.embodiment_id is not None:
             sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
         sample = self.pipeline(sample)
-        sample["images"] = stack(sample["images"])
+        sample["images"] = stack_images(sample["images"])
         batch = {key: np.asarray(sample[key])[None] for key in _KEYS if key in sample}
         return {k: torch.from_numpy(np.ascontiguousarray(array)) for k, array in batch.items()}
 

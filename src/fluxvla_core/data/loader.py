@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import multiprocessing
-import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from multiprocessing.connection import wait
+from functools import partial
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.data.rng import DEFAULT_SEED, global_generators
-from fluxvla_core.data.sampler import EpochSampler, SampleKey
+from fluxvla_core.contracts.training import Dataset
+from fluxvla_core.data.sampler import (
+    DEFAULT_SEED,
+    EpochSampler,
+    SampleKey,
+    drop_kept_normal,
+    global_generators,
+    read_samples,
+)
 from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
 # Of malloc.h, and bytes: the largest piece that comes from the heap, and what the heap may keep.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -25,7 +32,7 @@ _END_S = 1.0  # between the end of a connection and that of the process that had
 
 
 class Loader:
-    """Batches without end, from ``sampler.start`` on; ``make_loader`` builds it.
+    """An endless iterable of batches, from ``sampler.start`` on; ``make_loader`` builds it.
 
     Prefetching runs ahead of training, so a position counts batches that were *used*:
     ``sampler.advance(start, used)``.
@@ -36,24 +43,30 @@ class Loader:
         self.sampler = sampler
 
     def __iter__(self) -> Iterator[Any]:
-        batches = iter(self.inner)
+        context = getattr(self.inner, "multiprocessing_context", None) or multiprocessing
+        with held_back(context.get_start_method()):
+            batches = iter(self.inner)
+        workers = getattr(batches, "_workers", ())
+        end = partial(_shut_down, batches, workers)
+        # For an iterator that nobody closes: torch would send its workers SIGTERM, and wait.
+        atexit.register(end)
         try:
             for batch in batches:
                 if isinstance(batch, _Failed):
                     raise batch.error
+                drop_kept_normal()
                 yield batch
         except (OSError, EOFError, RuntimeError) as error:
-            # Seen first may be that a connection to it broke, or that it is not there.
-            words = _killed(getattr(batches, "_workers", ()))
-            if words is None:
+            # Of a killed worker, the broken connection to it may be noticed first.
+            message = _killed_message(workers)
+            if message is None:
                 raise
-            raise RuntimeError(words) from error
+            raise RuntimeError(message) from error
         finally:
-            # One that was killed is told by torch at every child that ends, in the middle of
-            # whatever is being done, for as long as a traceback keeps the others alive.
-            end = getattr(batches, "_shutdown_workers", None)
-            if end is not None:
-                end()
+            # As long as a traceback keeps the other workers alive, torch reports the killed one
+            # whenever any child ends, in the middle of whatever is being done.
+            end()
+            atexit.unregister(end)
 
 
 def make_loader(
@@ -67,7 +80,7 @@ def make_loader(
     reporter: Reporter | None = None,
     seed: int = DEFAULT_SEED,
 ) -> Loader:
-    """Load batches of ``dataset`` in the order of ``sampler``.
+    """Build a loader of batches of ``dataset`` in the order of ``sampler``.
 
     Args:
         dataset: has ``get_sample(index, epoch)``, or ``get_samples(keys)`` for grouped reads;
@@ -75,8 +88,8 @@ def make_loader(
         num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
-        reporter: is told how far ``prepare`` is.
-        seed: with a batch's first sample, all that the global generators draw by while it is made.
+        reporter: gets the progress of ``prepare``.
+        seed: with a batch's first sample, seeds the global generators while the batch is made.
 
     Raises:
         ConfigError: ``num_workers`` is negative.
@@ -86,19 +99,17 @@ def make_loader(
 
     if num_workers < 0:
         raise ConfigError(f"per_device_num_workers must be at least 0, got {num_workers}")
-    prepare = getattr(dataset, "prepare", None)
-    if prepare is not None:
-        prepare(reporter or SilentReporter())
+    Dataset.adapt(dataset).prepare(reporter or SilentReporter())
     keyed: Any = _Keyed(dataset, collator, seed)
     inner: DataLoader[Any] = DataLoader(
         keyed,
         batch_sampler=sampler,
-        collate_fn=_as_it_is,
+        collate_fn=_identity,
         num_workers=num_workers,
         pin_memory=pin_memory,
         prefetch_factor=prefetch_factor if num_workers else None,
         multiprocessing_context=multiprocessing_context if num_workers else None,
-        worker_init_fn=_begin_worker if num_workers else None,
+        worker_init_fn=_init_worker if num_workers else None,
         # The loader draws a base seed for its workers; from the global generator that draw
         # would make a resumed run differ from an uninterrupted one.
         generator=torch.Generator().manual_seed(0),
@@ -106,16 +117,31 @@ def make_loader(
     return Loader(inner, sampler)
 
 
-def _begin_worker(worker: int) -> None:
-    _keep_memory()
-    _end_with_trainer()
+def _init_worker(worker: int) -> None:
+    # torch watches the parent process. With ``forkserver``, Python 3.14's default, that is the
+    # server, which lives as long as its children: they would never end.
+    leave_stopping_to_the_parent()
+    sys.excepthook = partial(_report_unless_orphaned, sys.excepthook)
+    _reuse_memory()
 
 
-def _keep_memory() -> None:
-    """Let a worker use the memory of one batch's pictures for the next one's.
+def _report_unless_orphaned(
+    hook: Callable[..., Any], kind: type[BaseException], error: BaseException, trace: Any
+) -> None:
+    """Report an error of the thread that sends batches, unless the trainer is gone.
 
-    A batch is freed as a whole once it was sent, and glibc then gives the pages back; to get them
-    anew, zeroed, took a third of a worker's time. See mallopt(3).
+    A trainer that is killed while it fetches one breaks that connection; multiprocessing's
+    ``resource_sharer`` calls ``sys.excepthook``, whose traceback would come before the cause.
+    """
+    if not issubclass(kind, EOFError | ConnectionError):
+        hook(kind, error, trace)
+
+
+def _reuse_memory() -> None:
+    """Let a worker reuse the memory of one batch's images for the next.
+
+    A batch is freed as a whole once it was sent, and glibc then returns the pages to the system;
+    getting new, zeroed ones took a third of a worker's time. See mallopt(3).
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
@@ -123,24 +149,19 @@ def _keep_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _KEPT)
 
 
-def _end_with_trainer() -> None:
-    """End a worker whose trainer was killed.
-
-    torch's own watch looks at the parent process. With ``forkserver``, Python 3.14's default, that
-    is the server, which in turn lives as long as its children: they would stay for good.
-    """
-    parent = multiprocessing.parent_process()
-    assert parent is not None, "runs in a worker"
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, name="fluxvla-trainer-watch", daemon=True).start()
+def _shut_down(batches: Any, workers: Sequence[Any]) -> None:
+    """Shut down the workers of torch's iterator; those that hang are killed."""
+    try:
+        if workers:
+            batches._shutdown_workers()
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.join()
 
 
-def _killed(workers: Sequence[Any]) -> str | None:
-    """What torch says of a worker that was killed, as one was that ends by a signal; else None."""
+def _killed_message(workers: Sequence[Any]) -> str | None:
+    """Torch's message for a killed worker, if a worker was ended by a signal; else None."""
     until = time.monotonic() + _END_S
     for worker in workers:
         worker.join(max(0.0, until - time.monotonic()))
@@ -151,17 +172,17 @@ def _killed(workers: Sequence[Any]) -> str | None:
 
 
 class _Failed:
-    """An error on its way out of a worker: torch would rebuild it from its text alone."""
+    """An error to send from a worker as it is: torch would rebuild it from its text alone."""
 
     def __init__(self, error: FluxError) -> None:
         self.error = error
 
 
 class _Keyed:
-    """What torch's fetcher sees: a dataset that is asked for a whole batch of keys.
+    """The dataset as torch's fetcher sees it, which asks for a whole batch of keys.
 
-    Workers begin with equal global generators on every rank and after every restart; so these are
-    seeded for each batch, which then is the same whoever makes it, and left as they were.
+    Workers start with equal global generators on every rank and after every restart. They are
+    therefore seeded for each batch, which then is the same whoever makes it, and restored.
     """
 
     def __init__(self, dataset: Any, collator: Callable[[Sequence[Any]], Any], seed: int) -> None:
@@ -172,15 +193,10 @@ class _Keyed:
     def __getitems__(self, keys: list[SampleKey]) -> Any:
         try:
             with global_generators(self.seed, keys[0].epoch, keys[0].index):
-                return self.collator(self._samples(keys))
+                return self.collator(read_samples(self.dataset, keys))
         except FluxError as error:
             return _Failed(error)
 
-    def _samples(self, keys: list[SampleKey]) -> Any:
-        if hasattr(self.dataset, "get_samples"):
-            return self.dataset.get_samples(keys)
-        return [self.dataset.get_sample(key.index, key.epoch) for key in keys]
 
-
-def _as_it_is(batch: Any) -> Any:
+def _identity(batch: Any) -> Any:
     return batch

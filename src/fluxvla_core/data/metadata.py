@@ -1,4 +1,4 @@
-"""What a dataset says about itself: its ``meta/``, read and checked, no frames yet."""
+"""Read and check a dataset's ``meta/``: features, tasks, episodes and the robot; no frames."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data import tables_v2, tables_v3
-from fluxvla_core.data.episodes import Episodes, FileId
-from fluxvla_core.data.files import read_json
+from fluxvla_core.data import lerobot
+from fluxvla_core.data.files import read_json, staging_of
+from fluxvla_core.data.lerobot import check_info, fill
+from fluxvla_core.data.tables import Episodes, FileId, read_episodes, read_tasks, tasks_file
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-VERSIONS = ("v2.0", "v2.1", v3.VERSION)
+_MOST_TASKS = 1_000_000
+"""The largest dataset that is published, DROID, has some 50,000 instructions."""
+VERSIONS = ("v2.0", "v2.1", lerobot.VERSION)
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Metadata:
 
     @property
     def tasks_file(self) -> str:
-        return v3.TASKS if self.version == v3.VERSION else tables_v2.TASKS
+        """The file of the instructions, below ``root``."""
+        return tasks_file(self.version)
 
     @property
     def fps(self) -> float:
@@ -50,33 +53,33 @@ class Metadata:
 
     @property
     def cameras(self) -> list[str]:
-        """Features that are pictures."""
+        """The features that are images or video."""
         return [k for k, f in self.features.items() if f["dtype"] in ("video", "image")]
 
     @property
     def vectors(self) -> list[str]:
-        """Features that are a vector of float32 or float64 a frame."""
+        """The features that are one vector of float32 or float64 a frame."""
         return [
             k
             for k, f in self.features.items()
             if f["dtype"].startswith("float")
             and len(f["shape"]) == 1
-            and k not in v3.INDEX_FEATURES
+            and k not in lerobot.INDEX_FEATURES
         ]
 
     def data_file(self, file: FileId) -> Path:
-        return self.root / _path(self.info["data_path"], file)
+        return self.root / fill(self.info["data_path"], _numbers(file))
 
     def video_file(self, key: str, file: FileId) -> Path:
-        return self.root / _path(self.info["video_path"], file, video_key=key)
+        return self.root / fill(self.info["video_path"], _numbers(file), key)
 
     def camera(self, name: str) -> str:
-        """The feature that ``name`` (a feature, or a camera's short name) means.
+        """The feature of the camera ``name``, which is a feature or a camera's short name.
 
         Raises:
             DataError: there is none, or its pictures are not in colour.
         """
-        for key in (name, v3.image_feature(name)):
+        for key in (name, lerobot.image_feature(name)):
             if key in self.features:
                 dtype = self.features[key]["dtype"]
                 if key not in self.cameras:
@@ -88,7 +91,7 @@ class Metadata:
         raise DataError(f"{self.root}: there is no camera {name!r}{self.hint(name, self.cameras)}")
 
     def picture_size(self, key: str) -> tuple[int, int]:
-        """Height and width of a camera's pictures; some datasets name the channels first."""
+        """Height and width of a camera's images; some datasets list the channels first."""
         first, middle, last = map(int, self.features[key]["shape"])
         return (middle, last) if first == 3 and last != 3 else (first, middle)
 
@@ -101,7 +104,7 @@ class Metadata:
         numbers = [
             k
             for k, f in self.features.items()
-            if f["dtype"].startswith("float") and k not in v3.INDEX_FEATURES
+            if f["dtype"].startswith("float") and k not in lerobot.INDEX_FEATURES
         ]
         if name not in self.features:
             raise DataError(f"{self.root}: there is no feature {name!r}{self.hint(name, numbers)}")
@@ -114,9 +117,9 @@ class Metadata:
         return int(feature["shape"][0])
 
     def names(self, key: str) -> list[str]:
-        """What a vector's entries are called: a list, in older datasets a table of lists.
+        """The names of a vector's entries; in older datasets they are a table of lists.
 
-        Empty if they have no names, or others than it has entries.
+        Empty if there are none, or not one for each entry.
         """
         names = self.features[key].get("names")
         if isinstance(names, Mapping):
@@ -125,9 +128,9 @@ class Metadata:
         return [str(n) for n in names or ()] if fits else []
 
     def hint(self, name: str, known: Sequence[str]) -> str:
-        """``; did you mean …? there are …`` for a message."""
-        short = {v3.camera_name(k): k for k in known}
-        near = difflib.get_close_matches(v3.camera_name(name), short, 1)
+        """The end of an error message: ``; did you mean …? there are …``."""
+        short = {lerobot.camera_name(k): k for k in known}
+        near = difflib.get_close_matches(lerobot.camera_name(name), short, 1)
         mean = f"; did you mean {short[near[0]]!r}?" if near else ";"
         return f"{mean} there are {', '.join(known) or 'none'}"
 
@@ -139,9 +142,14 @@ def read_metadata(root: Path) -> Metadata:
         DataError: no such folder, not a dataset, of another version, empty, or damaged.
     """
     info = _read_info(root)
-    tables = tables_v3 if info["codebase_version"] == v3.VERSION else tables_v2
-    episodes = tables.read_episodes(root, info)
-    numbered = tables.read_tasks(root)
+    episodes = read_episodes(root, info)
+    numbered = read_tasks(root, info["codebase_version"])
+    if max(numbered, default=0) >= _MOST_TASKS:
+        raise DataError(
+            f"{root}: task_index {max(numbered)}, {_MOST_TASKS} instructions are the most that "
+            "are read",
+            cause="the table of tasks was damaged, or made by hand",
+        )
     for index, text in numbered.items():
         if not isinstance(text, str):
             raise DataError(f"{root}: task_index {index} has no instruction, but {text!r}")
@@ -153,7 +161,7 @@ def read_metadata(root: Path) -> Metadata:
     ):
         if stated != found:
             raise DataError(
-                f"{root}: {v3.INFO} states {stated} {what}, the episode table lists {found}",
+                f"{root}: {lerobot.INFO} states {stated} {what}, the episode table lists {found}",
                 cause="a part of the dataset is missing, or its writer was stopped",
             )
     empty = np.flatnonzero(episodes.lengths < 1)
@@ -166,12 +174,12 @@ def read_metadata(root: Path) -> Metadata:
 
 
 def read_embodiment(root: Path) -> EmbodimentSpec | None:
-    """The robot that a dataset of ours was recorded with; None for others' datasets.
+    """The robot that FluxVLA recorded the dataset with; None for datasets of other programs.
 
     Raises:
-        DataError: the file is no JSON. SpecMismatch: it is no embodiment.
+        DataError: the file is not JSON. SpecMismatch: it is not an embodiment.
     """
-    path = root / v3.EMBODIMENT
+    path = root / lerobot.EMBODIMENT
     return EmbodimentSpec.from_dict(read_json(path)) if path.is_file() else None
 
 
@@ -180,28 +188,31 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DataError(
             f"{root}: there is no dataset here: the folder does not exist",
             cause=_unfinished(root),
-            next="check data_root_path; it is relative to the folder that the command runs in",
+            next="check data_root_path, which is relative to the folder that the command runs in: "
+            "--set train_dataloader.dataset.data_root_path=DIR",
         )
-    path = root / v3.INFO
+    path = root / lerobot.INFO
     if not path.is_file():
-        what = "is a file" if root.is_file() else f"has no {v3.INFO}"
+        what = "is a file" if root.is_file() else f"has no {lerobot.INFO}"
         raise DataError(
             f"{root}: this is no LeRobot dataset: it {what}",
             cause=_inner_dataset(root),
         )
     info = read_json(path)
     version = info.get("codebase_version")
-    if version not in VERSIONS:
+    if not isinstance(version, str) or version not in VERSIONS:
         raise DataError(
-            f"{root}: LeRobot dataset of version {version}, "
+            f"{root}: LeRobot dataset of version {str(version)[:40]}, "
             f"{', '.join(VERSIONS[:-1])} and {VERSIONS[-1]} are what is read here",
             next="convert a copy with the LeRobot that reads it",
         )
     missing = sorted({"fps", "features", "data_path", "total_episodes", "total_frames"} - set(info))
-    if any(f["dtype"] == "video" for f in info.get("features", {}).values()):
-        missing += [] if info.get("video_path") else ["video_path"]
     if missing:
         raise DataError(f"{path}: {', '.join(missing)} missing")
+    check_info(info, str(path))
+    videos = any(feature["dtype"] == "video" for feature in info["features"].values())
+    if videos and not info.get("video_path"):
+        raise DataError(f"{path}: video_path missing")
     if info["total_episodes"] == 0 or info["total_frames"] == 0:
         raise DataError(
             f"{root}: the dataset is empty: {info['total_episodes']} episodes, "
@@ -212,20 +223,23 @@ def _read_info(root: Path) -> dict[str, Any]:
 
 
 def _unfinished(root: Path) -> str | None:
-    staging = root.with_name(f".{root.name}.writing")
+    staging = staging_of(root)
     if staging.is_dir():
         return f"its recording was never finalized; what was saved is in {staging}"
     return None
 
 
 def _inner_dataset(root: Path) -> str | None:
-    inner = next(root.glob(f"*/{v3.INFO}"), None) if root.is_dir() else None
+    inner = next(root.glob(f"*/{lerobot.INFO}"), None) if root.is_dir() else None
     return f"did you mean {inner.parent.parent}?" if inner else None
 
 
-def _path(pattern: str, file: FileId, **names: str) -> str:
-    """``pattern`` filled in; version 2 counts chunks and files of episodes under other names."""
+def _numbers(file: FileId) -> dict[str, int]:
+    """The numbers that a path pattern may name; version 2 has other names for them."""
     chunk, number = file
-    return pattern.format(
-        chunk_index=chunk, file_index=number, episode_chunk=chunk, episode_index=number, **names
-    )
+    return {
+        "chunk_index": chunk,
+        "file_index": number,
+        "episode_chunk": chunk,
+        "episode_index": number,
+    }

@@ -1,4 +1,4 @@
-"""Several datasets as one: how often each is seen, and what their numbers mean together."""
+"""Mixture of datasets: sampling weights, and statistics that datasets of one robot share."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy.typing as npt
 
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.data.agreement import check_alike, doubts
-from fluxvla_core.data.parquet_dataset import ParquetDataset, pooled_statistics
-from fluxvla_core.data.rng import DEFAULT_SEED, mixture_rng
-from fluxvla_core.data.sampler import SampleKey
+from fluxvla_core.contracts.training import Dataset
+from fluxvla_core.data.columns import check_compatible, naming_warnings
+from fluxvla_core.data.dataset import ParquetDataset, pooled_statistics
+from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, mixture_rng, read_samples
+from fluxvla_core.data.transforms.pipeline import deferring
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
-from fluxvla_core.transforms.deferral import deferring
 
 Sample = dict[str, Any]
 Ints = npt.NDArray[np.int64]
 
 
-class DistributedRepeatingDataset:
+class DistributedRepeatingDataset(Dataset):
     """A mixture: map style, every sample a function of (seed, epoch, index).
 
     An epoch is ``samples_per_epoch`` places; each dataset has its share of them, exactly. Epoch
@@ -94,7 +94,7 @@ class DistributedRepeatingDataset:
     @property
     def action_window_size(self) -> int | None:
         """The first dataset's."""
-        return getattr(self.datasets[0], "action_window_size", None)
+        return Dataset.adapt(self.datasets[0]).action_window_size
 
     @property
     def pipeline(self) -> Any:
@@ -108,38 +108,37 @@ class DistributedRepeatingDataset:
         A dataset is called by its folder (its ``statistic_name`` if it has none), with its place
         in the mixture behind it where several are called alike.
         """
-        names = [_called(dataset) for dataset in self.datasets]
+        names = [_name_of(dataset) for dataset in self.datasets]
         unique = [n if names.count(n) == 1 else f"{n}-{i}" for i, n in enumerate(names)]
         return dict(zip(unique, self.lengths.tolist(), strict=True))
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """The instructions of all datasets."""
-        return tuple(dict.fromkeys(t for d in self.datasets for t in getattr(d, "tasks", ())))
+        return tuple(dict.fromkeys(t for d in self.datasets for t in Dataset.adapt(d).tasks))
 
-    def doubts(self) -> list[str]:
-        """What somebody should know before training begins; the same of several is said once.
+    def warnings(self) -> list[str]:
+        """Warnings before training begins; those that several datasets give are listed once.
 
         Raises:
-            ConfigError: see ``ParquetDataset.doubts``.
+            ConfigError: see ``ParquetDataset.warnings``.
         """
-        asked = [d for d in self.datasets if hasattr(d, "doubts")]
-        found = [doubt for dataset in asked for doubt in dataset.doubts()]
+        asked = [d for d in self.datasets if hasattr(d, "warnings")]
+        found = [warning for dataset in asked for warning in dataset.warnings()]
         for group in self._groups().values():
-            recordings = [r for d in group for r in getattr(d, "recordings", ())]
-            found += doubts(recordings) if recordings else []
+            loaded = [one for dataset in group for one in getattr(dataset, "loaded", ())]
+            found += naming_warnings(loaded) if loaded else []
         return list(dict.fromkeys(found))
 
     def use_seed(self, seed: int) -> None:
-        """Draw by the run's seed from now on, here and in every dataset, but for given ones."""
+        """Use the run's seed from now on, here and in every dataset, except where one was given."""
         if not self._own_seed:
             self.seed, self._drawn = seed, {}
         for dataset in self.datasets:
-            if hasattr(dataset, "use_seed"):
-                dataset.use_seed(seed)
+            Dataset.adapt(dataset).use_seed(seed)
 
     def deferring(self) -> DistributedRepeatingDataset | None:
-        """The same samples with pictures left to be normalised, if every dataset can leave it."""
+        """The same samples with images left to be normalised on the device, if all datasets can."""
         parts = [deferring(dataset) for dataset in self.datasets]
         if any(part is None for part in parts):
             return None
@@ -150,8 +149,7 @@ class DistributedRepeatingDataset:
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Let every dataset decode what it keeps in memory."""
         for dataset in self.datasets:
-            if hasattr(dataset, "prepare"):
-                dataset.prepare(reporter)
+            Dataset.adapt(dataset).prepare(reporter)
 
     def __getitem__(self, index: int) -> Sample:
         return self.get_sample(index, 0)
@@ -166,14 +164,16 @@ class DistributedRepeatingDataset:
         found: list[Any] = [None] * len(keys)
         for part, dataset in enumerate(self.datasets):
             mine = [i for i, (which, _) in enumerate(places) if which == part]
-            for i, sample in zip(mine, _read(dataset, [places[i][1] for i in mine]), strict=True):
+            for i, sample in zip(
+                mine, read_samples(dataset, [places[i][1] for i in mine]), strict=True
+            ):
                 if "sample_ids" in sample:
                     sample["sample_ids"] = sample["sample_ids"] + self._first_id[part]
                 found[i] = sample
         return found
 
     def place(self, key: SampleKey) -> tuple[int, SampleKey]:
-        """Which dataset place ``key`` shows, and what it asks that dataset for."""
+        """The dataset that place ``key`` shows, and the key to ask it for."""
         if not 0 <= key.index < len(self):
             raise IndexError(f"sample {key.index} of {len(self)}")
         part = int(np.searchsorted(self._places, key.index, side="right"))
@@ -203,7 +203,7 @@ class DistributedRepeatingDataset:
         return {**self.__dict__, "_drawn": {}}
 
     def _groups(self) -> dict[str, list[Any]]:
-        """The datasets by what their statistics are called."""
+        """The datasets by their ``statistic_name``."""
         groups: dict[str, list[Any]] = {}
         for dataset in self.datasets:
             # Asking for its statistics would compute them, only to replace them below.
@@ -222,7 +222,7 @@ class DistributedRepeatingDataset:
 
 
 def shares(total: int, weights: Sequence[float] | Ints, count: int) -> Ints:
-    """``total`` shared out by ``weights``: whole numbers, exact in sum, each within 1 of its due.
+    """Divide ``total`` by ``weights``: whole numbers, exact in sum, each within 1 of its share.
 
     Raises:
         ConfigError: a weight is not positive and finite, there are not ``count`` of them, or one
@@ -253,7 +253,7 @@ def shares(total: int, weights: Sequence[float] | Ints, count: int) -> Ints:
 
 
 def first_dataset(table: Mapping[str, Any]) -> dict[str, Any]:
-    """The table of the dataset whose robot a checkpoint trained on ``table`` acts on.
+    """The config of the dataset whose robot a checkpoint acts on that was trained on ``table``.
 
     ``table`` itself, unless it is a mixture's.
     """
@@ -280,10 +280,10 @@ def _build(datasets: Any, context: RunContext | None) -> list[Any]:
     return built
 
 
-def _called(dataset: Any) -> str:
-    recordings = getattr(dataset, "recordings", None)
-    if recordings:
-        return str(recordings[0].meta.root.name)
+def _name_of(dataset: Any) -> str:
+    loaded = getattr(dataset, "loaded", None)
+    if loaded:
+        return str(loaded[0].meta.root.name)
     return str(getattr(dataset, "statistic_name", type(dataset).__name__))
 
 
@@ -295,11 +295,11 @@ def _check_group(name: str, group: Sequence[Any]) -> None:
             f"{where} of several datasets are computed from their rows, and {others[0]} shows none",
             next="give each of them a statistic_name of its own",
         )
-    check_alike([recorded for dataset in group for recorded in dataset.recordings])
+    check_compatible([one for dataset in group for one in dataset.loaded])
     first = group[0]
-    root = str(first.recordings[0].meta.root)
+    root = str(first.loaded[0].meta.root)
     for other in group[1:]:
-        its_root = str(other.recordings[0].meta.root)
+        its_root = str(other.loaded[0].meta.root)
         if first.embodiment is not None and other.embodiment is not None:
             check_match(first.embodiment, other.embodiment, root, its_root, ())
         for what, read in _MEANING.items():
@@ -318,9 +318,3 @@ _MEANING: Mapping[str, Callable[[ParquetDataset], Any]] = {
     "per_step_statistics": lambda d: d.per_step_statistics,
     "relative_actions": lambda d: None if d.relative is None else d.relative.tolist(),
 }
-
-
-def _read(dataset: Any, keys: Sequence[SampleKey]) -> list[Sample]:
-    if hasattr(dataset, "get_samples"):
-        return list(dataset.get_samples(keys))
-    return [dataset.get_sample(key.index, key.epoch) for key in keys]

@@ -1,33 +1,58 @@
-"""Which samples make up which batch: a function of (seed, epoch), whoever asks.
+"""Shuffling, batches per rank, and random number generators: functions of (seed, epoch, index).
 
 One permutation per epoch is cut into global batches of ``batch_size * world`` samples, and rank
 ``r`` takes the ``r``-th part of each. The stream of samples is therefore the same for every world
 size, and a run resumes at a position instead of replaying what it has seen.
+
+A sample's noise follows from (seed, epoch, index) and an epoch's order from (seed, epoch), so
+neither the number of ranks, nor the number of workers, nor a restart changes either. Philox is a
+counter-based generator: the counter's high words say what the numbers are for, which keeps the
+streams of two samples apart for 2^64 draws each.
+Source: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+import random
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numpy.random.mtrand import get_bit_generator, set_bit_generator
 
-from fluxvla_core.data.order import EpisodeShards, epoch_order
 from fluxvla_core.errors import ConfigError
+
+Ints = npt.NDArray[np.int64]
+DEFAULT_SEED = 42
+"""The seed of datasets that set none, where no run gives them its own."""
+_SPARE = np.random.MT19937()
+"""The bit generator of ``numpy.random`` while a batch is made."""
+_SAMPLE, _ORDER, _MIXTURE, _BATCH = 1, 2, 3, 4
 
 
 @dataclass(frozen=True, slots=True)
 class SampleKey:
-    """What a data worker is asked for."""
+    """One sample of one epoch: what a data worker is asked for."""
 
     epoch: int
     index: int
 
 
+def read_samples(dataset: Any, keys: Sequence[SampleKey]) -> list[Any]:
+    """The samples that ``keys`` name: by ``get_samples(keys)`` of the dataset, if it has that."""
+    if hasattr(dataset, "get_samples"):
+        samples: list[Any] = dataset.get_samples(keys)
+        return samples
+    return [dataset.get_sample(key.index, key.epoch) for key in keys]
+
+
 class Position(NamedTuple):
-    """The next batch of this rank: ``batch`` batches of ``epoch`` have been used already."""
+    """Where this rank continues: ``batch`` batches of ``epoch`` have been used already."""
 
     epoch: int
     batch: int
@@ -82,7 +107,8 @@ class EpochSampler:
         if self.batches_per_epoch == 0:
             raise ConfigError(
                 f"{length} samples do not fill one global batch of {self.global_batch}",
-                next="lower per_device_batch_size, use fewer processes, or set drop_last=False",
+                next="lower --set train_dataloader.per_device_batch_size=…, use fewer processes, "
+                "or set drop_last=False",
             )
 
     @property
@@ -115,7 +141,7 @@ class EpochSampler:
         return Position(*divmod(done, self.batches_per_epoch))
 
     def seek(self, position: Position) -> None:
-        """Let the next iteration begin at ``position``."""
+        """Start the next iteration at ``position``."""
         self.start = self.advance(position, 0)
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
@@ -123,3 +149,98 @@ class EpochSampler:
         while True:
             yield from self.batches(epoch, batch)
             epoch, batch = epoch + 1, 0
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeShards:
+    """Shuffle within a few episodes at a time, so that few files are read from at once.
+
+    A dataset of many large videos is then read from the page cache and from open decoders.
+    Which episodes come together is drawn again in every epoch.
+
+    Args:
+        ends: ``(E,)`` for each episode the index after its last sample, ascending; an episode
+            begins where the one before it ends.
+        together: how many episodes are shuffled together.
+
+    Raises:
+        ConfigError: ``together`` is below 2, which would hardly shuffle.
+    """
+
+    ends: Ints
+    together: int
+
+    def __post_init__(self) -> None:
+        if self.together < 2:
+            raise ConfigError(f"shuffle_episodes must be at least 2, got {self.together}")
+
+
+def epoch_order(length: int, seed: int, epoch: int, shards: EpisodeShards | None = None) -> Ints:
+    """Shuffle an epoch: ``(length,)`` every index once, over all samples or within shards."""
+    rng = order_rng(seed, epoch)
+    if shards is None:
+        return rng.permutation(length)
+    starts = np.concatenate([[0], shards.ends[:-1]])
+    episodes = rng.permutation(len(shards.ends))
+    parts: list[Ints] = []
+    for first in range(0, len(episodes), shards.together):
+        chosen = episodes[first : first + shards.together]
+        samples = np.concatenate([np.arange(starts[e], shards.ends[e]) for e in chosen])
+        parts.append(rng.permutation(samples))
+    return np.concatenate(parts)
+
+
+def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:
+    """The generator of sample ``index`` in ``epoch``."""
+    return _generator(seed, _SAMPLE, epoch, index)
+
+
+def order_rng(seed: int, epoch: int) -> np.random.Generator:
+    """The generator that shuffles ``epoch``."""
+    return _generator(seed, _ORDER, epoch, 0)
+
+
+def mixture_rng(seed: int, dataset: int, turn: int) -> np.random.Generator:
+    """The generator that orders the ``turn``-th round through a mixture's ``dataset``."""
+    return _generator(seed, _MIXTURE, turn, dataset)
+
+
+@contextmanager
+def global_generators(seed: int, epoch: int, index: int) -> Iterator[None]:
+    """Seed Python's, numpy's and torch's global generators for the batch that starts at ``index``.
+
+    Afterwards they have their old state, without the second of a pair of normal numbers that numpy
+    may have kept: see :func:`drop_kept_normal`. GPUs' are left alone: batches are made on CPUs.
+    """
+    import torch
+
+    # A Philox of its own would take longer than seeding all three.
+    key = struct.pack("<4Q", seed, _BATCH, epoch, index)
+    word = int.from_bytes(hashlib.blake2b(key, digest_size=8).digest(), "little")
+    before = random.getstate(), get_bit_generator(), torch.get_rng_state()
+    random.seed(word)
+    # Exchanged, because numpy takes four times as long as all the rest to read and set a state.
+    set_bit_generator(_SPARE)
+    np.random.seed(word % 2**32)
+    torch.default_generator.manual_seed(word)
+    try:
+        yield
+    finally:
+        random.setstate(before[0])
+        set_bit_generator(before[1])
+        torch.set_rng_state(before[2])
+
+
+def drop_kept_normal() -> None:
+    """Let numpy's global generator drop the second of a pair of normal numbers that it keeps.
+
+    Making a batch does so, too. The training process calls this for each batch that a worker made:
+    what a model draws then does not depend on the number of workers.
+    """
+    set_bit_generator(get_bit_generator())
+
+
+def _generator(seed: int, purpose: int, epoch: int, index: int) -> np.random.Generator:
+    key = np.array([seed, purpose], dtype=np.uint64)
+    counter = np.array([0, 0, index, epoch], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))

@@ -1,4 +1,4 @@
-"""Exact statistics of columns and of images, without holding all rows at once.
+"""Exact statistics for normalisation: of columns, action windows and images, in bounded memory.
 
 Mean and variance are kept as (count, mean, sum of squared deviations) in float64 and joined by
 Chan's formula, so many small chunks give what one big one gives. Quantiles of columns are true
@@ -10,17 +10,18 @@ variances", Stanford STAN-CS-79-773, 1979.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.data.columns import LoadedDataset
+
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LEVELS = 256
 CHUNK = 65536
-
 Floats = npt.NDArray[np.float64]
 Stats = dict[str, npt.NDArray[Any]]
 
@@ -109,22 +110,41 @@ def joined_statistics(
     }
 
 
-def _cut(parts: Iterable[npt.NDArray[Any]], size: int) -> Iterator[npt.NDArray[Any]]:
-    """All rows in chunks of ``size``, wherever one part ends and the next begins."""
-    held: list[npt.NDArray[Any]] = []
-    for part in parts:
-        while len(part):
-            held.append(part[: size - sum(map(len, held))])
-            part = part[len(held[-1]) :]
-            if sum(map(len, held)) == size:
-                yield np.concatenate(held)
-                held = []
-    if held:
-        yield np.concatenate(held)
+def action_statistics(
+    datasets: Sequence[LoadedDataset],
+    size: int,
+    first_action: int,
+    relative: npt.NDArray[np.bool_] | None,
+    per_step: bool,
+) -> dict[str, Any]:
+    """Statistics of the actions that samples show, as JSON values.
 
+    Args:
+        size, first_action: of the window.
+        relative: ``(D,)``; where True, actions are counted from the state at the window's frame.
+        per_step: give ``(size, D)`` statistics, one row for each step of the window.
 
-def _column(parts: Iterable[npt.NDArray[Any]]) -> Floats:
-    return np.concatenate([part[:, 0].astype(np.float64) for part in parts])
+    Plain actions are counted once a frame of the chosen episodes; relative or per-step ones once
+    for each window that they occur in.
+    """
+    if relative is None and not per_step:
+        rows = np.concatenate([r.actions[r.chosen] for r in datasets])
+        return as_lists(column_statistics(rows))
+    if per_step:
+        # The last steps of a window longer than every episode occur nowhere.
+        each: list[Stats] = []
+        for j in range(size):
+            rows = _step(datasets, first_action + j, relative, slice(None))
+            each.append(column_statistics(rows) if len(rows) else each[0])
+        stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
+    else:
+        stats = joined_statistics(
+            lambda dims: (_step(datasets, first_action + j, relative, dims) for j in range(size))
+        )
+    found = as_lists(stats)
+    if relative is not None:
+        found["relative"] = relative.astype(int).tolist()
+    return found
 
 
 def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
@@ -155,6 +175,46 @@ def histogram_statistics(histogram: npt.NDArray[np.int64], frames: int) -> Stats
     return {**scaled, "count": np.array([frames], dtype=np.int64)}
 
 
+def as_lists(stats: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    """Plain JSON values."""
+    return {name: value.tolist() for name, value in stats.items()}
+
+
+def _cut(parts: Iterable[npt.NDArray[Any]], size: int) -> Iterator[npt.NDArray[Any]]:
+    """All rows in chunks of ``size``, wherever one part ends and the next begins."""
+    held: list[npt.NDArray[Any]] = []
+    for part in parts:
+        while len(part):
+            held.append(part[: size - sum(map(len, held))])
+            part = part[len(held[-1]) :]
+            if sum(map(len, held)) == size:
+                yield np.concatenate(held)
+                held = []
+    if held:
+        yield np.concatenate(held)
+
+
+def _column(parts: Iterable[npt.NDArray[Any]]) -> Floats:
+    return np.concatenate([part[:, 0].astype(np.float64) for part in parts])
+
+
+def _step(
+    datasets: Sequence[LoadedDataset],
+    ahead: int,
+    relative: npt.NDArray[np.bool_] | None,
+    dims: slice,
+) -> npt.NDArray[np.float32]:
+    """Actions ``ahead`` rows after each usable one, where they are within the episode."""
+    parts = []
+    for one in datasets:
+        rows = one.rows[one.rows + ahead < one.end[one.rows]]
+        actions = one.actions[:, dims][rows + ahead]
+        if relative is not None:
+            actions = actions - one.states[:, : len(relative)][:, dims][rows] * relative[dims]
+        parts.append(actions)
+    return np.concatenate(parts)
+
+
 def _histogram_quantile(histogram: npt.NDArray[np.int64], level: float) -> float:
     """The quantile of the counted values, by linear interpolation as ``np.quantile`` does it."""
     cumulative = np.cumsum(histogram)
@@ -162,8 +222,3 @@ def _histogram_quantile(histogram: npt.NDArray[np.int64], level: float) -> float
     low = int(np.floor(place))
     below, above = np.searchsorted(cumulative, [low, low + (place > low)], side="right")
     return float(below + (above - below) * (place - low))
-
-
-def as_lists(stats: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    """Plain JSON values."""
-    return {name: value.tolist() for name, value in stats.items()}

@@ -1,7 +1,7 @@
 """Check a dataset down to its last frame: ``fluxvla data validate``.
 
-Opening a dataset checks its tables and the indices of its videos; this decodes every frame too,
-and does not stop at the first file that is damaged.
+Opening a dataset checks its tables and the indices of its videos; this also decodes every frame,
+and does not stop at the first damaged file.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.columns import read_columns
+from fluxvla_core.data import lerobot
+from fluxvla_core.data.columns import Track, check_tasks, make_track, read_columns
 from fluxvla_core.data.files import read_json, read_table
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.recording import Track, check_tasks, make_track
 from fluxvla_core.data.statistics import column_statistics
-from fluxvla_core.data.video import check_video, open_source
+from fluxvla_core.data.video_decode import ExpectedVideo, check_video, open_source
 from fluxvla_core.errors import DataError, FluxError
 
 LISTED = 20
@@ -31,16 +30,16 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
     """Read all columns and decode all frames of the dataset below ``root``.
 
     Returns:
-        What somebody should know although the dataset can be used; also told to ``reporter``.
+        Warnings: the dataset can be used, but somebody should know; ``reporter`` gets them, too.
 
     Raises:
         DataError: everything that is wrong, with the files' names.
     """
-    say = reporter or SilentReporter()
+    reporter = reporter or SilentReporter()
     meta = read_metadata(root)
     columns = _read_columns(meta)
     frames = len(columns["timestamp"])
-    say.info(
+    reporter.info(
         f"{root}: LeRobot {meta.version}, {len(meta.episodes)} episodes, "
         f"{frames} frames at {meta.fps:g} Hz"
     )
@@ -51,9 +50,9 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
         wrong.append(str(error))
     damaged: set[Path] = set()
 
-    def check(path: Path, expected: int) -> None:
+    def check(path: Path, stated: ExpectedVideo) -> None:
         try:
-            check_video(path, expected)
+            check_video(path, stated)
         except DataError as error:
             wrong.append(str(error))
             damaged.add(path)
@@ -71,18 +70,18 @@ def validate(root: Path, reporter: Reporter | None = None) -> list[str]:
         for number, source in enumerate(track.files):
             try:
                 if source not in damaged:
-                    _decode(track, number, say, done, total)
+                    _decode(track, number, reporter, done, total)
             except FluxError as error:
                 wrong.append(str(error))
             done += int((track.file == number).sum())
         if len(wrong) == before and damaged.isdisjoint(track.files):
-            say.info(f"{track.key}: {frames} frames in {len(track.files)} files")
-    say.progress("decode frames", total, total)
+            reporter.info(f"{track.key}: {frames} frames in {len(track.files)} files")
+    reporter.progress("decode frames", total, total)
     _raise(meta, wrong)
-    doubts = _doubts(meta, columns)
-    for doubt in doubts:
-        say.warn(doubt)
-    return doubts
+    warnings = _find_warnings(meta, columns)
+    for warning in warnings:
+        reporter.warn(warning)
+    return warnings
 
 
 def _read_columns(meta: Metadata) -> dict[str, npt.NDArray[Any]]:
@@ -109,7 +108,7 @@ def _raise(meta: Metadata, wrong: list[str]) -> None:
         raise DataError(f"{meta.root}: {len(wrong)} findings\n" + "\n".join(wrong[:LISTED]) + more)
 
 
-def _decode(track: Track, number: int, say: Reporter, done: int, total: int) -> None:
+def _decode(track: Track, number: int, reporter: Reporter, done: int, total: int) -> None:
     pictures = open_source(track.files[number])
     try:
         for count, time in enumerate(np.sort(track.time[track.file == number])):
@@ -120,7 +119,7 @@ def _decode(track: Track, number: int, say: Reporter, done: int, total: int) -> 
                     f"{image.shape[1]}, info.json says {track.height} x {track.width}"
                 )
             if count % EVERY == 0:
-                say.progress("decode frames", done + count, total)
+                reporter.progress("decode frames", done + count, total)
     finally:
         pictures.close()
 
@@ -141,20 +140,21 @@ def _wrong_times(meta: Metadata, timestamp: npt.NDArray[Any]) -> list[str]:
     ]
 
 
-def _doubts(meta: Metadata, columns: dict[str, npt.NDArray[Any]]) -> list[str]:
+def _find_warnings(meta: Metadata, columns: dict[str, npt.NDArray[Any]]) -> list[str]:
     found = []
     if meta.embodiment is None:
         found.append(
-            f"{v3.EMBODIMENT} is missing: a policy acts only if its config says embodiment="
+            f"{lerobot.EMBODIMENT} is missing: a policy acts only if its config says embodiment="
         )
     used = np.unique(columns["task_index"])
     empty = [int(i) for i in used if not meta.tasks[i].strip()]
     if empty:
         found.append(f"{meta.tasks_file}: no instruction for task_index {empty}")
-    path = meta.root / v3.STATS
-    if meta.version == v3.VERSION and path.is_file():
+    path = meta.root / lerobot.STATS
+    if meta.version == lerobot.VERSION and path.is_file():
         found += [
-            f"{v3.STATS}: {text} (FluxVLA computes its own); fluxvla data stats --write corrects it"
+            f"{lerobot.STATS}: {text} (FluxVLA computes its own); "
+            "fluxvla data stats --write corrects it"
             for text in _wrong_statistics(read_json(path), meta, columns)
         ]
     return found
@@ -176,7 +176,11 @@ def _wrong_statistics(
         # Means and deviations only: others' quantiles are estimates, and say so.
         scale = np.maximum(true["std"], 1e-3 * np.abs(true["mean"]) + 1e-6)
         for name in ("mean", "std"):
-            value = np.asarray(entry.get(name, true[name]), np.float64)
+            try:
+                value = np.asarray(entry.get(name, true[name]), np.float64)
+            except (TypeError, ValueError):  # text, or rows of different lengths
+                found.append(f"{key}: {name} is no list of numbers")
+                continue
             if value.shape != true[name].shape or (abs(value - true[name]) > 0.01 * scale).any():
                 found.append(f"{key}: {name} is not that of the data")
     return found

@@ -1,38 +1,48 @@
-"""Recording a dataset, episode by episode, so that a crash leaves either it or what was saved.
+"""``LeRobotWriter``: record a dataset episode by episode; a crash loses at most the current one.
 
-Everything goes into a folder of its own beside the dataset, ``.<name>.writing``. An episode is
-there once its folder has its final name; the dataset is there once ``finalize`` has renamed it.
+Everything goes into a staging folder beside the dataset, ``.<name>.writing``. An episode is saved
+once its folder has its final name; the dataset exists once ``finalize`` has renamed the folder.
 """
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.data import lerobot_v3 as v3
-from fluxvla_core.data.assemble import Recording, assemble
-from fluxvla_core.data.draft import EpisodeDraft, Sizes, load_episode
-from fluxvla_core.data.encode import find_codec
-from fluxvla_core.data.files import read_json, write_json
-from fluxvla_core.errors import DataError, RunFailed
+from fluxvla_core import untrusted
+from fluxvla_core.data import lerobot
+from fluxvla_core.data.assemble import DatasetSettings, Episode, assemble
+from fluxvla_core.data.files import (
+    check_absent,
+    explain_disk,
+    make_staging,
+    publish,
+    read_json,
+    staging_of,
+    write_json,
+)
+from fluxvla_core.data.statistics import LEVELS, image_histogram
+from fluxvla_core.data.video_encode import Clip, Codec, EpisodeEncoder, find_codec
+from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.untrusted import checked
 
 _RECORDING = "recording.json"
+Sizes = dict[str, tuple[int, int]]
 
 
 class LeRobotWriter:
-    """Writes a LeRobot v3.0 dataset.
+    """Record a LeRobot v3.0 dataset.
 
     Use it as a context manager: leaving it normally finalizes; leaving it by an exception keeps
     the saved episodes in the staging folder, where ``recover=True`` finds them.
@@ -45,7 +55,8 @@ class LeRobotWriter:
         robot_type: LeRobot's name of the robot; the embodiment's by default.
         video_codec: ``h264`` (decodes everywhere, encodes fast) or ``libsvtav1`` (smaller).
         data_file_mb, video_file_mb: a file that would get larger is followed by another.
-        recover: go on with the episodes of a recording that was interrupted.
+        recover: continue with the episodes of a recording that was interrupted.
+        go_on: how to continue, for the message when the disk is full.
 
     Raises:
         DataError: there is a dataset, or an interrupted recording, already; with ``recover``, that
@@ -60,13 +71,15 @@ class LeRobotWriter:
         embodiment: EmbodimentSpec,
         robot_type: str | None = None,
         video_codec: str = "h264",
-        data_file_mb: float = v3.DATA_FILE_MB,
-        video_file_mb: float = v3.VIDEO_FILE_MB,
+        data_file_mb: float = lerobot.DATA_FILE_MB,
+        video_file_mb: float = lerobot.VIDEO_FILE_MB,
         recover: bool = False,
+        go_on: str = "LeRobotWriter(..., recover=True).finalize()",
     ) -> None:
         self.root = Path(root)
+        self._go_on = go_on
         self._codec = find_codec(video_codec)
-        self._recording = Recording(
+        self._recording = DatasetSettings(
             float(fps),
             embodiment,
             video_codec,
@@ -79,9 +92,9 @@ class LeRobotWriter:
         self._sizes: Sizes = {}
         self._saved: list[Path] = []
         if self._staging.exists():
-            self._take_over(recover)
+            self._continue_recording(recover)
         make_staging(self._staging)
-        self._draft = self._new_draft()
+        self._buffer = self._new_buffer()
 
     @property
     def episodes(self) -> int:
@@ -91,7 +104,7 @@ class LeRobotWriter:
     @property
     def frames(self) -> int:
         """Frames of the episode that is being recorded."""
-        return len(self._draft)
+        return len(self._buffer)
 
     def add_frame(
         self,
@@ -113,12 +126,12 @@ class LeRobotWriter:
             RunFailed: the disk is full.
         """
         try:
-            self._draft.add(images, state, action, task)
+            self._buffer.add(images, state, action, task)
         except OSError as error:
             raise self._disk(error) from error
 
     def save_episode(self, key: int | None = None) -> int:
-        """Keep the episode; returns its number.
+        """Save the episode; returns its number.
 
         Args:
             key: its place among episodes that other processes record, for example its seed;
@@ -128,23 +141,23 @@ class LeRobotWriter:
             DataError: no frame was added.
             RunFailed: the disk is full; the episodes before are safe.
         """
-        if not len(self._draft):
+        if not len(self._buffer):
             raise DataError("save_episode: no frame was added since the last episode")
         number = len(self._saved)
         final = self._staging / f"episode-{number:06d}"
         try:
             write_json(self._staging / _RECORDING, {"sizes": self._sizes, **self._settings()})
-            self._draft.save(final, key)
+            self._buffer.save(final, key)
         except OSError as error:
             raise self._disk(error) from error
         self._saved.append(final)
-        self._draft = self._new_draft()
+        self._buffer = self._new_buffer()
         return number
 
     def discard_episode(self) -> None:
-        """Forget the frames since the last episode."""
-        self._draft.discard()
-        self._draft = self._new_draft()
+        """Drop the frames since the last episode."""
+        self._buffer.discard()
+        self._buffer = self._new_buffer()
 
     def finalize(self) -> Path:
         """Write the dataset and remove the staging folder; returns the dataset's path.
@@ -153,9 +166,9 @@ class LeRobotWriter:
             DataError: no episode was saved, or frames were added after the last one.
             RunFailed: the disk is full; the saved episodes are safe.
         """
-        if len(self._draft):
+        if len(self._buffer):
             raise DataError(
-                f"finalize: {len(self._draft)} frames belong to no episode",
+                f"finalize: {len(self._buffer)} frames belong to no episode",
                 next="call save_episode() or discard_episode() first",
             )
         if not self._saved:
@@ -185,7 +198,7 @@ class LeRobotWriter:
         else:
             self.discard_episode()
 
-    def _take_over(self, recover: bool) -> None:
+    def _continue_recording(self, recover: bool) -> None:
         saved = sorted(self._staging.glob("episode-*"))
         if not recover:
             raise DataError(
@@ -194,9 +207,10 @@ class LeRobotWriter:
                 next="LeRobotWriter(..., recover=True) goes on with them; or delete that folder",
             )
         if saved:
-            said = read_json(self._staging / _RECORDING)
-            self._check_settings(said)
-            self._sizes = {camera: (size[0], size[1]) for camera, size in said["sizes"].items()}
+            before = read_json(self._staging / _RECORDING)
+            self._check_settings(before)
+            sizes = checked(before.get("sizes"), dict[str, tuple[int, int]], DataError, _RECORDING)
+            self._sizes = dict(sizes)
         self._saved = saved
 
     def _settings(self) -> dict[str, Any]:
@@ -209,24 +223,24 @@ class LeRobotWriter:
         }
         return dict(json.loads(json.dumps(settings)))
 
-    def _check_settings(self, said: Mapping[str, Any]) -> None:
-        """Refuse to go on with episodes of another robot, rate or codec."""
+    def _check_settings(self, before: Mapping[str, Any]) -> None:
+        """Refuse to continue with episodes of another robot, rate or codec."""
         here = self._settings()
-        other = [key for key in here if key not in said or said[key] != here[key]]
+        other = [key for key in here if key not in before or before[key] != here[key]]
         if not other:
             return
-        listed = [k if k == "embodiment" else f"{k}: {said.get(k)} / {here[k]}" for k in other]
+        listed = [k if k == "embodiment" else f"{k}: {before.get(k)} / {here[k]}" for k in other]
         raise DataError(
             f"{self.root}: the recording that was interrupted has another {', '.join(listed)}",
             cause="what was saved and what is to come would not be read alike",
             next="record with the settings of then, or into another folder",
         )
 
-    def _new_draft(self) -> EpisodeDraft:
+    def _new_buffer(self) -> EpisodeBuffer:
         spec, fps = self._recording.embodiment, self._recording.fps
-        return EpisodeDraft(self._staging / "part", spec, fps, self._codec, self._sizes)
+        return EpisodeBuffer(self._staging / "part", spec, fps, self._codec, self._sizes)
 
-    def _sized(self) -> Recording:
+    def _sized(self) -> DatasetSettings:
         """The recording with the pictures' true sizes in its embodiment."""
         spec = self._recording.embodiment
         cameras = tuple(
@@ -240,88 +254,143 @@ class LeRobotWriter:
             error,
             self.root,
             f"{len(self._saved)} saved episodes are safe in {self._staging}",
-            "make room, then LeRobotWriter(..., recover=True).finalize()",
+            f"make room, then {self._go_on}",
         )
 
 
-def staging_of(root: Path) -> Path:
-    """Where a dataset is while it is written."""
-    return root.with_name(f".{root.name}.writing")
-
-
-def make_staging(staging: Path) -> None:
-    """Make the folder that a dataset is written in.
-
-    Raises:
-        DataError: it cannot be made.
-    """
-    try:
-        staging.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"{staging.parent}: no dataset can be written here ({error.strerror})",
-            cause="there is no permission to write, or a file is where a folder should be",
-        ) from error
-
-
-@contextmanager
-def built_aside(target: Path, safe: str, next: str) -> Iterator[Path]:
-    """A folder to write the dataset ``target`` into; it appears there if nothing is raised.
+class EpisodeBuffer:
+    """The frames since the last saved episode. Images are encoded as they come.
 
     Args:
-        safe, next: what to say when the disk is full.
+        folder: where its files go; made with the first frame.
+        sizes: camera -> (height, width) of earlier frames; filled from the first ones.
+    """
+
+    def __init__(
+        self, folder: Path, embodiment: EmbodimentSpec, fps: float, codec: Codec, sizes: Sizes
+    ) -> None:
+        self.folder = folder
+        self.embodiment = embodiment
+        self.fps = fps
+        self.codec = codec
+        self.sizes = sizes
+        self.task: str | None = None
+        self.states: list[npt.NDArray[np.float32]] = []
+        self.actions: list[npt.NDArray[np.float32]] = []
+        self.histograms = {
+            lerobot.image_feature(c): np.zeros((3, LEVELS), np.int64)
+            for c in embodiment.camera_names
+        }
+        self._encoders: dict[str, EpisodeEncoder] = {}
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def add(
+        self,
+        images: Mapping[str, npt.NDArray[np.uint8]],
+        state: npt.ArrayLike,
+        action: npt.ArrayLike,
+        task: str,
+    ) -> None:
+        """Check and add one frame; nothing is added if anything is wrong with it."""
+        if not task.strip():
+            raise DataError("add_frame: the task is empty; every episode needs an instruction")
+        if self.task is not None and task != self.task:
+            raise DataError(f"add_frame: task {task!r} within an episode of {self.task!r}")
+        row = (
+            _vector("state", state, self.embodiment.state_dim),
+            _vector("action", action, self.embodiment.dim),
+        )
+        cameras = self.embodiment.camera_names
+        if set(images) != set(cameras):
+            raise DataError(
+                f"add_frame: cameras {sorted(images)} given, {sorted(cameras)} expected"
+            )
+        for camera in cameras:
+            self._check_image(camera, images[camera])
+        if not self._encoders:
+            self._open()
+        for camera in cameras:
+            self._encoders[camera].add(images[camera])
+            self.histograms[lerobot.image_feature(camera)] += image_histogram(images[camera])
+        self.task = task
+        self.states.append(row[0])
+        self.actions.append(row[1])
+
+    def save(self, final: Path, key: int | None) -> None:
+        """Finish the files and give the folder its final name."""
+        for encoder in self._encoders.values():
+            encoder.close()
+        columns: dict[str, Any] = {"state": np.stack(self.states), "action": np.stack(self.actions)}
+        np.savez(self.folder / "columns.npz", **columns)
+        counts: dict[str, Any] = dict(self.histograms)
+        np.savez(self.folder / "histograms.npz", **counts)
+        write_json(self.folder / "episode.json", {"task": self.task, "key": key})
+        os.replace(self.folder, final)
+
+    def discard(self) -> None:
+        """Delete the files."""
+        for encoder in self._encoders.values():
+            encoder.abandon()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _open(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir()
+        for camera in self.embodiment.camera_names:
+            path = self.folder / f"{lerobot.image_feature(camera)}.mp4"
+            self._encoders[camera] = EpisodeEncoder(path, *self.sizes[camera], self.fps, self.codec)
+
+    def _check_image(self, camera: str, image: Any) -> None:
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            kind = getattr(image, "dtype", type(image).__name__)
+            raise DataError(f"add_frame: camera {camera!r} gives {kind}, uint8 is expected")
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise DataError(
+                f"add_frame: camera {camera!r} gives shape {image.shape}, (height, width, 3) "
+                "is expected"
+            )
+        size = self.sizes.setdefault(camera, (image.shape[0], image.shape[1]))
+        if image.shape[:2] != size:
+            raise DataError(
+                f"add_frame: camera {camera!r} gives {image.shape[0]} x {image.shape[1]}, "
+                f"{size[0]} x {size[1]} before"
+            )
+
+
+def load_episode(folder: Path) -> Episode:
+    """Load a saved episode.
 
     Raises:
-        DataError: ``target`` exists, is under way, or cannot be written.
-        RunFailed: the disk is full.
+        DataError: it cannot be read as one.
     """
-    check_absent(target)
-    staging = staging_of(target)
-    if staging.exists():
-        raise DataError(
-            f"{target}: {staging} is in the way",
-            cause="another process writes the same dataset, or was interrupted",
-            next="delete that folder if nothing is writing there",
-        )
-    make_staging(staging)
+    about = untrusted.read_json(folder / "episode.json", _SavedAbout, DataError)
     try:
-        yield staging
-        publish(staging, target)
-    except OSError as error:
-        raise explain_disk(error, target, safe, next) from error
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-
-
-def explain_disk(error: OSError, root: Path, safe: str, next: str) -> Exception:
-    """What to raise for ``error``: RunFailed when the disk is full, else ``error`` itself."""
-    if error.errno != errno.ENOSPC:
-        return error
-    return RunFailed(f"{root}: no space left on the disk", cause=safe, next=next)
-
-
-def check_absent(root: Path) -> None:
-    """Refuse to write over anything.
-
-    Raises:
-        DataError: ``root`` exists and is not an empty folder.
-    """
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        with np.load(folder / "columns.npz") as file:
+            state, action = file["state"], file["action"]
+        with np.load(folder / "histograms.npz") as file:
+            histograms = {key: file[key] for key in file.files}
+    except (KeyError, ValueError, EOFError, BadZipFile) as error:
         raise DataError(
-            f"{root}: there is something here already; a dataset is never written over",
-            next="choose another folder, or delete this one",
-        )
+            f"{folder}: a saved episode cannot be read ({error})",
+            cause="the disk lost a part of it, or it was changed",
+        ) from error
+    paths = {key: folder / f"{key}.mp4" for key in histograms}
+    clips = {key: Clip(path, len(state), path.stat().st_size) for key, path in paths.items()}
+    return Episode(about.task, about.key, state, action, clips, histograms)
 
 
-def publish(built: Path, root: Path) -> None:
-    """Put a finished dataset in its place in one step, with its files safely on the disk."""
-    for path in sorted(built.rglob("*")):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    os.replace(built, root)
-    parent = os.open(root.parent, os.O_RDONLY)
-    try:
-        os.fsync(parent)
-    finally:
-        os.close(parent)
+@dataclass(frozen=True)
+class _SavedAbout:
+    task: str
+    key: int | None = None
+
+
+def _vector(what: str, values: npt.ArrayLike, dim: int) -> npt.NDArray[np.float32]:
+    array = np.array(values, np.float32)
+    if array.shape != (dim,):
+        raise DataError(f"add_frame: {what} has shape {array.shape}, ({dim},) is expected")
+    if not np.isfinite(array).all():
+        raise DataError(f"add_frame: {what} is not finite: {array.tolist()}")
+    return array

@@ -1,49 +1,35 @@
-"""Run episodes in worker processes and keep their results as they come.
+"""Run the episodes of an evaluation in worker processes, or this process's shard of them.
 
 What an episode needs (a simulator, a policy) is made by a factory in each worker process. Its
 result must follow from the episode's key alone; then neither the number of workers nor an
 interruption changes anything but the time it takes.
+
+torchrun sets ``RANK`` and ``WORLD_SIZE``, a SLURM array ``SLURM_ARRAY_TASK_ID`` (with ``_MIN``,
+``_COUNT``), ``srun`` ``SLURM_PROCID`` and ``SLURM_NTASKS``; an array of srun steps has both. Nobody
+has to wait for anybody: each shard has an episode log of its own in the same folder, and whoever
+finds all episodes finished writes the results.
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.evaluate.ledger import DONE, ERROR, EpisodeKey, Ledger
+from fluxvla_core.errors import UsageError
+from fluxvla_core.evaluate.episode_log import DONE, ERROR, EpisodeKey, EpisodeLog
 from fluxvla_core.evaluate.pool import Outcome, WorkerPool
-from fluxvla_core.evaluate.summary import reason
-
-EpisodeFactory = Callable[[], Callable[[EpisodeKey], dict[str, Any]]]
-
-
-def run_episodes(
-    factory: EpisodeFactory,
-    keys: Sequence[EpisodeKey],
-    ledger: Ledger,
-    workers: int,
-    reporter: Reporter,
-    timeout_s: float | None = None,
-) -> list[dict[str, Any]]:
-    """:func:`run_in_pool` with processes of its own.
-
-    Args:
-        factory: makes, in a worker process, the function from a key to a result.
-        workers: processes.
-        timeout_s: how long one attempt at an episode may take.
-    """
-    with WorkerPool(factory, workers, timeout_s=timeout_s) as pool:
-        return run_in_pool(pool, keys, ledger, reporter)
+from fluxvla_core.evaluate.statistics import reason
 
 
 def run_in_pool(
-    pool: WorkerPool, keys: Sequence[EpisodeKey], ledger: Ledger, reporter: Reporter
+    pool: WorkerPool, keys: Sequence[EpisodeKey], log: EpisodeLog, reporter: Reporter
 ) -> list[dict[str, Any]]:
-    """Run the episodes of ``keys`` that ``ledger`` does not have yet.
+    """Run the episodes of ``keys`` that ``log`` does not have yet.
 
     Args:
         pool: its factory makes, in a worker process, a function from a key to a result: JSON
@@ -58,17 +44,17 @@ def run_in_pool(
         FluxError: one that means bad input, from a worker.
         KeyboardInterrupt: after the workers have been ended; finished episodes are kept.
     """
-    missing = [key for key in keys if key not in ledger]
+    missing = [key for key in keys if key not in log]
     errors: dict[EpisodeKey, dict[str, Any]] = {}
     done, began = len(keys) - len(missing), time.monotonic()
-    succeeded = sum(bool(record["success"]) for record in ledger.records(keys))
+    succeeded = sum(bool(record["success"]) for record in log.records(keys))
     if done and missing:
         reporter.info(f"{done} of {len(keys)} episodes are there already; going on with the others")
     with closing(pool.run(missing)) as outcomes:
         for outcome in outcomes:
             key = missing[outcome.index]
             record = _record(key, outcome)
-            ledger.add(record)
+            log.add(record)
             if record["status"] == ERROR:
                 errors[key] = record
                 reporter.warn(_error_line(record))
@@ -79,7 +65,7 @@ def run_in_pool(
             reporter.progress(
                 "episodes", done, len(keys), successes=succeeded, per_minute=round(pace, 1)
             )
-    return [errors[key] if key in errors else ledger.records([key])[0] for key in keys]
+    return [errors[key] if key in errors else log.records([key])[0] for key in keys]
 
 
 def _record(key: EpisodeKey, outcome: Outcome) -> dict[str, Any]:
@@ -96,18 +82,6 @@ def _error_line(record: dict[str, Any]) -> str:
         f"episode {record['group']}/{record['task']}/{record['seed']} gave no result "
         f"after {record['attempts']} attempts: {reason(record['error'])}"
     )
-
-
-def open_ledger(
-    path: Path, what: dict[str, Any], reporter: Reporter, beside: str | None = None
-) -> Ledger:
-    """The ledger of an evaluation of ``what``; says so if another one was in the way."""
-    ledger = Ledger(path, what, beside)
-    if ledger.set_aside is not None:
-        reporter.info(
-            f"{path.name} was about another evaluation; it is {ledger.set_aside.name} now"
-        )
-    return ledger
 
 
 def episode_keys(
@@ -128,3 +102,61 @@ def episode_keys(
     return [
         EpisodeKey(group, task, first + number) for task, number in pairs for group, first in groups
     ]
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``index`` of ``count`` of an evaluation's episodes; all of them by default."""
+
+    index: int = 0
+    count: int = 1
+
+    def of(self, items: Sequence[T]) -> list[T]:
+        """Every ``count``-th item: each part has some of every task."""
+        return list(items[self.index :: self.count])
+
+    @property
+    def log_name(self) -> str:
+        """The file name of this part's episode log."""
+        if self.count == 1:
+            return "episodes.jsonl"
+        return f"episodes-{self.index:04d}-of-{self.count:04d}.jsonl"
+
+
+def shard_of(environment: Mapping[str, str] | None = None) -> Shard:
+    """The part that the process's environment variables say it is.
+
+    Raises:
+        UsageError: they make no sense.
+    """
+    env = os.environ if environment is None else environment
+    try:
+        array = _array(env)
+        step = _pair(env, "RANK", "WORLD_SIZE") or _pair(env, "SLURM_PROCID", "SLURM_NTASKS")
+    except ValueError as error:
+        raise UsageError(f"this process cannot tell which part of the job it is: {error}") from None
+    (a, n), (b, m) = array or (0, 1), step or (0, 1)
+    if not (0 <= a < n and 0 <= b < m):
+        raise UsageError(
+            f"this process is said to be part {a} of {n} and {b} of {m}",
+            cause="RANK, WORLD_SIZE or SLURM_* were changed by hand",
+        )
+    return Shard(a * m + b, n * m)
+
+
+def _array(env: Mapping[str, str]) -> tuple[int, int] | None:
+    if "SLURM_ARRAY_TASK_ID" not in env:
+        return None
+    if int(env.get("SLURM_ARRAY_TASK_STEP", "1")) != 1:
+        raise ValueError("the SLURM array counts in steps; use --array=0-N")
+    first = int(env.get("SLURM_ARRAY_TASK_MIN", "0"))
+    return int(env["SLURM_ARRAY_TASK_ID"]) - first, int(env["SLURM_ARRAY_TASK_COUNT"])
+
+
+def _pair(env: Mapping[str, str], index: str, count: str) -> tuple[int, int] | None:
+    if index not in env or count not in env:
+        return None
+    return int(env[index]), int(env[count])

@@ -23,21 +23,21 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.contracts.continuation import Continuation
-from fluxvla_core.contracts.environment import Actor, Environment, Step, TaskSpec
+from fluxvla_core.contracts.environment import Environment, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
-from fluxvla_core.contracts.optional import can_continue
-from fluxvla_core.control.clock import MonotonicClock
+from fluxvla_core.contracts.policy import Actor, Continuation, Policy
+from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
+from fluxvla_core.evaluate.divergence import check_step
 from fluxvla_core.evaluate.live_settings import Live
-from fluxvla_core.evaluate.rollout import check_state
-from fluxvla_core.infer.base_runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.robot.clock import MonotonicClock
+from fluxvla_core.robot.runner import BaseInferenceRunner
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 
 
-class EnvironmentOperator:
+class EnvironmentOperator(Operator):
     """An environment as a robot that lives in real time.
 
     Physics is stepped in whole control periods as they become due, whenever somebody looks or
@@ -55,6 +55,8 @@ class EnvironmentOperator:
     """
 
     api: ClassVar[str] = "1.0"
+    embodiment: EmbodimentSpec
+    clock: MonotonicClock
 
     def __init__(
         self,
@@ -65,6 +67,7 @@ class EnvironmentOperator:
         cameras: tuple[Camera, ...],
         max_steps: int,
     ) -> None:
+        environment, actor = Environment.adapt(environment), Actor.adapt(actor)
         self.embodiment = replace(environment.spec.embodiment, cameras=cameras)
         self.clock = MonotonicClock()
         self.ticks = self.late = 0
@@ -85,8 +88,7 @@ class EnvironmentOperator:
         """Reset the environment; called by the runner."""
         with self._lock:
             self._environment.reset(self._seed, self._task.name)
-            if hasattr(self._actor, "enter"):
-                self._actor.enter(self._environment)
+            self._actor.enter(self._environment)
             self._began = self._target = self._found = None
             self.ticks = self.late = 0
 
@@ -147,7 +149,7 @@ class EnvironmentOperator:
         while self.ticks < due and not self._over():
             try:
                 self._found = self._environment.step(self._target)
-                check_state(self._environment.state, self.ticks + 1)
+                check_step(self._environment, self.ticks + 1)
             except Exception as error:
                 self.failed = error
                 raise
@@ -167,17 +169,25 @@ class EnvironmentOperator:
         return target
 
 
-class _Driver:
+class _Driver(Policy):
     """An actor with all that the Policy contract asks for."""
 
+    embodiment: EmbodimentSpec
+    cameras: tuple[str, ...]
+    action_rate_hz: float
+    horizon: int
+    continues: bool
+
     def __init__(self, actor: Actor, environment: Environment, cameras: tuple[Camera, ...]) -> None:
-        spec = environment.spec.embodiment
+        spec, actor = environment.spec.embodiment, Actor.adapt(actor)
         self._actor = actor
-        self.embodiment = getattr(actor, "embodiment", None) or replace(spec, cameras=cameras)
+        self.embodiment = actor.embodiment or replace(spec, cameras=cameras)
         self.cameras = tuple(camera.name for camera in cameras)
-        self.action_rate_hz = float(getattr(actor, "action_rate_hz", spec.rate_hz))
-        self.horizon = int(getattr(actor, "horizon", 0))
-        self.continues = can_continue(actor)
+        self.action_rate_hz = float(
+            spec.rate_hz if actor.action_rate_hz is None else actor.action_rate_hz
+        )
+        self.horizon = int(1 if actor.horizon is None else actor.horizon)
+        self.continues = self._actor.continues
         self.seconds = 0.0
 
     def reset(self, seed: int) -> None:
@@ -187,14 +197,15 @@ class _Driver:
         return self._timed(self._actor.predict_action, observation)
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        return self._timed(self._actor.continue_action, observation, rest)  # type: ignore[attr-defined]
+        return self._timed(self._actor.continue_action, observation, rest)
 
     def _timed(self, ask: Callable[..., Array], *arguments: Any) -> Array:
         began = time.perf_counter()
         chunk = ask(*arguments)
         self.seconds += time.perf_counter() - began
         # An expert's chunks may be of any length; what a policy said, it has to keep.
-        self.horizon = getattr(self._actor, "horizon", len(chunk))
+        own = self._actor.horizon
+        self.horizon = len(chunk) if own is None else own
         return chunk
 
 
@@ -222,13 +233,13 @@ def run_live(
 
     Raises:
         ConfigError: the environment takes no joint targets, or an option does not fit.
-        RunFailed: the environment's state is not finite; or what its ``step`` raised.
+        RunFailed: the environment's simulation diverged; or what its ``step`` raised.
     """
     if not environment.spec.limited:
         raise ConfigError(
             f"{environment.spec.name} takes no joint targets: the safety of a robot cannot be kept "
             "for its actions, and live evaluation goes by way of it",
-            next="evaluate it stepped: live = False",
+            next="evaluate it stepped: --set eval.live=false",
         )
     folder = Path(live.folder) / name
     shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was cut short

@@ -1,4 +1,4 @@
-"""Which policy is measured: a checkpoint's, its untrained twin, or a registered one."""
+"""Which policy is evaluated: a checkpoint's, its untrained twin, or a registered one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import build_policy_from_cfg
-from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError, SpecMismatch
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, check_match
+from fluxvla_core.spec.embodiment import Camera, check_match
 
 if TYPE_CHECKING:
-    from fluxvla_core.infer.local_policy import LocalPolicy
+    from fluxvla_core.robot.local_policy import LocalPolicy
+from pathlib import Path
 
 CHECKPOINT, UNTRAINED, EXPERT, RANDOM = "checkpoint", "untrained", "expert", "random"
 NAMES = (CHECKPOINT, UNTRAINED, EXPERT, RANDOM)
@@ -79,16 +81,14 @@ def make_policy(source: Source) -> Actor:
         CheckpointError, ConfigError, PluginError: see ``load_policy``, ``build_from_cfg``.
     """
     if not isinstance(source.what, str):
-        made: Actor = build_policy_from_cfg(source.what)
-        return made
+        return Actor.adapt(build_policy_from_cfg(source.what))
     return load(source)
 
 
 def load(source: Source) -> LocalPolicy:
     """The policy of a checkpoint, or its untrained twin: the same model with fresh random weights
     and everything else as it is, which tells what the pipeline does without having learned."""
-    from fluxvla_core.evaluate.subject import untrained_model
-    from fluxvla_core.infer.local_policy import load_policy
+    from fluxvla_core.robot.local_policy import load_policy
 
     assert source.ckpt_path is not None
     dataset, denormalize = source.dataset, source.denormalize_action
@@ -102,7 +102,7 @@ def load(source: Source) -> LocalPolicy:
 
 
 def fit(
-    policy: Any, spec: EnvironmentSpec, size: tuple[int, int] | None = None
+    policy: Actor, spec: EnvironmentSpec, size: tuple[int, int] | None = None
 ) -> tuple[Camera, ...]:
     """The cameras that ``policy`` looks at, in the sizes that it was trained with.
 
@@ -114,12 +114,13 @@ def fit(
         SpecMismatch: its numbers mean something else here: joints, units, frames, rotations,
             gripper polarity, absolute or delta, rate; or a camera is missing.
     """
-    embodiment: EmbodimentSpec | None = getattr(policy, "embodiment", None)
+    policy = Actor.adapt(policy)
+    embodiment = policy.embodiment
     trained = {c.name: c for c in embodiment.cameras} if embodiment is not None else {}
-    names = tuple(getattr(policy, "cameras", trained))
+    names = tuple(policy.cameras)
     if embodiment is not None:
         check_match(embodiment, spec.embodiment, "the policy", spec.name, cameras=names)
-    rate = getattr(policy, "action_rate_hz", None)
+    rate = policy.action_rate_hz
     if not spec.limited and rate is not None and rate != spec.embodiment.rate_hz:
         raise SpecMismatch(
             f"the policy's actions are for steps of 1/{rate:g} s, "
@@ -139,7 +140,7 @@ def fit(
     return tuple(cameras)
 
 
-class RandomPolicy:
+class RandomPolicy(Actor):
     """Uniform within the limits of every joint; what chance alone does.
 
     Args:
@@ -147,6 +148,7 @@ class RandomPolicy:
     """
 
     cameras: tuple[str, ...] = ()
+    horizon: int
 
     def __init__(self, horizon: int = 1) -> None:
         if horizon < 1:
@@ -194,3 +196,47 @@ def _with_statistics(source: Source) -> tuple[Any, Any]:
     if isinstance(denormalize, Mapping):
         denormalize = {**denormalize, "statistic_name": key}
     return dataset, denormalize
+
+
+def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
+    """The checkpoint that is meant, checked: ``path``, ``step`` and ``sha256`` of its manifest.
+
+    Args:
+        ckpt_path: checkpoint or work dir; the newest whole one of ``work_dir`` by default.
+
+    Raises:
+        CheckpointError: there is none, or the one that is named is damaged.
+    """
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.manifest import NAME, hash_file
+    from fluxvla_core.robot.local_policy import find_checkpoint
+
+    path = find_checkpoint(ckpt_path, work_dir)
+    checkpoint = Checkpoint.open(path)
+    checkpoint.verify()
+    return {"path": str(path), "step": checkpoint.step, "sha256": hash_file(path / NAME)}
+
+
+def policy_tables(path: str) -> list[Any]:
+    """Of a checkpoint's config, the tables that its policy is built from."""
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+
+    config = Checkpoint.open(path).config()
+    return [config.get(name) for name in ("model", "train_dataloader")]
+
+
+def untrained_model(ckpt_path: str, device: str) -> Any:
+    """The checkpoint's model with fresh random weights (seed 0), in evaluation mode.
+
+    Raises:
+        CheckpointError: there is no such checkpoint.
+        ConfigError, PluginError: its model cannot be built here.
+    """
+    import torch
+
+    from fluxvla_core.build import build_vla_from_cfg
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return build_vla_from_cfg(Checkpoint.open(ckpt_path).config()["model"]).to(device).eval()

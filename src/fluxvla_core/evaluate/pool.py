@@ -23,6 +23,7 @@ from typing import Any
 
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
 from fluxvla_core.plugins.files import load_plugin_files, plugin_files
+from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
 Work = Callable[[Any], Any]
 Factory = Callable[..., Work]
@@ -78,7 +79,7 @@ class _Worker:
         more = None if link is None else link()
         arguments = (theirs, factory, plugin_files(), more)
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
-        with _environment(ONE_THREAD):
+        with _environment(ONE_THREAD), held_back("spawn"):
             self.process.start()
         theirs.close()
         if more is not None:
@@ -97,9 +98,6 @@ class _Worker:
         with suppress(OSError):
             self.connection.close()
         self.process.join(grace_s)
-        if self.process.is_alive():
-            self.process.terminate()
-            self.process.join(_GRACE_S)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
@@ -250,7 +248,7 @@ class WorkerPool:
                 raise RunFailed(
                     f"worker processes die before they have begun: {why}",
                     cause="out of memory, or a library that crashes while it is loaded",
-                    next="try again with workers=1",
+                    next="try again with one: --set eval.workers=1",
                 )
         outcome = None if index is None else self._again(index, why)
         if self._waiting:
@@ -299,8 +297,7 @@ def _serve(
     link: Connection | None,
 ) -> None:
     """A worker process's life: build the worker, answer jobs until the pipe closes."""
-    # Ctrl-C reaches the whole group; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_stopping_to_the_parent()
     with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
         try:
             load_plugin_files(plugins)

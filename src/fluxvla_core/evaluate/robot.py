@@ -1,4 +1,4 @@
-"""``RobotEvalRunner``: how often a robot does what it is told, one episode after the other.
+"""``RobotEvalRunner``: a policy's success rate on a robot, one episode after the other.
 
 What drives the robot is the config's inference section as it stands: its runner, its operator, all
 of its safety, in real time. A simulated robot begins every episode from a seed and tells whether
@@ -17,14 +17,22 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 from fluxvla_core.evaluate import results
-from fluxvla_core.evaluate.episodes import open_ledger
-from fluxvla_core.evaluate.ledger import DONE, ERROR, EpisodeKey, Ledger
-from fluxvla_core.evaluate.showing import choose_episodes
-from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import problems, summarise
-from fluxvla_core.infer.base_runner import FOLDER as EPISODES
+from fluxvla_core.evaluate.episode_log import (
+    DONE,
+    ERROR,
+    EpisodeKey,
+    EpisodeLog,
+    open_episode_log,
+)
+from fluxvla_core.evaluate.policies import chosen_checkpoint, policy_tables
+from fluxvla_core.evaluate.provenance import Code, code_of, provenance
+from fluxvla_core.evaluate.results import choose_episodes
+from fluxvla_core.evaluate.statistics import problems, summarise
+from fluxvla_core.robot.runner import FOLDER as EPISODES
 
 FOLDER = "eval_robot"
 GROUP = "policy"
@@ -33,7 +41,7 @@ POLICYS_FAULT = ("chunk", "policy", "starvation", "tracking")
 any other stop it counts as an error, which says nothing about the policy."""
 
 
-class RobotEvalRunner:
+class RobotEvalRunner(Runner):
     """Runs an inference section ``episodes`` times for each task: ``run_setup()``, then ``run()``.
 
     Writes ``<work_dir>/eval_robot/``: ``results.json`` and ``episodes.jsonl``; each episode's own
@@ -52,12 +60,14 @@ class RobotEvalRunner:
             nobody: else somebody must look first, and start the same command again.
         record_videos: how many episodes the results show: failures first, then successes.
         answer: reads a person's line; stdin by default.
+        reuse: also count episodes that other code ran; without it that is asked.
 
     Raises:
         ConfigError: there is no such section, it has no such task, or a value is impossible.
     """
 
     api: ClassVar[str] = "1.0"
+    keeps_config: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -70,6 +80,7 @@ class RobotEvalRunner:
         go_on: bool = False,
         record_videos: int = 4,
         answer: Callable[[str], str] | None = None,
+        reuse: bool = False,
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
         self.section = section
@@ -78,6 +89,7 @@ class RobotEvalRunner:
         self.go_on = go_on
         self.record_videos = record_videos
         self.folder = Path(self.context.work_dir) / FOLDER
+        self.reuse = reuse
         self._answer = answer
         table = self.context.config.get(section)
         if not isinstance(table, Mapping):
@@ -114,25 +126,28 @@ class RobotEvalRunner:
         Raises:
             RunFailed: nobody can tell whether a task was done; an episode gave no result (the
                 results of the others are written).
+            UsageError: there are episodes that other code ran, and ``reuse`` is not set.
             SafetyStop, OperatorError: what ended an episode, unless ``go_on``.
         """
         reporter, keys, about = self.context.reporter, self._keys(), self._about()
-        ledger = open_ledger(self.folder / "episodes.jsonl", about, reporter)
-        missing = [key for key in keys if key not in ledger]
+        code = self._code()
+        path = self.folder / "episodes.jsonl"
+        log = open_episode_log(path, about, reporter, code=code.to_dict(), reuse=self.reuse)
+        missing = [key for key in keys if key not in log]
         errors: dict[EpisodeKey, dict[str, Any]] = {}
         began = time.monotonic()
         if 0 < len(missing) < len(keys):
             left = len(keys) - len(missing)
             reporter.info(f"{left} of {len(keys)} episodes are there already; going on")
         for key in missing:
-            record = self._episode(key, ledger)
+            record = self._episode(key, log)
             if record["status"] == ERROR:
                 errors[key] = record
-            succeeded = sum(bool(r["success"]) for r in ledger.records(keys))
-            done = len(ledger.records(keys)) + len(errors)
+            succeeded = sum(bool(r["success"]) for r in log.records(keys))
+            done = len(log.records(keys)) + len(errors)
             reporter.progress("episodes", done, len(keys), successes=succeeded)
-        records = [errors[key] if key in errors else ledger.records([key])[0] for key in keys]
-        results.check_any_done(records, ledger.path)
+        records = [errors[key] if key in errors else log.records([key])[0] for key in keys]
+        results.check_any_done(records, log.path)
         found = {
             "format": results.FORMAT,
             "policy": "checkpoint" if self._checkpoint else type(self._policy).__name__,
@@ -141,14 +156,20 @@ class RobotEvalRunner:
             "problems": problems(records),
             "checkpoint": self._checkpoint,
             "settings": {**about["settings"], **_kept_time(records)},
+            "provenance": {
+                **provenance(code),
+                "seeds": results.seeds(records),
+                "reused": {"episodes": len(log.reused), "changed": log.changed},
+            },
             "videos": self._videos(records),
             "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
         }
         path = self.folder / "results.json"
         results.write_results(path, found)
+        results.keep_config(self.folder, self.context)
         reporter.artifact("evaluation", path)
-        results.tell(reporter, found, self.folder)
-        results.check_all_done(records, ledger.path)
+        results.report_results(reporter, found, self.folder)
+        results.check_all_done(records, log.path)
         return found
 
     def _keys(self) -> list[EpisodeKey]:
@@ -164,6 +185,12 @@ class RobotEvalRunner:
             "settings": settings,
         }
 
+    def _code(self) -> Code:
+        tables: list[Any] = [self._table]
+        if self._checkpoint is not None:
+            tables += policy_tables(self._checkpoint["path"])
+        return code_of(tables, (), () if self._checkpoint is None else ("torch",))
+
     def _runner(self, key: EpisodeKey) -> Any:
         """The section's runner for one episode: its policy is loaded once and handed on."""
         table = {**self._table, "seed": key.seed}
@@ -176,9 +203,9 @@ class RobotEvalRunner:
         runner.run_setup()
         return runner
 
-    def _episode(self, key: EpisodeKey, ledger: Ledger) -> dict[str, Any]:
+    def _episode(self, key: EpisodeKey, log: EpisodeLog) -> dict[str, Any]:
         runner = self._runner(key)
-        simulated = hasattr(runner.ros_operator, "begin_episode")
+        simulated = runner.robot.simulated
         if not simulated:
             self._ask(f"{key.task}, episode {key.seed}: put things in place, then press Enter: ")
         before, began, failure = set(self._folders()), time.monotonic(), None
@@ -192,8 +219,7 @@ class RobotEvalRunner:
             raise failure
         record = {**_head(key), "attempts": 1, **_tail(summary, time.monotonic() - began)}
         record["folder"] = made[-1].relative_to(self.context.work_dir).as_posix()
-        tell = getattr(runner.ros_operator, "episode_facts", None)
-        record |= {} if tell is None else tell()
+        record |= Operator.adapt(runner.ros_operator).episode_facts()
         rules = [trip["rule"] for trip in summary["trips"]]
         if failure is None and record["success"] is None:
             record["success"] = self._judged(key)
@@ -201,7 +227,7 @@ class RobotEvalRunner:
             record["success"] = False
         elif failure is not None:
             record |= {"status": ERROR, "error": str(failure)}
-        ledger.add(record)
+        log.add(record)
         self.context.reporter.event("episode", **record)
         if failure is not None:
             if not self.go_on:
@@ -223,6 +249,7 @@ class RobotEvalRunner:
                 "this robot cannot tell whether a task was done, and nobody is there to ask",
                 next="run the evaluation at a terminal, or give the operator a task_success()",
             )
+        getattr(self.context.reporter, "settle", lambda: None)()
         return input(question).strip()
 
     def _folders(self) -> list[Path]:
@@ -279,7 +306,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _kept_time(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The worst of what simulators tell of their time, if any does."""
+    """The lowest real-time factor that simulators report, if any does."""
     kept = [r["real_time_kept"] for r in records if r.get("real_time_kept") is not None]
     return {"least_real_time_kept": min(kept)} if kept else {}
 

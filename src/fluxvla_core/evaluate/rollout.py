@@ -1,8 +1,8 @@
 """One episode in an environment: observe, predict, execute some of the chunk, observe again.
 
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
-commands are formed as on a robot: keyframes are joined linearly from the last command on and kept
-within the same limits.
+commands are formed by the same path as on a robot: keyframes are joined linearly from the last
+command on and kept within the same limits. Other actions pass the limits unchanged.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, TaskSpec
-from fluxvla_core.control.keyframes import interpolate
-from fluxvla_core.errors import RunFailed, SpecMismatch
-from fluxvla_core.safety.limits import Limiter
-from fluxvla_core.safety.trips import action_columns, not_finite
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.errors import SpecMismatch
+from fluxvla_core.evaluate.divergence import check_state, check_step
+from fluxvla_core.robot.checks import not_finite
+from fluxvla_core.robot.commands import CommandFormer
+from fluxvla_core.robot.joining import interpolate
+from fluxvla_core.robot.limits import CommandLimiter, PassThrough
+from fluxvla_core.robot.tracking import action_columns
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]
@@ -28,7 +33,7 @@ Watch = Callable[[Environment, int], None]
 
 
 @dataclass(frozen=True)
-class Course:
+class RolloutSettings:
     """How an episode is run, beside its environment, policy and key.
 
     Args:
@@ -45,17 +50,25 @@ class Course:
     policy_seed: int = 0
 
 
-class Commands:
-    """From a policy's actions to those that are executed; ``clamped`` of them were changed."""
+class ChunkCommands:
+    """From a policy's chunks to the commands of an environment, formed as a robot's are.
+
+    ``clamped`` of them were changed, or were beyond the limits of an environment that takes no
+    joint targets.
+
+    Args:
+        spec: of the environment.
+        action_rate_hz: keyframes a second; the environment's rate by default.
+    """
 
     def __init__(self, spec: EnvironmentSpec, action_rate_hz: float | None) -> None:
         self.clamped = 0
-        self._rate = spec.embodiment.rate_hz
+        body = spec.embodiment
+        self._rate = body.rate_hz
         self._action_rate = action_rate_hz or self._rate
-        self._lower = np.array([joint.lower for joint in spec.embodiment.joints])
-        self._upper = np.array([joint.upper for joint in spec.embodiment.joints])
-        self._columns = action_columns(spec.embodiment) if spec.limited else None
-        self._limiter = Limiter(spec.embodiment, 1.0 / self._rate) if spec.limited else None
+        self._columns = action_columns(body) if spec.limited else None
+        self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
+        self._former = CommandFormer(self._limiter or PassThrough(body))
 
     def start(self, state: Array) -> None:
         """Begin an episode where the robot is."""
@@ -63,23 +76,17 @@ class Commands:
         if self._limiter is not None:
             self._limiter.start(state[self._columns])
 
-    def of(self, chunk: Array) -> Array:
-        """``(N, dim)`` targets, one for each control step; limited only when they are taken."""
+    def targets(self, chunk: Array) -> Array:
+        """``(N, dim)``, one for each control step; limited only when they are taken."""
         if self._limiter is None:
             return chunk
         return interpolate(self._limiter.last, chunk, self._action_rate, self._rate)
 
-    def take(self, target: Array) -> Array:
-        """The command for one target."""
-        if self._limiter is None:
-            # What such an environment does with a value beyond its limits is its own affair.
-            slack = 1e-6 * (self._upper - self._lower)
-            beyond = (target > self._upper + slack) | (target < self._lower - slack)
-            self.clamped += bool(beyond.any())
-            return target
-        command, clamps = self._limiter.step(target)
-        self.clamped += bool(clamps)
-        return command
+    def command(self, target: Array) -> Array:
+        """The ``(dim,)`` command for one target."""
+        commands, clamps = self._former.form(target[None])
+        self.clamped += bool(clamps[0])
+        return np.asarray(commands[0])
 
 
 def run_episode(
@@ -87,19 +94,19 @@ def run_episode(
     actor: Actor,
     task: TaskSpec,
     seed: int,
-    course: Course,
-    told: TaskSpec | None = None,
+    course: RolloutSettings,
+    instructed: TaskSpec | None = None,
     watch: Watch | None = None,
 ) -> dict[str, Any]:
     """Run one episode; its course follows from the arguments alone.
 
     A chunk that is not finite ends it: the policy has failed, as on a robot, where safety stops
-    it. A state that is not finite is the environment's affair, and says nothing about the policy.
+    it. A simulation that diverges is the environment's affair, and says nothing about the policy.
 
     Args:
         seed: of environment and, with ``course.policy_seed``, policy.
-        told: the task whose instruction the policy is told instead; the environment is
-            :class:`Retellable` then.
+        instructed: the task whose instruction the policy is told instead; the environment is
+            one whose scenes have several tasks (``others``).
         watch: called with the number of steps before the first and after each, for a video.
 
     Returns:
@@ -111,32 +118,35 @@ def run_episode(
 
     Raises:
         SpecMismatch: the policy's chunk is of another shape.
-        RunFailed: the environment's state is not finite.
+        Diverged: the environment's state is not finite, or its simulation diverged.
     """
     began = time.perf_counter()
     spent = dict.fromkeys(("policy", "step", "observe"), 0.0)
+    environment, actor = Environment.adapt(environment), Actor.adapt(actor)
     environment.reset(seed, task.name)
-    if told is not None:
-        environment.tell(told.name)  # type: ignore[attr-defined]
-    if hasattr(actor, "enter"):
-        actor.enter(environment)
+    if instructed is not None:
+        environment.tell(instructed.name)
+    actor.enter(environment)
     actor.reset(course.policy_seed + seed)
     spec, limit = environment.spec, course.max_steps or task.max_steps
-    commands = Commands(spec, getattr(actor, "action_rate_hz", None))
-    start = environment.state
-    check_state(start, 0)
+    commands = ChunkCommands(spec, actor.action_rate_hz)
+    start = check_step(environment, 0)
     commands.start(start)
-    own_hash = getattr(environment, "state_hash", None)
+    own_hash = implements(environment, Environment, "state_hash")
     digest = hashlib.sha256(start.tobytes())
     steps = calls = 0
     total, success, ended = 0.0, False, False
     behaviours: dict[str, bool] | None = None
     problem: str | None = None
+    instruction = (
+        instructed or task
+    ).instruction  # the environment may have words for each episode
     if watch is not None:
         watch(environment, 0)
     while not ended and steps < limit:
         at = time.perf_counter()
         observation = environment.observe(course.cameras)
+        instruction = observation["task_description"]
         # Before the policy is asked: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
         seen = time.perf_counter()
@@ -150,16 +160,18 @@ def run_episode(
         if problem is not None:
             success = False
             break
-        for target in commands.of(chunk[: course.replan_every]):
+        for target in commands.targets(chunk[: course.replan_every]):
             at = time.perf_counter()
-            found = environment.step(commands.take(target))
+            found = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
             steps += 1
             total += found.reward
+            # Before anything is made of it: a scene that resets itself may even look like success.
+            state = check_step(environment, steps)
             success, ended = bool(found.success), bool(found.ended)
             behaviours = None if found.behaviours is None else dict(found.behaviours)
-            if own_hash is None:
-                digest.update(environment.state.tobytes())
+            if not own_hash:
+                digest.update(state.tobytes())
             if watch is not None:
                 watch(environment, steps)
             if ended or steps >= limit:
@@ -172,8 +184,8 @@ def run_episode(
         "calls": calls,
         "clamped": commands.clamped,
         "return": float(total),
-        "state_hash": digest.hexdigest()[:16] if own_hash is None else own_hash(),
-        "instruction": (told or task).instruction,
+        "state_hash": environment.state_hash() if own_hash else digest.hexdigest()[:16],
+        "instruction": instruction,
         "timing": {
             "seconds": time.perf_counter() - began,
             **{f"{name}_seconds": value for name, value in spent.items()},
@@ -194,15 +206,6 @@ def shaped(chunk: Any, dim: int) -> Array:
     if array.ndim != 2 or array.shape[1] != dim or not len(array):
         raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
     return array
-
-
-def check_state(state: Any, steps: int) -> None:
-    """Refuse a state that is not finite after so many steps: its episode tells nothing."""
-    if not np.isfinite(state).all():
-        raise RunFailed(
-            f"the environment's state is not finite after {steps} steps",
-            cause="the simulation diverged",
-        )
 
 
 def find_task(tasks: Sequence[TaskSpec], name: str) -> TaskSpec:

@@ -1,4 +1,4 @@
-"""``EvalRunner``: how often a policy does what it is told, in any environment.
+"""``EvalRunner``: a policy's success rate in any environment.
 
 Every episode's outcome follows from the policy, its task and its seed. Neither the number of
 processes, nor the machines, nor an interruption changes anything but the time.
@@ -17,31 +17,48 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, build_environment_from_cfg
-from fluxvla_core.contracts.environment import EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluate import results
-from fluxvla_core.evaluate.behaviours import count_behaviours, instruction_test
-from fluxvla_core.evaluate.episodes import episode_keys, open_ledger, run_in_pool
-from fluxvla_core.evaluate.ledger import EpisodeKey, Ledger
+from fluxvla_core.evaluate.collect import unseen_seeds
+from fluxvla_core.evaluate.episode_log import (
+    POLICY,
+    SWAPPED,
+    EpisodeKey,
+    EpisodeLog,
+    open_episode_log,
+)
+from fluxvla_core.evaluate.episodes import Shard, episode_keys, run_in_pool, shard_of
 from fluxvla_core.evaluate.live_settings import Live, live_options
 from fluxvla_core.evaluate.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
     UNTRAINED,
     Source,
+    chosen_checkpoint,
     load,
+    policy_tables,
     resolve_name,
 )
+from fluxvla_core.evaluate.policy_server import PolicyServer
 from fluxvla_core.evaluate.pool import WorkerPool
-from fluxvla_core.evaluate.rollout import Course
-from fluxvla_core.evaluate.serving import PolicyServer
-from fluxvla_core.evaluate.shards import Shard, shard_of
-from fluxvla_core.evaluate.showing import choose_episodes, record_videos, recorded_videos
-from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.evaluate.summary import problems, summarise
+from fluxvla_core.evaluate.provenance import Code, code_of, drawn, provenance
+from fluxvla_core.evaluate.results import (
+    choose_episodes,
+    record_videos,
+    recorded_videos,
+    with_others,
+)
+from fluxvla_core.evaluate.rollout import RolloutSettings
+from fluxvla_core.evaluate.statistics import (
+    count_behaviours,
+    count_obeyed,
+    instruction_test,
+    problems,
+    summarise,
+)
 from fluxvla_core.evaluate.worker import (
-    POLICY,
-    SWAPPED,
     EpisodeWorker,
     Job,
     Settings,
@@ -54,7 +71,7 @@ RECORDS = "episodes"
 """Where the records of live episodes are, in their evaluation's folder."""
 
 
-class EvalRunner:
+class EvalRunner(Runner):
     """Evaluates a policy in an environment: ``run_setup()``, then ``run()``.
 
     Writes ``<work_dir>/eval/``: ``results.json``, ``episodes.jsonl``, ``videos/*.mp4``. Started
@@ -75,7 +92,7 @@ class EvalRunner:
         replan_every: how many actions of a chunk are used before the policy is asked again; all of
             them by default.
         max_steps: control steps after which an episode ends, instead of the environment's.
-        instruction_swap: also tell the policy another task's instruction, and test whether the
+        instruction_swap: also give the policy another task's instruction, and test whether the
             right one does better.
         swap_seed: of the first of these episodes; by default they repeat those of the policy.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
@@ -97,6 +114,8 @@ class EvalRunner:
         height, width: of the policy's pictures; as in its training data by default.
         device, mixed_precision_dtype: of the policy.
         episode_timeout_s: an episode that takes longer is tried again in a new process.
+        reuse: also count episodes that other code ran (other versions, changed plugins) which are
+            there; without it that is asked.
 
     Raises:
         ConfigError: a value is impossible.
@@ -104,6 +123,8 @@ class EvalRunner:
     """
 
     api: ClassVar[str] = "1.0"
+    keeps_config: ClassVar[bool] = True
+    """The resolved config is kept beside the results, in their folder."""
 
     def __init__(
         self,
@@ -138,17 +159,18 @@ class EvalRunner:
         device: str = "cpu",
         mixed_precision_dtype: str = "float32",
         episode_timeout_s: float = 1800.0,
+        reuse: bool = False,
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
         self.shard = shard_of()
         # Under torchrun, nproc is the number of its processes, not of each one's workers.
-        own = self.context.nproc > 1 and "WORLD_SIZE" not in os.environ
+        nproc = None if "WORLD_SIZE" in os.environ else self.context.nproc
         try:
             self._live: dict[str, Any] | None = plain(live_options(live))
         except ConfigError as error:
             raise self.wrong("live", error.what) from error
         usual = 2 if self._live is None else 1
-        self.workers = self.context.nproc if own else (usual if workers is None else workers)
+        self.workers = nproc or (usual if workers is None else workers)
         self.ckpt_path = ckpt_path
         self.episodes = episodes
         self.seed = seed
@@ -157,6 +179,7 @@ class EvalRunner:
         self.baseline = baseline
         self.record_videos = record_videos
         self.episode_timeout_s = episode_timeout_s
+        self.reuse = reuse
         self.folder = Path(self.context.work_dir) / (FOLDER if self._live is None else LIVE_FOLDER)
         self._given = tasks
         for name, value, least in (
@@ -197,12 +220,14 @@ class EvalRunner:
         )
         served = batch_size > 1 or not device.startswith("cpu")
         self._serve = served if serve_policy is None else serve_policy
-        self._course = Course((), replan_every, max_steps, policy_seed)
+        self._course = RolloutSettings((), replan_every, max_steps, policy_seed)
         self._size = None if height is None or width is None else (height, width)
         self._checkpoint: dict[str, Any] | None = None
         self._spec: EnvironmentSpec | None = None
         self._tasks: tuple[TaskSpec, ...] = ()
         self._settings: Settings | None = None
+        self._code = Code({}, "")
+        self._unseen: bool | None = None
 
     def run_setup(self) -> None:
         """Look at the environment and find the checkpoint.
@@ -211,7 +236,7 @@ class EvalRunner:
             ConfigError: the environment has no such task or camera, or names no expert.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
         """
-        environment = build_environment_from_cfg(self._environment)
+        environment = Environment.adapt(build_environment_from_cfg(self._environment))
         self._spec = environment.spec
         what = resolve_name(self._policy, environment)
         environment.close()
@@ -237,6 +262,13 @@ class EvalRunner:
             video=video,
             live=self._live_settings(self._spec),
         )
+        tables = [self._environment, what, self._source.dataset, self._source.denormalize_action]
+        if path is not None:
+            tables += policy_tables(path)
+        simulators = environment.distributions
+        seeds = range(self.seed, self.seed + self.episodes)
+        self._unseen = unseen_seeds(tables, self._environment.get("type"), seeds)
+        self._code = code_of(tables, simulators, () if path is None else ("torch",))
 
     def run(self) -> dict[str, Any]:
         """Run this process's episodes; write ``results.json`` once all there are have ended.
@@ -247,25 +279,33 @@ class EvalRunner:
 
         Raises:
             SpecMismatch: the policy is for another robot.
+            UsageError: there are episodes that other code ran, and ``reuse`` is not set.
             RunFailed: an episode gave no result after all attempts (the results of the others are
                 written), or results cannot be written.
         """
         reporter, keys = self.context.reporter, self.keys()
         what = self.what()
-        ledger = open_ledger(self.folder / self.shard.ledger, what, reporter, "episodes*.jsonl")
+        log = open_episode_log(
+            self.folder / self.shard.log_name,
+            what,
+            reporter,
+            "episodes*.jsonl",
+            self._code.to_dict(),
+            self.reuse,
+        )
         mine = self.shard.of(keys)
-        new = sum(key not in ledger for key in mine)
+        new = sum(key not in log for key in mine)
         with self._pool() as pool:
             began = time.monotonic()
-            run_in_pool(pool, mine, ledger, reporter)
+            run_in_pool(pool, mine, log, reporter)
             # Loading libraries and models is not what is measured.
             seconds = time.monotonic() - began - (pool.ready_s or 0.0)
-            ledger.look_beside()
-            records = ledger.settled(keys)
+            log.look_beside()
+            records = log.settled(keys)
             if records is None:
-                return self._leave_to_others(keys, ledger)
-            results.check_any_done(records, ledger.path)
-            shown = choose_episodes(records, self.record_videos)
+                return self._leave_to_others(keys, log)
+            results.check_any_done(records, log.path)
+            shown = with_others(choose_episodes(records, self.record_videos), records)
             if self._live is None:
                 videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
             else:
@@ -279,8 +319,16 @@ class EvalRunner:
             "problems": problems(records),
             "instruction_test": instruction_test(records),
             "behaviours": count_behaviours(records),
+            "obeyed": count_obeyed(records),
             "checkpoint": self._checkpoint,
             "settings": what["settings"],
+            "provenance": {
+                **provenance(self._code),
+                "seeds": results.seeds(records),
+                "unseen_seeds": self._unseen,
+                "pictures": drawn(records),
+                "reused": {"episodes": len(log.reused), "changed": log.changed},
+            },
             "videos": videos,
             "timing": results.timing(records, new, seconds, self.workers),
         }
@@ -288,10 +336,11 @@ class EvalRunner:
             found["live"] = results.ticks(records)
         path = self.folder / "results.json"
         results.write_results(path, found)
+        results.keep_config(self.folder, self.context)
         reporter.artifact("evaluation", path)
-        results.tell(reporter, found, self.folder)
+        results.report_results(reporter, found, self.folder)
         if new:  # what others have to try again is theirs: failing here would end them, too
-            results.check_all_done(records, ledger.path)
+            results.check_all_done(records, log.path)
         return found
 
     def keys(self) -> list[EpisodeKey]:
@@ -349,8 +398,8 @@ class EvalRunner:
             with WorkerPool(factory, self.workers, timeout_s=timeout, link=server.link) as pool:
                 yield pool
 
-    def _leave_to_others(self, keys: Sequence[EpisodeKey], ledger: Ledger) -> dict[str, Any]:
-        left = sum(ledger.settled([key]) is None for key in keys)
+    def _leave_to_others(self, keys: Sequence[EpisodeKey], log: EpisodeLog) -> dict[str, Any]:
+        left = sum(log.settled([key]) is None for key in keys)
         part: Shard = self.shard
         self.context.reporter.info(
             f"part {part.index} of {part.count} is done; {left} episodes of others are not, and "

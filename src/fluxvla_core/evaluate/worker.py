@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import Actor, Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluate.ledger import EpisodeKey
+from fluxvla_core.evaluate.episode_log import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluate.live_settings import Live
 from fluxvla_core.evaluate.policies import Source, fit, make_policy
-from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
-from fluxvla_core.evaluate.serving import Facts, ServedPolicy
+from fluxvla_core.evaluate.policy_server import Facts, ServedPolicy
+from fluxvla_core.evaluate.rollout import RolloutSettings, find_task, run_episode
 from fluxvla_core.spec.embodiment import Camera
-
-POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
-"""Groups of episodes: the policy, the policy told another task, its untrained twin."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class Settings:
     environment: Mapping[str, Any]
     tasks: tuple[str, ...]
     sources: Mapping[str, Source]
-    course: Course
+    course: RolloutSettings
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
     served: Mapping[str, Facts] = field(default_factory=dict)
@@ -111,7 +109,7 @@ class EpisodeWorker:
     def __init__(self, settings: Settings, link: Connection | None = None) -> None:
         self._settings = settings
         self._link = link
-        self.environment: Environment = build_environment_from_cfg(settings.environment)
+        self.environment = Environment.adapt(build_environment_from_cfg(settings.environment))
         self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
         # Before the first episode: one that does not fit is refused before a scene is built, and
         # loading it is no part of an episode's time.
@@ -131,9 +129,9 @@ class EpisodeWorker:
         tasks = self.environment.spec.tasks
         if settings.live is not None:
             return self._live(settings.live, key, actor, cameras)
-        told = None
+        instructed = None
         if key.group == SWAPPED:
-            told = find_task(tasks, told_instead(self.environment, key.task, settings.tasks))
+            instructed = find_task(tasks, swapped_task(self.environment, key.task, settings.tasks))
         film = None if job.video is None else Film(Path(job.video), settings.video)
         try:
             record = run_episode(
@@ -142,14 +140,13 @@ class EpisodeWorker:
                 find_task(tasks, key.task),
                 key.seed,
                 replace(settings.course, cameras=cameras),
-                told,
+                instructed,
                 film,
             )
         finally:
             if film is not None:
                 film.close()
-        record["timing"]["memory_mb"] = memory_mb()
-        return record
+        return self._completed(record, cameras)
 
     def _live(
         self, live: Live, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
@@ -168,7 +165,13 @@ class EpisodeWorker:
             course.max_steps or task.max_steps,
             live,
         )
+        return self._completed(record, cameras)
+
+    def _completed(self, record: dict[str, Any], cameras: tuple[Camera, ...]) -> dict[str, Any]:
         record["timing"]["memory_mb"] = memory_mb()
+        if cameras:
+            sizes = {camera.name: [camera.height, camera.width] for camera in cameras}
+            record["pictures"] = {"sizes": sizes, "by": self.environment.drawn_by()}
         return record
 
     def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:
@@ -196,7 +199,7 @@ class Film:
     def __call__(self, environment: Environment, steps: int) -> None:
         import numpy as np
 
-        from fluxvla_core.record.video import VideoWriter
+        from fluxvla_core.robot.recording.video import VideoWriter
 
         rate = environment.spec.embodiment.rate_hz
         stride = max(1, round(rate / self._video.fps))
@@ -216,7 +219,7 @@ class Film:
             self._writer.close()
 
 
-def told_instead(environment: Any, task: str, wanted: Sequence[str]) -> str:
+def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> str:
     """The task to ask for instead of ``task``: the next one, round and round, that could be done
     in its scene; one of ``wanted`` if there is one.
 
@@ -224,13 +227,13 @@ def told_instead(environment: Any, task: str, wanted: Sequence[str]) -> str:
         ConfigError: the environment's scenes allow no other task.
     """
     names: list[str] = [each.name for each in environment.spec.tasks]
-    others: list[str] = list(environment.others(task)) if hasattr(environment, "others") else []
+    others = list(environment.others(task))
     others = [name for name in others if name in wanted] or others
     if not others:
         raise ConfigError(
             f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
             f"of {task!r}",
-            next="evaluate without instruction_swap",
+            next="evaluate without it: --set eval.instruction_swap=false",
         )
     here = names.index(task)
     return min(others, key=lambda name: (names.index(name) <= here, names.index(name)))

@@ -1,7 +1,10 @@
-"""One scan of the installed distributions' metadata; nothing of theirs is imported.
+"""What is installed, from one scan of the distributions' metadata; nothing of theirs is imported.
 
-The only module that imports ``importlib.metadata``: importing the backport beside the standard
-library's disables the latter's finder, so there must be one place that chooses.
+``.dist-info`` folders are read here: to import ``importlib.metadata``, which brings ``email``,
+takes as long as all the rest of ``fluxvla plugins list``. It reads what else there may be (an
+``.egg-info`` with plugins, an archive, what a finder of another library finds). No other module
+imports it: the backport beside the standard library's disables the latter's finder, so one place
+must choose.
 """
 
 from __future__ import annotations
@@ -9,18 +12,25 @@ from __future__ import annotations
 import functools
 import os
 import re
+import stat
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
-if sys.version_info >= (3, 11):
-    import importlib.metadata as metadata
-else:  # 3.10's copy keeps no order and no origin for what it finds
-    import importlib_metadata as metadata
-
-from fluxvla_core.plugins.groups import PREFIX
+from fluxvla_core.registries import PREFIX
 
 CORE = "fluxvla-core"
+_ENTRY_POINTS = "entry_points.txt"
+# The most bytes of each file; METADATA holds the whole readme, "" is an .egg-info that is a file.
+_AT_MOST = {
+    _ENTRY_POINTS: 1 << 18,
+    "METADATA": 1 << 22,
+    "PKG-INFO": 1 << 22,
+    "requires.txt": 1 << 18,
+    "": 1 << 22,
+}
 
 
 @dataclass(frozen=True)
@@ -52,12 +62,15 @@ class Plugin:
 class Index:
     """Everything that is installed under a ``fluxvla.`` group.
 
-    ``plugins`` maps (group, name) to every provider, sorted by distribution; ``broken`` holds
-    one ``where: reason`` line for each distribution that could not be read.
+    Args:
+        plugins: (group, name) -> every provider, sorted by distribution.
+        broken: one ``where: reason`` line for each distribution that could not be read.
+        folders: canonical name -> ``.dist-info`` folder, of everything that is installed.
     """
 
     plugins: Mapping[tuple[str, str], tuple[Plugin, ...]]
     broken: tuple[str, ...]
+    folders: Mapping[str, str] = field(default_factory=dict)
 
 
 def canonical(name: str) -> str:
@@ -67,23 +80,27 @@ def canonical(name: str) -> str:
 
 @functools.cache
 def index() -> Index:
-    """The scan. Cached: nothing in ``importlib.metadata`` is, and a second scan costs as much.
+    """The scan. Cached: it is asked for in many places, and lists every folder of ``sys.path``.
 
     ``FLUXVLA_PLUGINS=ur,fsdp`` sees only those distributions (and the core); empty means none.
     ``FLUXVLA_BLOCK=ur`` leaves those out. Names may drop the ``fluxvla-`` prefix.
     """
     found: dict[tuple[str, str], list[Plugin]] = {}
-    broken: list[str] = []
+    broken: set[str] = set()
+    folders: dict[str, str] = {}
     seen: set[str] = set()
     # Never metadata.entry_points(): one malformed file in any distribution ends it for all.
-    for dist in metadata.distributions():
-        where = getattr(dist, "_path", dist)
+    for dist in _distributions():
+        where = dist.path if isinstance(dist, _Folder) else getattr(dist, "_path", dist)
+        if isinstance(dist, _Folder) and dist.is_dist_info:
+            folders.setdefault(dist.stated_name, dist.path)
         try:
-            if PREFIX not in (dist.read_text("entry_points.txt") or ""):
+            if PREFIX not in (dist.read_text(_ENTRY_POINTS) or ""):
                 continue
-            if getattr(where, "name", "").startswith("~"):
+            if os.path.basename(str(where)).startswith("~"):
                 raise ValueError("leftover of an interrupted uninstall; delete this folder")
-            name = dist.metadata["Name"]
+            about = dist.about() if isinstance(dist, _Folder) else dist
+            name = about.metadata["Name"]
             if not name:
                 raise ValueError("its METADATA is missing or has no Name; reinstall it")
             key = canonical(name)
@@ -92,30 +109,205 @@ def index() -> Index:
             seen.add(key)
             if not _wanted(key):
                 continue
-            for point in dist.entry_points:
+            version, requires = about.version, tuple(about.requires or ())
+            for point in about.entry_points:
                 if point.group.startswith(PREFIX):
-                    plugin = Plugin(
-                        point.group,
-                        point.name,
-                        point.value,
-                        name,
-                        dist.version,
-                        tuple(dist.requires or ()),
-                    )
+                    plugin = Plugin(point.group, point.name, point.value, name, version, requires)
                     found.setdefault((plugin.group, plugin.name), []).append(plugin)
         except Exception as error:  # noqa: BLE001 - one broken distribution must not hide the others
-            broken.append(f"{where}: {type(error).__name__}: {error}")
+            broken.add(f"{where}: {type(error).__name__}: {error}")
     # The scan follows os.listdir, whose order is not stable.
     ordered = {k: tuple(sorted(v, key=lambda p: canonical(p.dist))) for k, v in found.items()}
-    return Index(ordered, tuple(sorted(broken)))
+    return Index(ordered, tuple(sorted(broken)), folders)
 
 
 def version(dist: str) -> str | None:
     """The installed version of a distribution, or None."""
     try:
-        return metadata.version(dist)
+        found = _distribution(dist)
+        return None if found is None else found.version
+    except ValueError:
+        return None
+
+
+def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dict[str, str]:
+    """Versions of the distributions and of what they require, where it is installed; not of what
+    the core requires.
+
+    Args:
+        depth: how many steps to follow requirements.
+        extras: also, in the first step, those of extras, by which plugins name their simulators.
+    """
+    from packaging.requirements import InvalidRequirement, Requirement
+
+    found: dict[str, str] = {}
+    names = list(dists)
+    for _ in range(depth + 1):
+        following: list[str] = []
+        for name in names:
+            if canonical(name) in found:
+                continue
+            try:
+                dist = _distribution(name)
+            except ValueError:
+                continue
+            if dist is None or dist.version is None:
+                continue
+            found[canonical(name)] = dist.version
+            for text in () if canonical(name) == CORE else dist.requires or ():
+                try:
+                    requirement = Requirement(text)
+                except InvalidRequirement:
+                    continue
+                marker = requirement.marker
+                if extras or marker is None or marker.evaluate({"extra": ""}):
+                    following.append(requirement.name)
+        names, extras = following, False
+    return found
+
+
+class _Folder:
+    """A ``.dist-info`` or ``.egg-info`` on ``sys.path``, of which nothing has been read yet."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    @property
+    def is_dist_info(self) -> bool:
+        return self.path.lower().endswith(".dist-info")
+
+    @property
+    def stated_name(self) -> str:
+        """The distribution's canonical name as the folder's name has it."""
+        return canonical(os.path.basename(self.path)[: -len(".dist-info")].partition("-")[0])
+
+    def read_text(self, name: str) -> str | None:
+        """A file in it; None where there is none.
+
+        Raises:
+            ValueError: it is a pipe or the like, larger than such files are, or no UTF-8.
+        """
+        try:
+            # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
+            flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
+            descriptor = os.open(os.path.join(self.path, name) if name else self.path, flags)
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError):
+            return None
+        try:
+            found = os.fstat(descriptor)
+            if stat.S_ISDIR(found.st_mode):
+                return None
+            if not stat.S_ISREG(found.st_mode):
+                raise ValueError(f"{name} is no regular file")
+            if found.st_size > _AT_MOST[name]:
+                raise ValueError(
+                    f"{name} holds {found.st_size} bytes, {_AT_MOST[name]} are the most"
+                )
+            return os.read(descriptor, _AT_MOST[name]).decode("utf-8")
+        finally:
+            os.close(descriptor)
+
+    def about(self) -> Any:
+        """What it says of its distribution: a :class:`_DistInfo`, or importlib's of an older kind.
+
+        Raises:
+            ValueError: see :meth:`read_text`.
+        """
+        if self.is_dist_info:
+            return _DistInfo(self)
+        for name in _AT_MOST:
+            self.read_text(name)
+        return _importlib_metadata().PathDistribution(Path(self.path))
+
+
+@dataclass(frozen=True)
+class _EntryPoint:
+    group: str
+    name: str
+    value: str
+
+
+class _DistInfo:
+    """What ``importlib.metadata.Distribution`` gives of a ``.dist-info``, as far as it is used."""
+
+    def __init__(self, folder: _Folder) -> None:
+        self._folder = folder
+        # The headers (RFC 822) end at the first empty line; the readme follows.
+        self._headers: list[tuple[str, str]] = []
+        for line in (folder.read_text("METADATA") or "").replace("\r\n", "\n").split("\n"):
+            name, colon, value = line.partition(":")
+            if line[:1] in {" ", "\t"} and self._headers:
+                name, before = self._headers.pop()
+                self._headers.append((name, f"{before}\n{line}"))
+            elif not colon:
+                break
+            else:
+                self._headers.append((name.lower(), value.strip()))
+        self.metadata = {"Name": self._first("name")}
+        self.version = self._first("version")
+        self.requires = [value for name, value in self._headers if name == "requires-dist"]
+
+    def _first(self, name: str) -> str | None:
+        return next((value for header, value in self._headers if header == name), None)
+
+    @property
+    def entry_points(self) -> Iterator[_EntryPoint]:
+        group = ""
+        for line in map(str.strip, (self._folder.read_text(_ENTRY_POINTS) or "").splitlines()):
+            if line.startswith("[") and line.endswith("]"):
+                group = line.strip("[]")
+            elif line and not line.startswith("#") and group:
+                name, equals, value = line.partition("=")
+                if not equals:
+                    raise ValueError(f"{_ENTRY_POINTS}: no '=' in {line[:80]!r}")
+                yield _EntryPoint(group, name.strip(), value.strip())
+
+
+def _distributions() -> Iterator[Any]:
+    """All that are installed, in the order in which one shadows another."""
+    for place in dict.fromkeys(sys.path):
+        try:
+            names = os.listdir(place or ".")
+        except NotADirectoryError:  # an archive
+            yield from _importlib_metadata().distributions(path=[place])
+            continue
+        except (OSError, ValueError):
+            continue
+        for name in names:
+            low = name.lower()
+            if low.endswith((".dist-info", ".egg-info")) or (
+                low == "egg-info" and place.lower().endswith(".egg")
+            ):
+                yield _Folder(os.path.join(place, name))
+    for finder in sys.meta_path:
+        name = getattr(finder, "__name__", type(finder).__name__)
+        # The path finders, the backport's too, look where it was looked above.
+        if hasattr(finder, "find_distributions") and "PathFinder" not in name:
+            yield from finder.find_distributions()
+
+
+def _distribution(name: str) -> Any | None:
+    """The distribution called ``name``; None if there is none.
+
+    Raises:
+        ValueError: its METADATA cannot be read.
+    """
+    folder = index().folders.get(canonical(name))
+    if folder is not None:
+        return _DistInfo(_Folder(folder))
+    metadata = _importlib_metadata()
+    try:
+        return metadata.distribution(name)
     except metadata.PackageNotFoundError:
         return None
+
+
+def _importlib_metadata() -> Any:
+    if sys.version_info >= (3, 11):
+        import importlib.metadata as metadata
+    else:  # 3.10's copy keeps no order and no origin for what it finds
+        import importlib_metadata as metadata
+    return metadata
 
 
 def _wanted(dist: str) -> bool:

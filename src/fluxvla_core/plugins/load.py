@@ -1,17 +1,20 @@
-"""From a name to a class: find the one plugin that provides it, check it, import it."""
+"""From a name to a class: find the one plugin that provides it, check it, import it.
+
+Also where a module's source file is, for those who read it and import nothing.
+"""
 
 from __future__ import annotations
 
-import difflib
+import functools
 import importlib
+import importlib.util
 from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
-from fluxvla_core.plugins import _metadata, known
+from fluxvla_core.plugins import _metadata, first_party
 from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
-from fluxvla_core.plugins.groups import PREFIX
-from fluxvla_core.plugins.locate import place
+from fluxvla_core.registries import PREFIX
 
 LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
@@ -43,18 +46,20 @@ def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
 
 
 def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[str]:
+    import difflib  # `fluxvla --help` has no use for it
+
     registry = group.removeprefix(PREFIX)
     installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
     text = f"no {group} plugin named {name!r}"
-    provider = known.owner(registry, short)
+    provider = first_party.owner(registry, short)
     if provider:
         text += f"; {provider} provides it and is not installed: pip install {provider}"
     else:
-        near = difflib.get_close_matches(short, [*installed, *known.names(registry)], 1)
+        near = difflib.get_close_matches(short, [*installed, *first_party.names(registry)], 1)
         if near:
             text += f"; did you mean {near[0]!r}?"
             if near[0] not in installed:
-                dist = known.owner(registry, near[0])
+                dist = first_party.owner(registry, near[0])
                 text += f" ({dist} provides it and is not installed: pip install {dist})"
     broken = _metadata.index().broken
     if broken:
@@ -67,22 +72,27 @@ def unmet(plugin: Plugin) -> str | None:
 
     ``pip install --no-deps``, conda and ROS overlays go past pip's check, so it is made again.
     """
+    if canonical(plugin.dist) == CORE:
+        return None
+    return _unmet(plugin.origin, plugin.requires, _metadata.version(CORE))
+
+
+@functools.cache  # a distribution has many plugins
+def _unmet(origin: str, requires: tuple[str, ...], have: str | None) -> str | None:
     from packaging.requirements import InvalidRequirement, Requirement
 
-    for text in plugin.requires:
+    for text in requires:
         try:
             requirement = Requirement(text)
         except InvalidRequirement as error:
-            return f"{plugin.origin} has a requirement that cannot be read: {error}"
+            return f"{origin} has a requirement that cannot be read: {error}"
         if canonical(requirement.name) != CORE:
             continue
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        have = _metadata.version(CORE)
         if have and not requirement.specifier.contains(have, prereleases=True):
             return (
-                f"{plugin.origin} needs {requirement.name}{requirement.specifier}, "
-                f"but {have} is installed"
+                f"{origin} needs {requirement.name}{requirement.specifier}, but {have} is installed"
             )
     return None
 
@@ -147,3 +157,34 @@ def _where(error: BaseException, module: str) -> str:
         if str(frame.f_globals.get("__name__", "")).partition(".")[0] == top
     ]
     return f" ({places[-1]})" if places else ""
+
+
+def locate(module: str) -> Path | None:
+    """Source file of ``module``, or None.
+
+    ``find_spec("a.b")`` would import ``a``, so only the top-level name is looked up and the rest
+    is followed on disk.
+    """
+    top, *rest = module.split(".")
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return None
+    if spec is None:
+        return None
+    if not spec.submodule_search_locations:
+        return Path(spec.origin) if spec.origin and not rest else None
+    for root in map(Path, spec.submodule_search_locations):
+        base = root.joinpath(*rest)
+        for file in (base / "__init__.py", base.with_suffix(".py")):
+            if file.is_file():
+                return file
+    return None
+
+
+def place(path: Path, module: str, line: int) -> str:
+    """``package/module.py:line``: short, and enough to find it."""
+    top = module.partition(".")[0]
+    parts = path.parts
+    start = len(parts) - 1 - parts[::-1].index(top) if top in parts else len(parts) - 1
+    return f"{'/'.join(parts[start:])}:{line}"

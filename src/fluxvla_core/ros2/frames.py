@@ -48,7 +48,10 @@ def pictures(
             continue
         message, camera = chosen[spec.name].message, spec.camera
         if spec.kind == CAMERA:
-            colours[camera.name] = images.to_rgb(message, camera.height, camera.width, spec.label)
+            grey = camera.encoding in images.GREY
+            colours[camera.name] = images.to_rgb(
+                message, camera.height, camera.width, spec.label, grey
+            )
         elif spec.kind == DEPTH:
             depths[camera.name] = images.to_depth(message, camera.height, camera.width, spec.label)
     return colours, depths

@@ -28,6 +28,8 @@ _COLOUR: Mapping[str, tuple[int, tuple[int, int, int]]] = {
     "mono8": (1, (0, 0, 0)),
     "8UC1": (1, (0, 0, 0)),
 }
+GREY = ("mono8", "8UC1")
+"""Encodings of pictures without colours: taken only where the camera is said to have none."""
 _DEPTH: Mapping[str, type[np.generic]] = {
     "16UC1": np.uint16,
     "mono16": np.uint16,
@@ -78,8 +80,13 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
     return pixels
 
 
-def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.NDArray[np.uint8]:
+def to_rgb(
+    message: Any, height: int, width: int, source: str = "image", grey: bool = False
+) -> npt.NDArray[np.uint8]:
     """A fresh ``(height, width, 3)`` uint8 RGB array from an ``Image`` or ``CompressedImage``.
+
+    Args:
+        grey: whether the camera has no colours: its pictures are alike in all three channels.
 
     Raises:
         BadMessage: another size, no colour picture, or damaged; names ``source``.
@@ -87,6 +94,10 @@ def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.
     """
     if is_compressed(message):
         picture = _decode(message, source, colour=True)
+        if picture.ndim == 2:
+            picture = picture[..., None].repeat(3, 2)
+            _check_colours(GREY[0], grey, source)
+        _check_colours(message.format.partition(";")[0].strip(), grey, source)
         _check_size(picture, height, width, source)
         return picture
     pixels = view(message, source)
@@ -95,6 +106,7 @@ def to_rgb(message: Any, height: int, width: int, source: str = "image") -> npt.
             f"{source} sends {message.encoding} pictures, which have no colours",
             cause="a depth topic is given where a colour topic belongs",
         )
+    _check_colours(message.encoding, grey, source)
     _check_size(pixels, height, width, source)
     order = _COLOUR[message.encoding][1]
     rgb = np.empty((height, width, 3), np.uint8)
@@ -224,11 +236,23 @@ def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) 
         )
 
 
+def _check_colours(encoding: str, grey: bool, source: str) -> None:
+    if encoding in GREY and not grey:
+        raise BadMessage(
+            f"{source} sends {encoding} pictures, which have no colours",
+            cause="the camera's mode was changed, or the topic is an infrared or a grey camera's",
+            next="set the driver to rgb8 or name the colour topic; a camera that has no colours is "
+            "declared with encoding='mono8'",
+        )
+
+
 def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
     cv2 = _opencv(f"{source} sends compressed pictures", "name the uncompressed topic")
     data = np.frombuffer(message.data, np.uint8)
     if colour:
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        picture = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if data.size else None
+        if picture is not None and picture.ndim == 2:
+            return np.asarray(picture)
         if picture is not None:
             return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
     elif message.format.startswith("16UC1"):

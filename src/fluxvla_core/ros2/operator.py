@@ -8,10 +8,11 @@ holding on ``stop``, and noticing a driver that falls silent or another node tha
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -19,11 +20,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
+from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames, silence, sync
-from fluxvla_core.ros2.actions import checked_action, hold_target
+from fluxvla_core.ros2.actions import checked_action
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2.holding import Motion, attempt
 from fluxvla_core.ros2.require import message_class
 from fluxvla_core.ros2.ring import Received
 from fluxvla_core.ros2.startup import Startup
@@ -40,7 +43,7 @@ _LOOK_S = 0.002
 _FLUSH_S = 0.2
 
 
-class RosOperator(ABC):
+class RosOperator(Operator):
     """One robot on ROS 2 topics.
 
     Args:
@@ -89,6 +92,7 @@ class RosOperator(ABC):
         # What holds the arm, and whether it was sent by ``send_action`` since the last stop.
         self._last: Array | None = None
         self._moving = False
+        self._motion = Motion()
         self._fault: FluxError | None = None
 
     # What a subclass says.
@@ -121,12 +125,8 @@ class RosOperator(ABC):
         """Called at the end of ``connect``."""
         return
 
-    def publish_hold(self, target: Array, last: Array) -> None:
-        """Send the ``(dim,)`` command that holds the arm; ``last`` is the one that it follows."""
-        self.publish_action(target)
-
     def on_stop(self) -> None:
-        """Called in every ``stop``, after the arm holds: stop what else can move."""
+        """Called in every ``stop``, once the arm brakes: stop what else can move."""
         return
 
     def admit(self, action: Array) -> None:
@@ -188,11 +188,12 @@ class RosOperator(ABC):
 
         Raises:
             NotReady: not connected.
-            Stale: a stream is silent.
+            Stale: a stream is silent, or the parts of the state are too far apart in time.
             BadMessage: the joint states are not what the embodiment describes.
             Faulted: the connection broke.
         """
         self._fresh()
+        self._check_together()
         return self._measured()[0]
 
     def state_stamp(self) -> float:
@@ -245,29 +246,31 @@ class RosOperator(ABC):
                 raise self._fault
             self.admit(checked)
             self.publish_action(checked)
+            self._motion.sent(checked)
             self._last, self._moving = checked, True
 
     def stop(self) -> None:
-        """Hold: repeat the last command, or where a joint is if it was kept from following.
+        """Hold: come to rest, and lead a joint that was kept from following to where it is.
 
-        Any state, any thread, any number of times. An arm that was not commanded since the last
-        stop, or that another node commands, is left alone: it may be elsewhere by now. What fails
-        is logged, not raised: the caller is ending a motion for another reason.
+        All within the limits; an arm at rest that follows is sent its last command again. Any
+        state, any thread, any number of times. An arm that was not commanded since the last stop,
+        or that another node commands, is left alone: it may be elsewhere by now. What fails is
+        logged, not raised: the caller is ending a motion for another reason.
         """
         with self._lock:
             if self._connection is None:
                 return
-            steps = [self.on_stop]
-            last = self._last
-            if self._moving and last is not None:
-                self._last = target = self._hold_target(last)
-                steps.insert(0, lambda: self.publish_hold(target, last))
-            self._moving = False
-            for step in steps:
-                try:
-                    step()
-                except Exception as error:  # noqa: BLE001 - the other steps must still be taken
-                    log.error("%s: stopping failed: %s", self.embodiment.name, error)
+            way, self._moving = self._way_to_hold(), False
+            if way:
+                self._motion.wait(self.embodiment)
+                self._hold(way[0])
+            attempt(self.embodiment.name, self.on_stop)
+        for before, command in itertools.pairwise(way):
+            self._motion.wait(self.embodiment)
+            with self._lock:
+                # Closed, or commanded by somebody else meanwhile.
+                if self._connection is None or self._last is not before or not self._hold(command):
+                    return
 
     def close(self) -> None:
         """Hold, then give the connection back; any number of times."""
@@ -352,7 +355,8 @@ class RosOperator(ABC):
             self._fault = None
             return
         error = discovery.contested(others)
-        if self._fault is None:
+        # Whoever commands the arm is told by the refusal of the next command.
+        if self._fault is None and not self._moving:
             log.error("%s", error.what)
         with self._lock:
             # The arm has the other's command now: no stop may send it back to ours.
@@ -376,7 +380,8 @@ class RosOperator(ABC):
             by = "receipt" if self._clock_stepped() else self.sync_on
             rings = {name: connection.streams[name].ring.items() for name in names}
             try:
-                match = sync.match(rings, self.max_skew_s, by)
+                self._check_together()
+                match = sync.match(rings, self.max_skew_s, by, sync.wall())
                 sync.check_age(match, time.monotonic(), self.max_age_s)
             except Stale:
                 if time.monotonic() >= until:
@@ -384,6 +389,12 @@ class RosOperator(ABC):
                 time.sleep(_LOOK_S)
             else:
                 return match.messages
+
+    def _check_together(self) -> None:
+        if self.sync_on == "stamp" and not self._clock_stepped():
+            streams = self._connected().streams
+            parts = {spec.name: streams[spec.name].ring.items() for spec in self._specs_of(STATE)}
+            sync.check_together(parts, self.max_skew_s, sync.wall())
 
     def _specs_of(self, *kinds: str) -> list[StreamSpec]:
         return [spec for spec in self._specs if spec.kind in kinds]
@@ -411,17 +422,20 @@ class RosOperator(ABC):
         rings = [stream.ring for stream in connection.streams.values()]
         return any(ring.stepped_at is not None and ring.stepped_at > since for ring in rings)
 
-    def _hold_target(self, last: Array) -> Array:
+    def _way_to_hold(self) -> list[Array]:
+        """The commands of a stop; none for an arm that rests, or is somebody else's."""
+        if not self._moving or self._last is None:
+            return []
         try:
             self._fresh()
-            state, receipt = self._measured(-1)
-            before, earlier = self._measured(-2)
+            measured = (self._measured(-1), self._measured(-2))
         except FluxError:
-            # Where the arm is, nobody knows; its last command is where it goes or stays.
-            return last
-        passed, age = receipt - earlier, time.monotonic() - receipt
-        moved = np.abs(state - before) * (age / passed if passed > 0 else 0.0)
-        return hold_target(self.embodiment, last, state, moved)
+            measured = None  # Its last command is where it goes or stays.
+        return self._motion.way_to_hold(self.embodiment, self._last, measured)
+
+    def _hold(self, command: Array) -> bool:
+        self._last = command
+        return attempt(self.embodiment.name, lambda: self.publish_action(command))
 
     def _measured(self, index: int = -1) -> tuple[Array, float]:
         """A ``(state_dim,)`` state that is kept, and the receipt of the oldest message in it.

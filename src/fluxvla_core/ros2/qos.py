@@ -7,6 +7,7 @@ from typing import Any
 
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
+_FAST_DDS = b"\x01\x0f"
 
 
 def reliability(offers: Iterable[Any]) -> str:
@@ -20,6 +21,17 @@ def reliability(offers: Iterable[Any]) -> str:
     """
     kinds = [offer.qos_profile.reliability.name for offer in offers]
     return RELIABLE if kinds and all(kind == "RELIABLE" for kind in kinds) else BEST_EFFORT
+
+
+def from_fast_dds(offers: Iterable[Any]) -> bool:
+    """Whether every publisher is one of Fast DDS, by the vendor in its GUID (RTPS 9.3.1.5), and
+    this process uses Fast DDS, too: only then do they share memory."""
+    from rclpy.utilities import get_rmw_implementation_identifier
+
+    if "fastrtps" not in get_rmw_implementation_identifier():
+        return False
+    vendors = [bytes(offer.endpoint_gid[:2]) for offer in offers]
+    return bool(vendors) and all(vendor == _FAST_DDS for vendor in vendors)
 
 
 def keeps_last(offers: Iterable[Any]) -> bool:

@@ -37,6 +37,7 @@ class Reception:
         lost: messages that the middleware says were sent and did not arrive.
         size: bytes of one message, 0 if unknown.
         expected_hz: messages a second that should come; None takes received and lost together.
+        from_fast_dds: whether its publishers are ones of Fast DDS; others know no such segment.
     """
 
     label: str
@@ -46,6 +47,7 @@ class Reception:
     lost: int
     size: int
     expected_hz: float | None = None
+    from_fast_dds: bool = False
 
     @property
     def wanted(self) -> float:
@@ -78,13 +80,22 @@ def check(receptions: Iterable[Reception]) -> list[str]:
 def lossy(bad: list[Reception]) -> NotReady:
     """The error for streams that lose most of their messages."""
     what = "; ".join(f"{r} in {r.seconds:.1f} s" for r in bad)
-    if any(is_trap(r) for r in bad):
+    if any(is_trap(r) and r.from_fast_dds for r in bad):
         return NotReady(
             what,
             cause="the publisher offers best effort, and its pictures are larger than the 512 KB "
             "of Fast DDS's shared memory, so their pieces overwrite one another",
             next="start the publisher (not this program) with "
             f"FASTDDS_DEFAULT_PROFILES_FILE={large_frames_profile()}, or let it offer RELIABLE",
+        )
+    if any(is_trap(r) for r in bad):
+        return NotReady(
+            what,
+            cause="the publisher offers best effort, so that a large message is lost with any "
+            "piece of it; publisher and subscriber do not share Fast DDS's memory, so the network "
+            "or its buffers drop the pieces",
+            next="let the publisher offer RELIABLE, or make the receive buffers of this machine "
+            "larger (net.core.rmem_max) and the pictures smaller or compressed",
         )
     return NotReady(
         what,
@@ -95,7 +106,7 @@ def lossy(bad: list[Reception]) -> NotReady:
 
 
 def is_trap(reception: Reception) -> bool:
-    """Whether this loss looks like the shared-memory trap.
+    """Whether large best-effort messages are lost: with Fast DDS, the shared-memory trap.
 
     Where no message ever arrived its size is unknown, and losses that the middleware reports for a
     best-effort stream are enough.

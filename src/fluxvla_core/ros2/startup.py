@@ -86,6 +86,7 @@ class Startup:
                 stream.lost - lost,
                 _size(stream),
                 spec.expected_hz,
+                stream.from_fast_dds,
             )
             for (spec, stream), (received, lost) in zip(streams, before, strict=True)
         )
@@ -112,7 +113,12 @@ class Startup:
 
     def _lossy(self, lost: Sequence[Stream]) -> NotReady:
         span = time.monotonic() - self._since
-        return rates.lossy([Reception(s.label, s.reliability, span, 0, s.lost, 0) for s in lost])
+        return rates.lossy(
+            [
+                Reception(s.label, s.reliability, span, 0, s.lost, 0, None, s.from_fast_dds)
+                for s in lost
+            ]
+        )
 
     def _problem(self, hurry: bool) -> FluxError | None:
         """What is still wrong; ``hurry`` leaves out what only makes the message better."""

@@ -37,6 +37,7 @@ class Stream:
         self.ring = Ring(depth)
         self.lost = 0
         self.reliability = ""
+        self.from_fast_dds = False
         self._lock = threading.Lock()
         self._asked: tuple[str, bool] | None = None
         self._node = node
@@ -59,6 +60,7 @@ class Stream:
         with self._lock:
             offers = self._node.get_publishers_info_by_topic(self.topic)
             wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)
+            self.from_fast_dds = qos.from_fast_dds(offers)
             if not offers or wanted == self._asked:
                 return
             before, self._asked = self._subscription, wanted

@@ -9,12 +9,16 @@ apart than ``max_skew``.
 from __future__ import annotations
 
 import bisect
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2.ring import STEP, Received
 from fluxvla_core.ros2.trouble import Stale
 
+_CLOCKS = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
+# Messages of a stream that tell how long they take.
+_FEW = 16
 Streams = Mapping[str, Sequence[Received]]
 
 
@@ -31,6 +35,11 @@ class Matched:
     slowest: str
 
 
+def wall() -> float:
+    """What to add to a receipt for the time of this machine's wall clock."""
+    return time.time() - time.monotonic()
+
+
 def silent(
     newest: Mapping[str, Received | None], now: float, max_age: float
 ) -> dict[str, float | None]:
@@ -42,7 +51,9 @@ def silent(
     return {name: age for name, age in ages.items() if age is None or age > max_age}
 
 
-def match(streams: Streams, max_skew: float, by: str = "stamp") -> Matched:
+def match(
+    streams: Streams, max_skew: float, by: str = "stamp", wall: float | None = None
+) -> Matched:
     """The messages that belong together, one of each stream.
 
     Args:
@@ -50,10 +61,11 @@ def match(streams: Streams, max_skew: float, by: str = "stamp") -> Matched:
         max_skew: seconds that the chosen messages may be apart.
         by: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived (for senders
             whose clocks differ). Where any stream bears no stamps, ``receipt`` is used.
+        wall: what to add to receipts for this machine's wall clock, which tells whose clock is off.
 
     Raises:
         Stale: they are further apart; names the first and the last stream, and whether the
-            senders' clocks differ or a stream is late.
+            senders' clocks differ (and whose is off) or a stream is late.
     """
     if any(items[-1].stamp is None for items in streams.values()):
         by = "receipt"
@@ -64,8 +76,42 @@ def match(streams: Streams, max_skew: float, by: str = "stamp") -> Matched:
     times = {name: _time(message, by) for name, message in chosen.items()}
     skew = max(times.values()) - min(times.values())
     if skew > max_skew:
-        raise _apart(chosen, times, skew, max_skew, by)
+        error = _apart(chosen, times, skew, max_skew, by)
+        if by == "stamp":
+            first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
+            delays = {name: _delay(streams[name]) for name in (first, last)}
+            if abs(delays[first] - delays[last]) > STEP:
+                error.cause, error.next = _off(delays, wall), _CLOCKS
+        raise error
     return Matched(chosen, skew, slowest)
+
+
+def check_together(streams: Streams, max_skew: float, wall: float | None = None) -> None:
+    """Refuse parts of one state whose stamps say that they are of different times.
+
+    What arrives at the same time and is stamped apart is a difference of clocks, or one sender is
+    that much later than the other: either way the newest messages do not belong together. Pictures
+    take longer than joint states, and are matched by their stamps instead.
+
+    Args:
+        streams: those that make up the state; where one bears no stamps, nothing can be said.
+        max_skew, wall: see ``match``.
+
+    Raises:
+        Stale: names the two that are furthest apart, and whose clock is off.
+    """
+    if len(streams) < 2 or any(items[-1].stamp is None for items in streams.values()):
+        return
+    delays = {name: _delay(items) for name, items in streams.items()}
+    first, last = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
+    apart = delays[first] - delays[last]
+    if apart > max_skew:
+        raise Stale(
+            f"{first} is stamped {apart:.3f} s before {last}, with which it arrives; "
+            f"at most {max_skew:g} s is allowed",
+            cause=_off({name: delays[name] for name in (first, last)}, wall),
+            next=f"{_CLOCKS}; max_skew_s sets what is allowed",
+        )
 
 
 def check_age(matched: Matched, now: float, max_age: float) -> None:
@@ -83,6 +129,29 @@ def check_age(matched: Matched, now: float, max_age: float) -> None:
             cause="its driver or the network delays it",
             next="look at its driver's load; if that is how it is, allow more with max_age_s",
         )
+
+
+def _delay(items: Sequence[Received]) -> float:
+    """How long after its stamp a message arrives, at best: latency, and how clocks differ.
+
+    At best, because messages may come in bursts.
+    """
+    return min((m.receipt - m.stamp for m in items[-_FEW:] if m.stamp is not None), default=0.0)
+
+
+def _off(delays: Mapping[str, float], wall: float | None) -> str:
+    """Whose clock is off, of two streams whose stamps are."""
+    slow, fast = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
+    # By this machine's wall clock; a stamp in the future cannot be a message that is late.
+    behind = {name: delay + (wall or 0.0) for name, delay in delays.items()}
+    if wall is None or min(map(abs, behind.values())) > STEP:
+        return "they arrive together, so the clocks that stamp them differ"
+    if abs(behind[fast]) > abs(behind[slow]):
+        return f"the clock that stamps {fast} is {-behind[fast]:.2f} s ahead of this machine's"
+    return (
+        f"the clock that stamps {slow} is {behind[slow]:.2f} s behind this machine's, "
+        "or its messages are sent that late"
+    )
 
 
 def _nearest(items: Sequence[Received], instant: float, by: str) -> Received:
@@ -112,7 +181,7 @@ def _apart(
     step = "look at its driver's load, or allow more with max_skew_s"
     if by == "stamp" and skew > 10 * max(max(receipts) - min(receipts), max_skew):
         cause = "they arrive together, so the clocks that stamp them differ"
-        step = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
+        step = _CLOCKS
     return Stale(
         f"{first} is {skew:.3f} s behind {last}; at most {max_skew:g} s is allowed",
         cause=cause,

@@ -1,21 +1,41 @@
 """What a robot's numbers mean: one description for dataset, checkpoint, policy and robot.
 
-Pure data on the standard library, so that a config check, a robot's onboard computer and a server
+Pure data without numpy or torch, so that a config check, a robot's onboard computer and a server
 hello can read it without anything installed. Lengths are metres, angles radians, times seconds.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
+from numbers import Integral
 from typing import Any
 
 from fluxvla_core.errors import SpecMismatch
+from fluxvla_core.untrusted import checked
 
 JOINT_KINDS = ("revolute", "prismatic", "gripper")
 UNITS = ("rad", "m", "normalized")
 ACTION_MODES = ("absolute", "delta")
+# A joint of such a unit or kind is commanded by its speed.
+_SPEED_UNITS = re.compile(r".+/\s*s(ec)?(ond)?s?|rpm|hz", re.IGNORECASE)
+_SPEED_KINDS = ("base", "continuous", "floating", "planar", "speed", "velocity", "wheel")
+# So is one with such a word in its name, or with two words of these pairs.
+_SPEED_WORDS = {"rpm", "speed", "speeds", "twist", "vel", "vels", "velocity", "velocities"}
+_SPEED_WORDS |= {"vx", "vy", "vz", "vyaw", "vtheta", "wheel", "wheels", "cmdvel"}
+_SPEED_PAIRS = (
+    ({"base", "chassis", "mobile"}, {"angular", "drive", "forward", "lateral", "linear", "turn"}),
+    ({"angular", "linear"}, {"x", "y", "z"}),
+)
+NO_SPEEDS = (
+    "a mobile base, or another joint that is commanded by its speed, is not supported yet among "
+    "the joints of a policy: the arm is held by repeating its last command, and a speed that is "
+    "repeated rolls on"
+)
+LARGEST_SIDE = 16384
+"""Pixels of a picture's side: four times what robots' cameras have."""
 ROTATIONS = ("none", "axis_angle", "quaternion_wxyz", "quaternion_xyzw", "euler_xyz", "rotation_6d")
 
 
@@ -25,12 +45,15 @@ class Joint:
 
     Args:
         name: the joint's name in messages and logs, for example ``left_waist``.
-        unit: ``rad``, ``m``, or ``normalized`` (grippers scaled to a range of their own).
+        unit: ``rad``, ``m``, or ``normalized`` (grippers scaled to a range of their own). A joint
+            is commanded by its position: there are no units of speed.
         lower, upper: position limits, in ``unit``.
         velocity: largest speed, in ``unit``/s.
         acceleration: largest acceleration, in ``unit``/s^2.
         kind: ``revolute``, ``prismatic`` or ``gripper``.
         open, closed: a gripper's values at its ends; together they state its polarity.
+        jerk: largest change of acceleration, in ``unit``/s^3, where the maker states one; None does
+            not limit it. Left out of ``to_dict`` then, as descriptions from before it have it.
     """
 
     name: str
@@ -42,8 +65,13 @@ class Joint:
     kind: str = "revolute"
     open: float | None = None
     closed: float | None = None
+    jerk: float | None = None
 
     def __post_init__(self) -> None:
+        if self.kind in _SPEED_KINDS:
+            raise ValueError(f"joint {self.name}: kind {self.kind!r} is a speed's; {NO_SPEEDS}")
+        if _SPEED_UNITS.fullmatch(self.unit):
+            raise ValueError(f"joint {self.name}: unit {self.unit!r} is a speed's; {NO_SPEEDS}")
         if self.kind not in JOINT_KINDS:
             raise ValueError(f"joint {self.name}: kind {self.kind!r} is none of {JOINT_KINDS}")
         if self.unit not in UNITS:
@@ -53,20 +81,38 @@ class Joint:
             raise ValueError(f"joint {self.name}: limits must be finite, got {numbers}")
         if not self.lower < self.upper:
             raise ValueError(f"joint {self.name}: lower {self.lower} is not below {self.upper}")
+        ends = [end for end in (self.open, self.closed) if end is not None]
+        if not all(math.isfinite(end) for end in ends):
+            raise ValueError(f"joint {self.name}: open and closed must be finite, got {ends}")
         if self.velocity <= 0 or self.acceleration <= 0:
             raise ValueError(f"joint {self.name}: velocity and acceleration must be positive")
+        if self.jerk is not None and not (math.isfinite(self.jerk) and self.jerk > 0):
+            raise ValueError(f"joint {self.name}: jerk must be positive, got {self.jerk}")
         if self.kind == "gripper" and (self.open is None or self.closed is None):
             raise ValueError(f"gripper {self.name}: open and closed state its polarity; give both")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One image stream: arrays of shape ``(height, width, 3)``, uint8, in ``encoding`` order."""
+    """One image stream: arrays of shape ``(height, width, 3)``, uint8, in ``encoding`` order.
+
+    One of ``encoding`` ``mono8`` has no colours: all three channels are alike.
+    """
 
     name: str
     height: int
     width: int
     encoding: str = "rgb8"
+
+    def __post_init__(self) -> None:
+        sides: tuple[Any, ...] = (self.height, self.width)  # a file may say anything
+        for side in sides:
+            whole = isinstance(side, Integral) and not isinstance(side, bool)
+            if not whole or not 1 <= side <= LARGEST_SIDE:
+                raise ValueError(
+                    f"camera {self.name}: height and width are whole numbers from 1 to "
+                    f"{LARGEST_SIDE}, got {self.height!r} and {self.width!r}"
+                )
 
 
 @dataclass(frozen=True)
@@ -131,7 +177,12 @@ class EmbodimentSpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; ``from_dict`` is the inverse."""
-        return asdict(self)
+        values = asdict(self)
+        for joint in (*values["joints"], *(values["state_joints"] or ())):
+            # Who knows no jerk limits can still read a robot that has none.
+            if joint["jerk"] is None:
+                del joint["jerk"]
+        return values
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> EmbodimentSpec:
@@ -141,26 +192,36 @@ class EmbodimentSpec:
             SpecMismatch: a key is unknown or missing, or a value is out of its range.
         """
         try:
-            values = _known(cls, data)
-            values["joints"] = _joints(values["joints"])
-            values["cameras"] = tuple(Camera(**_known(Camera, c)) for c in values["cameras"])
-            if values.get("state_joints") is not None:
-                values["state_joints"] = _joints(values["state_joints"])
-            return cls(**values)
-        except (KeyError, TypeError, ValueError) as error:
-            raise SpecMismatch(f"this is no embodiment spec: {error}") from error
+            made = checked(data, cls, SpecMismatch, "")
+        except SpecMismatch as error:
+            raise SpecMismatch(f"this is no embodiment spec: {error.what}") from error
+        tables = [*data["joints"], *(data.get("state_joints") or ())]
+        for kind, found in ((cls, [data]), (Joint, tables), (Camera, data["cameras"])):
+            _refuse_unknown(kind, found)
+        return made
 
 
-def _joints(items: Iterable[Mapping[str, Any]]) -> tuple[Joint, ...]:
-    return tuple(Joint(**_known(Joint, item)) for item in items)
-
-
-def _known(cls: type, data: Mapping[str, Any]) -> dict[str, Any]:
-    names = {f.name for f in fields(cls)}
-    unknown = sorted(set(data) - names)
+def _refuse_unknown(kind: type, tables: Iterable[Mapping[str, Any]]) -> None:
+    names = {f.name for f in fields(kind)}
+    unknown = sorted({str(key) for table in tables for key in table} - names)
     if unknown:
-        raise ValueError(f"{cls.__name__} takes no {', '.join(map(repr, unknown))}")
-    return dict(data)
+        raise SpecMismatch(
+            f"this is no embodiment spec: {kind.__name__} takes no "
+            f"{', '.join(map(repr, unknown[:8]))}"
+        )
+
+
+def speeds(spec: EmbodimentSpec) -> list[str]:
+    """Names of the action's joints that, by their names, are commanded by a speed.
+
+    Simulated environments and datasets may have such joints; a robot's are refused.
+    """
+    return [joint.name for joint in spec.joints if _is_speed(joint.name)]
+
+
+def _is_speed(name: str) -> bool:
+    words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)}
+    return bool(words & _SPEED_WORDS) or any(words & a and words & b for a, b in _SPEED_PAIRS)
 
 
 def differences(a: EmbodimentSpec, b: EmbodimentSpec) -> list[str]:

@@ -13,18 +13,36 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.evaluate.divergence import Diverged
 from fluxvla_core.evaluate.policies import RandomPolicy
-from fluxvla_core.evaluate.rollout import Course, run_episode
+from fluxvla_core.evaluate.rollout import RolloutSettings, run_episode
 from fluxvla_core.plugins.registry import ENVIRONMENTS
 from fluxvla_core.spec.embodiment import Camera
 
 SEED = 11
+
+
+class Saboteur(RandomPolicy):
+    """Acts at random and, before its third answer, gives everything an impossible velocity."""
+
+    def enter(self, environment: Environment) -> None:
+        super().enter(environment)
+        self.environment, self.calls = environment, 0
+
+    def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
+        self.calls += 1
+        if self.calls == 3:
+            self.environment.simulation.qvel[:] = 1e12  # type: ignore[attr-defined]
+        return super().predict_action(observation)
 
 
 class EnvironmentConformance:
@@ -45,8 +63,7 @@ class EnvironmentConformance:
 
     def make(self) -> Environment:
         """A new environment."""
-        made: Environment = ENVIRONMENTS.get(self.entry_point)(**self.arguments)
-        return made
+        return Environment.adapt(ENVIRONMENTS.get(self.entry_point)(**self.arguments))
 
     @pytest.fixture
     def environment(self) -> Iterator[Environment]:
@@ -76,7 +93,7 @@ class EnvironmentConformance:
         cameras: tuple[Camera, ...] = (),
     ) -> dict[str, Any]:
         """What an episode of random actions came to, without how long it took."""
-        course = Course(cameras=cameras, max_steps=self.steps)
+        course = RolloutSettings(cameras=cameras, max_steps=self.steps)
         record = run_episode(environment, RandomPolicy(), task, seed, course)
         return {name: value for name, value in record.items() if name != "timing"}
 
@@ -135,6 +152,19 @@ class EnvironmentConformance:
         task = self.tried(environment)[0]
         unseen = self.course(environment, task)
         assert self.course(environment, task, cameras=self.cameras(environment)) == unseen
+
+    def test_a_simulation_that_diverges_is_an_error_and_no_outcome(
+        self, environment: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
+        task = self.tried(environment)[0]
+        environment.reset(SEED, task.name)
+        if getattr(environment, "simulation", None) is None:
+            pytest.skip("no MuJoCo simulation below")
+        course = RolloutSettings(max_steps=self.steps)
+        with pytest.raises(Diverged, match=r"BADQVEL|not finite"):
+            run_episode(environment, Saboteur(), task, SEED, course)
+        assert self.course(environment, task), "the next episode is a whole one again"
 
     def test_it_can_be_closed_any_number_of_times(self, environment: Environment) -> None:
         environment.reset(SEED, self.tried(environment)[0].name)

@@ -24,7 +24,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from fluxvla_core.config.constructor import of_class
+from fluxvla_core.config.inspection import inspect_signature
 from fluxvla_core.contracts.check import missing_operator_methods
 from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.errors import NotReady, OperatorError, Rejected
@@ -120,7 +120,7 @@ class OperatorConformance:
         assert threads == 1, "importing the plugin starts a thread"
 
     def test_constructor_names_every_parameter(self) -> None:
-        signature = of_class(OPERATORS.get(self.entry_point))
+        signature = inspect_signature(OPERATORS.get(self.entry_point))
         assert not signature.open, (
             "*args or **kwargs that go nowhere hide names from a config check"
         )

@@ -19,6 +19,8 @@ from fluxvla_core.ros2.require import require_rclpy
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 
+__all__ = ["Driver", "drivers", "lasting_drivers", "other_domain", "ros_domain"]
+
 
 @pytest.fixture(scope="module")
 def ros_domain() -> Iterator[int]:

@@ -23,8 +23,10 @@ import torch
 
 from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.testing.training import (
+    SCALARS,
     checkpoint_differences,
     differences,
+    refusal,
     run_ranks,
     tiny_config,
     train,
@@ -48,11 +50,17 @@ class TrainRunnerConformance:
     """Further settings of the runner."""
     modules: ClassVar[Mapping[str, Any]] = {}
     """Settings of ``TinyVLA`` in all tests."""
+    scalars: ClassVar[tuple[str, ...]] = SCALARS
+    """Which parameters without dimensions a model may have; it has to refuse the others."""
 
     def config(
         self, batch: int = 3, dropout: float = 0.1, centred: bool = True, **settings: Any
     ) -> dict[str, Any]:
-        """A config with everything on that has a state: schedule, averages, dropout, buffers."""
+        """A config with everything on that has a state: schedule, averages, dropout, buffers.
+
+        The model has parameters of every kind: of an odd number of elements, of one, without
+        dimensions, tied, and frozen.
+        """
         table = {
             "type": self.entry_point,
             "ema_decay": 0.9,
@@ -64,7 +72,16 @@ class TrainRunnerConformance:
             **self.settings,
             **settings,
         }
-        return tiny_config(table, batch, **{"dropout": dropout, "centred": centred, **self.modules})
+        model = {
+            "width": 7,
+            "dropout": dropout,
+            "centred": centred,
+            "batch_norm": centred,
+            "assorted": True,
+            "scalar": self.scalars[0] if self.scalars else None,
+            **self.modules,
+        }
+        return tiny_config(table, batch, **model)
 
     def start(self, *runs: Mapping[str, Any]) -> list[int | None]:
         """The exit codes of ``ranks`` processes that do ``runs``."""
@@ -132,6 +149,22 @@ class TrainRunnerConformance:
         assert (changed in said) == (self.ranks > 1)
         assert _loss_gap(moved, tmp_path / "one") < 1e-4
         assert _weight_gap(moved, tmp_path / "one") < 1e-4
+
+    def test_parameters_without_dimensions_are_trained_or_refused(self, tmp_path: Path) -> None:
+        """Refused by name and as an error of the input, before anything is trained."""
+        refused = [kind for kind in SCALARS if kind not in self.scalars]
+        for kind in refused:
+            config = self.config(max_steps=1)
+            config["model"]["scalar"] = kind
+            run = {"config": config, "work_dir": str(tmp_path / kind)}
+            assert run_ranks(1, refusal, run) == [0]
+            assert "gain" in (tmp_path / kind / "refused.txt").read_text()
+            assert not folders(tmp_path / kind)
+        if self.scalars:
+            run = {"config": self.config(max_steps=1), "work_dir": str(tmp_path / "trained")}
+            assert self.start(run) == [0] * self.ranks
+            saved = Checkpoint.open(folders(tmp_path / "trained")[-1]).tensors(MODEL)
+            assert saved["gain"].shape == ()
 
 
 def _loss_gap(a: Path, b: Path) -> float:

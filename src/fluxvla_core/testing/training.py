@@ -24,20 +24,40 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import ENVIRONMENT, folders
-from fluxvla_core.checkpoints.disk import Disk
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.collator import DictCollator
-from fluxvla_core.data.rng import sample_rng
-from fluxvla_core.metrics.vla_metric import WALL_CLOCK
+from fluxvla_core.data.sampler import sample_rng
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 from fluxvla_core.train import stop
 from fluxvla_core.train.base_runner import BaseTrainRunner
+from fluxvla_core.train.metrics import WALL_CLOCK
+
+__all__ = [
+    "ACTIONS",
+    "HORIZON",
+    "STATES",
+    "Block",
+    "OneProcessRunner",
+    "TinyDataset",
+    "TinyVLA",
+    "checkpoint_differences",
+    "differences",
+    "run_ranks",
+    "tiny_config",
+    "train",
+    "train_all",
+]
 
 STATES, HORIZON, ACTIONS = 6, 2, 3
+SCALARS = ("trained", "frozen")
+"""Kinds of parameters without dimensions that a ``TinyVLA`` can have."""
 KEYS = ("states", "actions", "noise", "sample_ids")
-PRELOAD = ("fluxvla_core.testing.training", "fluxvla_core.train.loop", "torch.distributed.fsdp")
+PRELOAD = ("fluxvla_core.testing.training", "fluxvla_core.train.trainer", "torch.distributed.fsdp")
 
 
 class Block(nn.Module):
@@ -56,7 +76,7 @@ class Block(nn.Module):
 
 
 @VLAS.register_module()
-class TinyVLA(nn.Module):
+class TinyVLA(VLA, nn.Module):
     """A frozen encoder, two blocks, a head, and a buffer that training changes.
 
     Args:
@@ -64,6 +84,10 @@ class TinyVLA(nn.Module):
         spare: have a layer that the forward pass does not use.
         centred: subtract a running mean of the states, a buffer that follows from the batches of
             its own process: how samples are shared between processes then shows in the loss.
+        batch_norm: normalise over the batch in a block and before the head, which follows from the
+            batches of its own process as well.
+        assorted: have a parameter of one element and two layers that share their weights.
+        scalar: have a parameter without dimensions, ``trained`` or ``frozen``.
     """
 
     def __init__(
@@ -73,6 +97,9 @@ class TinyVLA(nn.Module):
         bad_sample: int = -1,
         spare: bool = False,
         centred: bool = False,
+        batch_norm: bool = False,
+        assorted: bool = False,
+        scalar: str | None = None,
     ) -> None:
         super().__init__()
         self.encoder = nn.Linear(STATES, width).requires_grad_(False)
@@ -84,6 +111,12 @@ class TinyVLA(nn.Module):
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
         self.mean: Tensor | None
         self.register_buffer("mean", torch.zeros(STATES) if centred else None)
+        self.batch_norm = nn.BatchNorm1d(width) if batch_norm else None
+        if batch_norm:
+            self.blocks[1] = nn.Sequential(nn.BatchNorm1d(width), self.blocks[1])
+        self.mixers = _tied(width) if assorted else None
+        self.offset = nn.Parameter(torch.zeros(1)) if assorted else None
+        self.gain = nn.Parameter(torch.tensor(0.5), scalar == "trained") if scalar else None
 
     def forward(
         self, states: Tensor, actions: Tensor, noise: Tensor, sample_ids: Tensor
@@ -92,6 +125,12 @@ class TinyVLA(nn.Module):
         x = self.encoder(states if self.mean is None else self._centre(states, self.mean))
         for block in self.blocks:
             x = block(x)
+        if self.batch_norm is not None:
+            x = self.batch_norm(x)
+        if self.mixers is not None:
+            x = x + self.mixers(x) + self.offset
+        if self.gain is not None:
+            x = self.gain * x
         found = self.head(x).unflatten(1, (HORIZON, ACTIONS))
         loss = (found - actions - 0.1 * noise).square().mean()
         if self.bad_sample >= 0:
@@ -114,6 +153,12 @@ class TinyVLA(nn.Module):
     def fsdp_units(self) -> list[nn.Module]:
         """The blocks."""
         return list(self.blocks)
+
+
+def _tied(width: int) -> nn.Sequential:
+    first, second = (nn.Linear(width, width, bias=False) for _ in range(2))
+    second.weight = first.weight
+    return nn.Sequential(first, second)
 
 
 @RUNNERS.register_module()
@@ -254,6 +299,20 @@ def train_all(*runs: Mapping[str, Any]) -> None:
         torch.distributed.init_process_group("gloo")
     for settings in runs:
         train(settings)
+
+
+def refusal(settings: Mapping[str, Any]) -> None:
+    """One run that is refused for its config; writes what it says to ``refused.txt``.
+
+    Raises:
+        AssertionError: it trains.
+    """
+    try:
+        train(settings)
+    except ConfigError as error:
+        (Path(settings["work_dir"]) / "refused.txt").write_text(str(error))
+        return
+    raise AssertionError("the config was not refused")
 
 
 class SignallingCollator(DictCollator):

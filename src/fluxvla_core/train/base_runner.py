@@ -1,11 +1,14 @@
 """``BaseTrainRunner``: trains on one process, and is what every strategy builds on.
 
-A strategy overrides ``_wrap_model`` and, where it must, ``_sync_gradients``, ``clip_grad_norm``
-and ``_unwrap``. Nothing here imports torch before it is used: a config is checked without it.
+The loop itself is in ``trainer.py``, the settings in ``options.py``. A strategy overrides
+:meth:`BaseTrainRunner._wrap_model` and, where it must, ``unwrap_model``, ``sync_gradients``,
+``backward``, ``optimizer_step``, ``clip_grad_norm`` and how tensors are saved and loaded. Nothing
+here imports torch before it is used: a config is checked without it.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -22,16 +25,27 @@ from fluxvla_core.build import (
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.train.options import LoaderOptions, TrainOptions
-from fluxvla_core.train.running import TrainRun
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.checkpoints.owner import Claim
     from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.data.sampler import EpisodeShards
+    from fluxvla_core.train.batches import StepPlan
+    from fluxvla_core.train.distributed import World
+    from fluxvla_core.train.ema import Ema
+    from fluxvla_core.train.flops import Meter
+    from fluxvla_core.train.model import ForwardArguments
+    from fluxvla_core.train.saving import Saver
+    from fluxvla_core.train.state import Progress
+    from fluxvla_core.train.trainer import Trainer
+    from fluxvla_core.train.weights import LeftOut
 
 
-class BaseTrainRunner(TrainRun):
+class BaseTrainRunner:
     """The training loop with everything around it; works as it is on one process.
 
     Called as ``run_setup(n_train_examples)`` and then ``run(dataset)``. Batch size and loader
@@ -39,143 +53,93 @@ class BaseTrainRunner(TrainRun):
     ``train_dataloader``.
 
     Args:
-        learning_rate: peak rate of AdamW.
-        collator: table of ``fluxvla.collators``, or a callable from samples to a batch.
         cfg: the whole config tree; filled in by the builder.
         context: the run; filled in by the builder.
-        max_epochs, max_steps: exactly one of them ends the run.
-        weight_decay: of matrices; biases and norms have none.
-        max_grad_norm: gradients are scaled down to this norm; None leaves them.
-        sampler: None or ``distributed``: both shuffle every epoch and split it over the ranks.
-        tokenizer: table of ``fluxvla.tokenizers``, saved with the checkpoints.
-        metric: table of ``fluxvla.metrics``; a ``VLAMetric`` that writes JSON lines if None.
-        save_epoch_interval: epoch-based runs save after every so many epochs.
-        save_iter_interval: save every so many steps; 10000 in step-based runs that say nothing,
-            only by epochs in epoch-based ones. The end of a run is always saved.
-        max_keep_ckpts: newest checkpoints (by step) to keep; 0 keeps all.
-        async_save: write checkpoints beside the training, from a copy in memory; False waits for
-            the disk and needs no copy.
-        optimizer: table of ``fluxvla.optimizers``; ``AdamW`` if None.
-        lr_scheduler_type: ``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``.
-        lr_schedule: for ``step-based``: ``{part of the run: rate}``, with 0.
-        warmup_ratio: part of the run over which the rate rises.
-        grad_accumulation_steps: batches per optimizer step; gradients are averaged over them.
-        enable_mixed_precision_training: compute in ``mixed_precision_dtype``; weights and
-            optimizer stay fp32.
-        mixed_precision_dtype: ``bf16``.
-        enable_gradient_checkpointing: recompute the model's ``fsdp_units`` in the backward pass.
-        compile_blocks: ``torch.compile`` each of the model's ``fsdp_units``.
-        init_from: weights to start from: a checkpoint's folder, a work dir, a safetensors file;
-            a run that goes on has its own, or its adapter's base, instead.
-        lora: train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
-            ``alpha``, ``dropout``, ``modules_to_save``.
-        ema_decay: keep averaged weights too, and act with those; None does not.
-        val_iter_interval: with a ``val_dataloader``: its loss every so many steps and at the end;
-            None with every checkpoint. The best one by it is kept and called ``best``.
-        early_stop_patience: end after so many validations in a row without a better one.
-        seed: initial weights, order of samples, and everything drawn, also by datasets that set
-            no ``seed`` of their own.
-        resume_from: ``auto`` or a checkpoint's path; the command line's ``--resume`` goes first,
-            but ``auto`` and restarts begin at that path while the work dir has no checkpoint.
-        log_iter_interval: fetch losses, and look for NaN, every so many steps; every step is
-            logged all the same.
-        device: ``auto`` (a GPU if there is one), ``cpu``, ``cuda``.
-        peak_tflops: what one device can do at most, for ``mfu``; by default what the makers of
-            known GPUs state for bf16.
+        options: the settings, by the fields of ``TrainOptions``.
 
     Raises:
         ConfigError: a setting that cannot be meant, with its place.
     """
 
     api: ClassVar[str] = "1.0"
+    Options: ClassVar[type[TrainOptions]] = TrainOptions
+    """The settings: its fields are the constructor's further keywords."""
     needs_process_group: ClassVar[bool] = False
+    """Whether the strategy needs torch's process group on a single process too."""
+
+    # Known from run_setup on.
+    vla: Any = None
+    optimizer: Any = None
+    lr_scheduler: Any = None
+    flops: Meter | None = None
+    adapter_base: str | None = None
+    left_out: LeftOut | None = None
+    # Known inside run().
+    dataset: Any = None
+    plan: StepPlan
+    progress: Progress
+    ema: Ema | None = None
+    sample_losses: Tensor | None = None
+    late_stop: int = 0
+    """The signal that asked for a stop when training was complete: nothing new is to begin."""
+    _world: World | None = None
+    _claim: Claim | None = None
+    _checkpoint: Checkpoint | None = None
+    _arguments: ForwardArguments | None = None
+    _trainer: Trainer | None = None
+    _saver: Saver | None = None
 
     def __init__(
         self,
         *,
-        learning_rate: float,
-        collator: Any,
         cfg: Mapping[str, Any] | None = None,
         context: RunContext | None = None,
-        max_epochs: int | None = None,
-        max_steps: int | None = None,
-        weight_decay: float = 0.0,
-        max_grad_norm: float | None = 1.0,
-        sampler: str | None = None,
-        tokenizer: Any = None,
-        metric: Any = None,
-        optimizer: Any = None,
-        save_epoch_interval: int = 1,
-        save_iter_interval: int | None = None,
-        max_keep_ckpts: int = 2,
-        async_save: bool = True,
-        lr_scheduler_type: str = "constant",
-        lr_schedule: Mapping[Any, float] | None = None,
-        warmup_ratio: float = 0.0,
-        grad_accumulation_steps: int = 1,
-        enable_mixed_precision_training: bool = False,
-        mixed_precision_dtype: str = "bf16",
-        enable_gradient_checkpointing: bool = False,
-        compile_blocks: bool = False,
-        init_from: str | None = None,
-        lora: Mapping[str, Any] | None = None,
-        ema_decay: float | None = None,
-        val_iter_interval: int | None = None,
-        early_stop_patience: int | None = None,
-        seed: int = 42,
-        resume_from: str | None = None,
-        log_iter_interval: int = 10,
-        device: str = "auto",
-        peak_tflops: float | None = None,
+        **options: Any,
     ) -> None:
         self.context = context or RunContext(config=cfg or {}, section="runner")
         self.cfg: Mapping[str, Any] = self.context.config if cfg is None else cfg
-        self.options = TrainOptions(
-            learning_rate=learning_rate,
-            max_epochs=max_epochs,
-            max_steps=max_steps,
-            weight_decay=weight_decay,
-            max_grad_norm=max_grad_norm,
-            sampler=sampler,
-            save_epoch_interval=save_epoch_interval,
-            save_iter_interval=save_iter_interval,
-            max_keep_ckpts=max_keep_ckpts,
-            async_save=async_save,
-            lr_scheduler_type=lr_scheduler_type,
-            lr_schedule=lr_schedule,
-            warmup_ratio=warmup_ratio,
-            grad_accumulation_steps=grad_accumulation_steps,
-            enable_mixed_precision_training=enable_mixed_precision_training,
-            mixed_precision_dtype=mixed_precision_dtype,
-            enable_gradient_checkpointing=enable_gradient_checkpointing,
-            compile_blocks=compile_blocks,
-            init_from=init_from,
-            lora=lora,
-            ema_decay=ema_decay,
-            val_iter_interval=val_iter_interval,
-            early_stop_patience=early_stop_patience,
-            seed=seed,
-            resume_from=resume_from,
-            log_iter_interval=log_iter_interval,
-            device=device,
-            peak_tflops=peak_tflops,
-        )
-        self.options.check(self.context)
+        try:
+            bound = inspect.signature(self.Options).bind(**options)
+        except TypeError as error:
+            raise ConfigError(
+                f"{type(self).__name__}: {error}",
+                where=self.context.where(self.context.section),
+                next=f"fluxvla plugins show {type(self).__name__}",
+            ) from error
+        self.options = given = self.Options(*bound.args, **bound.kwargs)
+        given.check(self.context)
         self.loader_options = LoaderOptions.read(self.cfg, self.context)
-        self.lora = self.options.lora_options(self.context)
-        self.val_options = LoaderOptions.for_validation(self.cfg, self.context, self.options)
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
-        self.max_grad_norm = max_grad_norm
-        self.max_epochs, self.max_steps = max_epochs, max_steps
-        self.collator = build_collator_from_cfg(collator, self.context)
-        self.tokenizer = build_tokenizer_from_cfg(tokenizer, self.context)
+        self.lora = given.lora_options(self.context)
+        self.val_options = LoaderOptions.for_validation(self.cfg, self.context, given)
+        self.learning_rate, self.weight_decay = given.learning_rate, given.weight_decay
+        self.max_grad_norm = given.max_grad_norm
+        self.max_epochs, self.max_steps = given.max_epochs, given.max_steps
+        self.collator = build_collator_from_cfg(given.collator, self.context)
+        self.tokenizer = build_tokenizer_from_cfg(given.tokenizer, self.context)
         self.metric = build_metric_from_cfg(
-            {"type": "VLAMetric"} if metric is None else metric, self.context
+            {"type": "VLAMetric"} if given.metric is None else given.metric, self.context
         )
         self.optimizer_settings = build_optimizer_from_cfg(
-            {"type": "AdamW"} if optimizer is None else optimizer, self.context
+            {"type": "AdamW"} if given.optimizer is None else given.optimizer, self.context
         )
         self.hooks = build_hooks(self.context)
+
+    def run(self, vla_dataset: Any) -> Path:
+        """Train on ``vla_dataset`` (``get_sample(index, epoch)``, ``__len__``) to the end.
+
+        Returns:
+            The work dir, with the last checkpoint in it.
+
+        Raises:
+            KeyboardInterrupt: after SIGINT, with everything saved.
+            RunFailed: after SIGTERM or SIGHUP, with everything saved; a loss that is not finite;
+                another rank that was lost; a checkpoint that could not be written; memory that
+                ran out; a work dir that was removed, or replaced by another.
+            CheckpointError, ConfigError, DataError: the inputs do not fit.
+        """
+        from fluxvla_core.train.trainer import train
+
+        return train(self, vla_dataset)
 
     # What a strategy may override.
 
@@ -192,10 +156,10 @@ class BaseTrainRunner(TrainRun):
 
     def _build_vla(self) -> nn.Module:
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
-        from fluxvla_core.train import flops, forward, lora
-        from fluxvla_core.train.distributed import on_first
+        from fluxvla_core.train import flops, lora
+        from fluxvla_core.train.model import checkpoint_activations, compile_units
         from fluxvla_core.train.state import seed_all
-        from fluxvla_core.train.weights import base_of, base_to_note, exact_place, start_from
+        from fluxvla_core.train.weights import base_to_note, start_training_from
 
         self._prepare()
         if "model" not in self.cfg:
@@ -207,22 +171,15 @@ class BaseTrainRunner(TrainRun):
         seed_all(self.options.seed)
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self._checkpoint
-        # A run that goes on finds all weights in its checkpoint, but for an adapter's base.
-        place = base_of(before, options.init_from) if before is not None else options.init_from
-        if place is not None:
-            # Found once: ranks that looked one after the other could find different ones.
-            wanted = place
-            found = start_from(vla, on_first(self.world, lambda: exact_place(wanted)))
-            if self.lora is not None:
-                vla.__dict__["frozen_source"] = str(found)
+        start_training_from(vla, options.init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = base_to_note(before, options.init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
         self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:
-            forward.checkpoint_activations(vla)
+            checkpoint_activations(vla)
         if options.compile_blocks:
-            forward.compile_units(vla)
+            compile_units(vla)
         return vla
 
     def _wrap_model(self, vla: nn.Module) -> nn.Module:
@@ -239,7 +196,7 @@ class BaseTrainRunner(TrainRun):
             )
         return vla.to(self.world.device)
 
-    def _unwrap(self, vla: nn.Module) -> nn.Module:
+    def unwrap_model(self, vla: nn.Module) -> nn.Module:
         """The model inside what ``_wrap_model`` returned, with the names that are saved."""
         from torch.nn.parallel import DistributedDataParallel
 
@@ -262,7 +219,7 @@ class BaseTrainRunner(TrainRun):
         schedule = make_schedule(
             options.lr_scheduler_type,
             options.learning_rate,
-            self._total(self._plan(n_train_examples)),
+            self.plan_steps(n_train_examples).total_steps(self.max_steps, self.max_epochs),
             options.warmup_ratio,
             options.lr_schedule,
         )
@@ -270,8 +227,7 @@ class BaseTrainRunner(TrainRun):
 
     def _training_step(self, batch: dict[str, Any]) -> Tensor:
         """Forward pass of one batch on the device: its loss, a scalar with a gradient."""
-        from fluxvla_core.train.forward import loss_of, sample_losses_of
-        from fluxvla_core.train.precision import autocast
+        from fluxvla_core.train.model import autocast, loss_of, sample_losses_of
 
         if self._arguments is None:
             raise RuntimeError("a batch's arguments are known inside run() only")
@@ -280,15 +236,15 @@ class BaseTrainRunner(TrainRun):
         self.sample_losses = sample_losses_of(output)
         return loss_of(output, self.model)
 
-    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
+    def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
         return nullcontext()
 
-    def _backward(self, loss: Tensor) -> None:
+    def backward(self, loss: Tensor) -> None:
         """Backward pass of one batch; ``loss`` is divided by the number of batches already."""
         loss.backward()  # type: ignore[no-untyped-call]
 
-    def _update(self) -> Tensor | None:
+    def optimizer_step(self) -> Tensor | None:
         """Clip, and let the optimizer step; the gradients' norm before, on the device.
 
         Where ``clip_grad_norm`` tells none it is the norm of what the optimizer uses: gradients
@@ -302,7 +258,7 @@ class BaseTrainRunner(TrainRun):
         self.optimizer.step()
         return norm
 
-    def _warm_up(self, batch: dict[str, Any]) -> None:
+    def warm_up(self, batch: dict[str, Any]) -> None:
         """Called with the first batch, before the first step; must leave no trace."""
 
     def clip_grad_norm(self) -> Tensor | None:
@@ -339,8 +295,7 @@ class BaseTrainRunner(TrainRun):
         Raises:
             RunFailed: it cannot be written; the earlier ones are as they were.
         """
-        from fluxvla_core.train.saver import Saver
-        from fluxvla_core.train.saving import save_snapshot, take_snapshot
+        from fluxvla_core.train.saving import Saver, save_snapshot, take_snapshot
 
         if self._saver is None:
             self._saver = Saver(self.world, False)
@@ -357,6 +312,27 @@ class BaseTrainRunner(TrainRun):
             self.settle_saves()
         return path
 
+    def settle_saves(self, wait: bool = True) -> None:
+        """Learn what became of the checkpoint that is being written; called on every rank.
+
+        Args:
+            wait: for its end; otherwise nothing happens while some rank still writes.
+
+        Raises:
+            RunFailed: it could not be written; the earlier ones are as they were.
+        """
+        saved = self._saver.settle(wait) if self._saver is not None else None
+        if saved is None or not self.world.first:
+            return
+        from fluxvla_core.checkpoints.directory import name_best
+
+        for warning in saved.warnings:
+            self.context.reporter.warn(warning)
+        if saved.step == self.progress.best_step:
+            name_best(saved.path.parent.parent, saved.step)
+        self.context.reporter.artifact("checkpoint", saved.path)
+        self.hooks.call("checkpoint_saved", path=saved.path, step=saved.step)
+
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
         """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
         from fluxvla_core.train.weights import put_model_tensors
@@ -368,29 +344,29 @@ class BaseTrainRunner(TrainRun):
         self.optimizer.load_state_dict(state)
         return True
 
-    def _model_tensors(self) -> Mapping[str, Tensor]:
+    def model_tensors(self) -> Mapping[str, Tensor]:
         """Weights and buffers by name, to be saved; parts of them where they are sharded."""
         from fluxvla_core.train.weights import model_tensors
 
         return model_tensors(self.model)
 
-    def _optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+    def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""
         from fluxvla_core.train.optim import named_state
 
         return named_state(self.model, self.optimizer)
 
-    def _load_optimizer_tensors(
+    def load_optimizer_tensors(
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
-        """The inverse of :meth:`_optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
+        """The inverse of :meth:`optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
         from fluxvla_core.train.optim import torch_state
 
         state = torch_state(self.model, self.optimizer, tensors, described, where)
         return self._load_optimizer_state(state)
 
     def resume(self) -> int:
-        """Go on from the checkpoint that the run was told to; the step it stands at, 0 afresh.
+        """Resume from the chosen checkpoint; the step it was saved at, 0 for a fresh start.
 
         Raises:
             CheckpointError: it is of another model, optimizer, dataset or seed.
@@ -411,9 +387,84 @@ class BaseTrainRunner(TrainRun):
             by_epoch = ended and progress.cursor.epoch % options.save_epoch_interval == 0
             return by_epoch or self._steps_due()
 
-        return self.loop.run(lambda: progress.cursor.epoch >= (epochs or 0), due)
+        return self.trainer.run(lambda: progress.cursor.epoch >= (epochs or 0), due)
 
     def _run_step_based(self) -> int:
         """Steps until ``max_steps`` are done; the signal that ended them early, or 0."""
         steps = self.max_steps or 0
-        return self.loop.run(lambda: self.progress.step >= steps, self._steps_due)
+        return self.trainer.run(lambda: self.progress.step >= steps, self._steps_due)
+
+    # What the run knows of itself.
+
+    @property
+    def world(self) -> World:
+        """This process among those that train; known from ``_build_vla`` on."""
+        if self._world is None:
+            raise RuntimeError("the world is known from _build_vla on")
+        return self._world
+
+    @property
+    def trainer(self) -> Trainer:
+        """The loop of the present ``run``."""
+        if self._trainer is None:
+            raise RuntimeError("there is a trainer only inside run()")
+        return self._trainer
+
+    @property
+    def model(self) -> nn.Module:
+        """The model without what trains it around it."""
+        return self.unwrap_model(self.vla)
+
+    @property
+    def compute_dtype(self) -> torch.dtype | None:
+        """What the forward pass computes in; None for the weights' own fp32."""
+        from fluxvla_core.train.model import compute_dtype
+
+        options = self.options
+        return compute_dtype(options.enable_mixed_precision_training, options.mixed_precision_dtype)
+
+    @property
+    def total_steps(self) -> int:
+        """Optimizer steps of the whole run: those done, which may have been of another size, and
+        those left."""
+        done, cursor = self.progress.step, self.progress.cursor
+        return done + self.plan.run_steps_left(done, cursor, self.max_steps, self.max_epochs)
+
+    def plan_steps(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
+        """How epochs of so many samples are cut into steps."""
+        from fluxvla_core.train.batches import StepPlan
+
+        return StepPlan(
+            samples,
+            self.loader_options.per_device_batch_size,
+            self.options.grad_accumulation_steps,
+            self.world.size,
+            self.options.seed,
+            shards,
+        )
+
+    def _steps_due(self) -> bool:
+        every = self.options.save_steps
+        return every is not None and self.progress.step % every == 0
+
+    def _prepare(self) -> None:
+        """Join the other ranks, take over the work dir, choose a checkpoint to resume from."""
+        from fluxvla_core.train import distributed
+        from fluxvla_core.train.resuming import choose, take_over
+
+        if self._world is not None:
+            return
+        self._world = distributed.start(self.options.device, self.needs_process_group)
+        self._claim = take_over(self._world, self.context)
+        configured = self.options.resume_from
+        wanted = self.context.resume or configured
+        self._checkpoint = choose(self._world, self.context, wanted, first=configured)
+
+    def check_work_dir(self) -> None:
+        """See that the work dir is still this run's; the first rank has the claim.
+
+        Raises:
+            RunFailed: it was removed, moved or replaced.
+        """
+        if self._claim is not None:
+            self._claim.check()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -86,6 +87,8 @@ def start(device: str = "auto", group_of_one: bool = False) -> World:
     place = _device(device, local_rank)
     owned = False
     if not dist.is_initialized() and (size > 1 or group_of_one):
+        if size == int(os.environ.get("LOCAL_WORLD_SIZE", "1")):
+            _stay_inside()
         backend = "nccl" if place.type == "cuda" else "gloo"
         store = _attempts_store() if size > 1 else dist.HashStore()  # type: ignore[attr-defined]
         dist.init_process_group(backend, store=store, rank=rank, world_size=size)
@@ -94,6 +97,18 @@ def start(device: str = "auto", group_of_one: bool = False) -> World:
         rank, size = dist.get_rank(), dist.get_world_size()
     control = dist.new_group(backend="gloo") if size > 1 else None
     return World(rank, size, local_rank, place, owned, control)
+
+
+def _stay_inside() -> None:
+    """Let gloo and NCCL listen on the loopback alone: all processes are on this machine.
+
+    Both take whoever connects for a rank. NCCL still moves tensors over NVLink, PCIe or shared
+    memory. Who names an interface gets that one.
+    """
+    loopback = next((name for _, name in socket.if_nameindex() if name in ("lo", "lo0")), None)
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        if loopback is not None:
+            os.environ.setdefault(name, loopback)
 
 
 def _attempts_store() -> Any:
@@ -114,7 +129,7 @@ def _device(name: str, local_rank: int) -> torch.device:
         raise ConfigError(
             "device is 'cuda', but torch finds no GPU here",
             cause=_why_no_gpu(),
-            next="device='auto' in the runner's table, which takes the CPU where there is no GPU",
+            next="--set runner.device=auto takes the CPU where there is no GPU",
         )
     if name == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
@@ -123,7 +138,7 @@ def _device(name: str, local_rank: int) -> torch.device:
             f"process {local_rank + 1} on this machine finds no GPU of its own: torch sees "
             f"{torch.cuda.device_count()}",
             cause="--nproc (or torchrun's --nproc-per-node) is larger than the number of GPUs",
-            next=f"--nproc {torch.cuda.device_count()}, or device='cpu' in the runner's table",
+            next=f"--nproc {torch.cuda.device_count()}, or --set runner.device=cpu",
         )
     torch.cuda.set_device(local_rank)
     return torch.device("cuda", local_rank)
@@ -252,4 +267,5 @@ def explain(error: Exception, world: World, step: int) -> RunFailed | None:
         + str(error).strip().splitlines()[0][:200]
         + ")",
         next="mend what that message names, then run the same command with --resume auto",
+        reason="rank lost",
     )

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.dtensor import local
+from fluxvla_core.checkpoints.parts import local
 from fluxvla_core.checkpoints.tensors import check_names, copy_whole
 
 

@@ -8,20 +8,22 @@ config's ``runner`` are left out, so that no training plugin is needed where it 
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.disk import files_below
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.train.weights import LeftOut, load_for_inference, model_tensors
+from fluxvla_core.untrusted import read_bytes
 
 TRAINING_ONLY = ("runner", "val_dataloader")
 """Sections of the config that are not exported."""
+_COPIED = (ckpt.POLICY, ckpt.EMBODIMENT, ckpt.STATISTICS, ckpt.ENVIRONMENT)
 
 
 def export(source: str | Path, target: str | Path) -> Path:
@@ -45,6 +47,7 @@ def export(source: str | Path, target: str | Path) -> Path:
     checkpoint = Checkpoint.open(source)
     prepare_folder(target.parent, "folder to export to", "name another place for the export")
     checkpoint.verify()
+    checkpoint.config()  # of the right types
     config = checkpoint.json(ckpt.CONFIG)
     tree = {k: v for k, v in config["config"].items() if k not in TRAINING_ONLY}
     if "model" not in tree:
@@ -60,15 +63,30 @@ def export(source: str | Path, target: str | Path) -> Path:
     load_for_inference(model, checkpoint)
     if target.exists():
         target.rmdir()
-    with CheckpointWriter(target.parent, checkpoint.step, checkpoint.epoch, final=target) as writer:
+    with CheckpointWriter(
+        target.parent,
+        checkpoint.step,
+        checkpoint.epoch,
+        final=target,
+        what="the export",
+        go_on="export again, or name a folder on another disk; the checkpoint is as it was",
+    ) as writer:
         TensorFile.whole(ckpt.MODEL, model_tensors(model), True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, {**config, "config": tree, "origins": origins})
-        for name in (ckpt.POLICY, ckpt.EMBODIMENT, ckpt.STATISTICS, ckpt.ENVIRONMENT):
-            if checkpoint.has(name):
-                writer.write_bytes(name, (checkpoint.path / name).read_bytes())
-        if checkpoint.processors.is_dir():
-            for path in files_below(checkpoint.processors):
-                name = path.relative_to(checkpoint.path).as_posix()
-                writer.write_bytes(name, path.read_bytes())
+        for name in sorted(checkpoint.manifest.files):
+            if name in _COPIED or name.startswith(f"{ckpt.PROCESSORS}/"):
+                writer.write_bytes(name, _verified(checkpoint, name))
         return writer.commit()
+
+
+def _verified(checkpoint: Checkpoint, name: str) -> bytes:
+    """What is copied is what its sum says, even if the file changes while this runs.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    content = read_bytes(checkpoint.path / name, CheckpointError)
+    if hashlib.sha256(content).hexdigest() != checkpoint.manifest.files[name].sha256:
+        raise CheckpointError(f"{name} was changed since it was saved", where=str(checkpoint.path))
+    return content

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.train.forward import loss_of
+from fluxvla_core.train.model import loss_of
 from fluxvla_core.train.state import rng_state, set_rng_state
 
 PEAK_TFLOPS: tuple[tuple[str, float], ...] = (

@@ -30,6 +30,18 @@ _PEFTS = ("base_layer", "lora_dropout")  # what peft puts into every layer that 
 
 
 @dataclass(frozen=True)
+class SavedAdapter:
+    """What is read of ``adapter_config.json``."""
+
+    r: int
+    target_modules: list[str] | str
+    lora_alpha: float
+    lora_dropout: float
+    base_model_name_or_path: str | None
+    modules_to_save: list[str] | None = None
+
+
+@dataclass(frozen=True)
 class LoraOptions:
     """The table ``lora`` of a train runner.
 
@@ -110,14 +122,14 @@ class LoraOptions:
         """The adapter that a checkpoint holds, None if it holds none."""
         if not checkpoint.has(CONFIG):
             return None
-        saved = checkpoint.json(CONFIG)
+        saved = checkpoint.json(CONFIG, SavedAdapter)
         targets = saved["target_modules"]
         return cls(
             saved["r"],
             targets if isinstance(targets, str) else tuple(targets),
             saved["lora_alpha"],
             saved["lora_dropout"],
-            tuple(saved["modules_to_save"] or ()),
+            tuple(saved.get("modules_to_save") or ()),
         )
 
 

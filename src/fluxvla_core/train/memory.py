@@ -39,8 +39,9 @@ _SHARED = (
     "unable to allocate shared memory(shm)",
 )
 _LESS_HOST = (
-    "lower train_dataloader.per_device_num_workers or per_device_batch_size, or set "
-    "cache_frames=False in the dataset"
+    "lower --set train_dataloader.per_device_num_workers=… or --set "
+    "train_dataloader.per_device_batch_size=…, or --set "
+    "train_dataloader.dataset.cache_frames=false"
 )
 _GO_ON = "then go on with --resume auto: checkpoints are as they were"
 
@@ -63,9 +64,11 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
     what = "the GPU ran" if device else "this machine ran"
     if device:
         advice = (
-            "lower train_dataloader.per_device_batch_size and raise runner.grad_accumulation_steps "
-            "by as much (the result stays the same), or set enable_gradient_checkpointing or "
-            "enable_mixed_precision_training, or split the model with FSDPTrainRunner"
+            "lower --set train_dataloader.per_device_batch_size=… and raise --set "
+            "runner.grad_accumulation_steps=… by as much (the result stays the same), or --set "
+            "runner.enable_gradient_checkpointing=true, --set "
+            "runner.enable_mixed_precision_training=true, or split the model: --set "
+            "runner.type=FSDPTrainRunner"
         )
     else:
         advice = _LESS_HOST
@@ -99,7 +102,7 @@ def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFai
         cause = "/dev/shm is full, through which workers pass batches: a container has 64 MB of it"
         advice = (
             "make it larger (docker run --shm-size=8g; on Kubernetes an emptyDir with medium: "
-            "Memory there), or set train_dataloader.per_device_num_workers=0"
+            "Memory there), or --set train_dataloader.per_device_num_workers=0"
         )
     elif ending == "killed":
         what = f"a data worker{pid} was killed{when}"
@@ -111,8 +114,8 @@ def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFai
         )
         cause = "a crash below Python, as in a video decoder, or it was killed from outside"
         advice = (
-            "run with train_dataloader.per_device_num_workers=0 and python -X faulthandler to see "
-            "where it happens"
+            "run with --set train_dataloader.per_device_num_workers=0 and python -X faulthandler "
+            "to see where it happens"
         )
     return RunFailed(what, cause=cause, next=f"{advice}; {_GO_ON}")
 

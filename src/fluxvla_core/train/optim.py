@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,6 +20,22 @@ NamedState = dict[str, Tensor]
 def trainable(model: nn.Module) -> dict[str, nn.Parameter]:
     """Parameters that are trained, by name; a tied one once, under its first name."""
     return {name: p for name, p in model.named_parameters() if p.requires_grad}
+
+
+def refuse_scalars(parameters: Mapping[str, nn.Parameter], runner: str, where: str | None) -> None:
+    """Refuse parameters without dimensions, for a strategy that cuts along one.
+
+    Raises:
+        ConfigError: names one of them.
+    """
+    for name, parameter in parameters.items():
+        if parameter.ndim == 0:
+            raise ConfigError(
+                f"{name} is a parameter without dimensions, which {runner} cannot split",
+                where=where,
+                cause="a parameter is split over the processes along a dimension",
+                next="give it one, as nn.Parameter(torch.ones(1)) has, or use DDPTrainRunner",
+            )
 
 
 def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
@@ -111,6 +128,11 @@ def torch_state(
     state: dict[int, dict[str, Any]] = {}
     for place, value in {**tensors, **described["scalars"]}.items():
         name, _, key = place.rpartition("/")
+        if name not in index:
+            raise CheckpointError(
+                f"the checkpoint's optimizer has a state of {name!r}, which is not trained here",
+                where=where,
+            )
         if isinstance(value, Tensor | Stored):
             same = value.shape == parameters[name].shape
             everything = tuple(slice(0, n) for n in value.shape)
@@ -125,6 +147,23 @@ def torch_state(
         first += len(mine["params"])
         groups.append(group)
     return {"state": state, "param_groups": groups}
+
+
+@dataclass(frozen=True)
+class SavedGroup:
+    """One group of an optimizer, its parameters by name."""
+
+    params: list[str]
+    lr: Any = None
+
+
+@dataclass(frozen=True)
+class SavedOptimizer:
+    """``optimizer.json``; see :func:`named_state`."""
+
+    type: str
+    groups: list[SavedGroup]
+    scalars: dict[str, Any]
 
 
 class ScheduledLR(torch.optim.lr_scheduler.LRScheduler):

@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from fluxvla_core.contracts.training import Optimizer
+
 if TYPE_CHECKING:
     import torch
 
 
-class AdamW:
+class AdamW(Optimizer):
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019), in one fused kernel.
 
     Args:
@@ -44,7 +46,7 @@ class AdamW:
         )
 
 
-class SGD:
+class SGD(Optimizer):
     """Stochastic gradient descent.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a train runner can be told, checked before anything is built."""
+"""The settings of a train runner and of its data loaders, checked before anything is built."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.config.check import LOADER_KEYS
+from fluxvla_core.config.resolve import LOADER_KEYS
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.train.lora import LoraOptions, check_installed
 from fluxvla_core.train.schedule import make_schedule
@@ -18,38 +18,82 @@ SAVE_STEPS = 10_000
 """``save_iter_interval`` of step-based runs that do not set it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """The runner's plain settings; ``BaseTrainRunner`` says what each means."""
+    """The settings of a train runner, of which its constructor and ``plugins show`` are made."""
 
     learning_rate: float
-    max_epochs: int | None
-    max_steps: int | None
-    weight_decay: float
-    max_grad_norm: float | None
-    sampler: str | None
-    save_epoch_interval: int
-    save_iter_interval: int | None
-    max_keep_ckpts: int
-    async_save: bool
-    lr_scheduler_type: str
-    lr_schedule: Mapping[Any, float] | None
-    warmup_ratio: float
-    grad_accumulation_steps: int
-    enable_mixed_precision_training: bool
-    mixed_precision_dtype: str
-    enable_gradient_checkpointing: bool
-    compile_blocks: bool
-    init_from: str | None
-    lora: Mapping[str, Any] | None
-    ema_decay: float | None
-    val_iter_interval: int | None
-    early_stop_patience: int | None
-    seed: int
-    resume_from: str | None
-    log_iter_interval: int
-    device: str
-    peak_tflops: float | None
+    """peak rate of AdamW."""
+    collator: Any
+    """table of ``fluxvla.collators``, or a callable from samples to a batch."""
+    max_epochs: int | None = None
+    """exactly one of max_epochs and max_steps ends the run."""
+    max_steps: int | None = None
+    """exactly one of max_epochs and max_steps ends the run."""
+    weight_decay: float = 0.0
+    """of matrices; biases and norms have none."""
+    max_grad_norm: float | None = 1.0
+    """gradients are scaled down to this norm; None leaves them."""
+    sampler: str | None = None
+    """None or ``distributed``: both shuffle every epoch and split it over the ranks."""
+    tokenizer: Any = None
+    """table of ``fluxvla.tokenizers``, saved with the checkpoints."""
+    metric: Any = None
+    """table of ``fluxvla.metrics``; a ``VLAMetric`` that writes JSON lines if None."""
+    optimizer: Any = None
+    """table of ``fluxvla.optimizers``; ``AdamW`` if None."""
+    save_epoch_interval: int = 1
+    """epoch-based runs save after every so many epochs."""
+    save_iter_interval: int | None = None
+    """save every so many steps; 10000 in step-based runs that say nothing, only by epochs in
+    epoch-based ones. The end of a run is always saved."""
+    max_keep_ckpts: int = 2
+    """newest checkpoints (by step) to keep; 0 keeps all."""
+    async_save: bool = True
+    """write checkpoints beside the training, from a copy in memory; False waits for the disk and
+    needs no copy."""
+    lr_scheduler_type: str = "constant"
+    """``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``."""
+    lr_schedule: Mapping[Any, float] | None = None
+    """for ``step-based``: ``{part of the run: rate}``, with 0."""
+    warmup_ratio: float = 0.0
+    """part of the run over which the rate rises."""
+    grad_accumulation_steps: int = 1
+    """batches per optimizer step; gradients are averaged over them."""
+    enable_mixed_precision_training: bool = False
+    """compute in ``mixed_precision_dtype``; weights and optimizer stay fp32."""
+    mixed_precision_dtype: str = "bf16"
+    """``bf16``."""
+    enable_gradient_checkpointing: bool = False
+    """recompute the model's ``fsdp_units`` in the backward pass."""
+    compile_blocks: bool = False
+    """``torch.compile`` each of the model's ``fsdp_units``."""
+    init_from: str | None = None
+    """weights to start from: a checkpoint's folder, a work dir, a safetensors file; a run that goes
+    on has its own, or its adapter's base, instead."""
+    lora: Mapping[str, Any] | None = None
+    """train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
+    ``alpha``, ``dropout``, ``modules_to_save``."""
+    ema_decay: float | None = None
+    """keep averaged weights too, and act with those; None does not."""
+    val_iter_interval: int | None = None
+    """with a ``val_dataloader``: its loss every so many steps and at the end; None with every
+    checkpoint. The best one by it is kept and called ``best``."""
+    early_stop_patience: int | None = None
+    """end after so many validations in a row without a better one."""
+    seed: int = 42
+    """initial weights, order of samples, and everything drawn, also by datasets that set no
+    ``seed`` of their own."""
+    resume_from: str | None = None
+    """``auto`` or a checkpoint's path; the command line's ``--resume`` goes first, but ``auto`` and
+    restarts begin at that path while the work dir has no checkpoint."""
+    log_iter_interval: int = 10
+    """fetch losses, and look for NaN, every so many steps; every step is logged all the same."""
+    device: str = "auto"
+    """``auto`` (a GPU if there is one), ``cpu``, ``cuda``."""
+    peak_tflops: float | None = None
+    """what one device can do at most, for ``mfu``; by default what the makers of known GPUs state
+    for bf16."""
 
     def check(self, context: RunContext) -> None:
         """Refuse values that cannot be meant.

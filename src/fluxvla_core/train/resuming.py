@@ -2,35 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import math
+import shlex
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
     EMA,
+    FOLDER,
     MODEL,
     OPTIMIZER_META,
     TRAINER,
     Checkpoint,
     folders,
     newest_whole,
+    step_name,
 )
+from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
 from fluxvla_core.checkpoints.owner import Claim, claim
-from fluxvla_core.checkpoints.shelf import clear_leftovers, prepare, set_aside_later
+from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.train.batches import StepPlan
-from fluxvla_core.train.changes import changed_settings, changed_statistics, plain
-from fluxvla_core.train.distributed import World, on_first
+from fluxvla_core.train.distributed import World, agree, on_first
 from fluxvla_core.train.lora import LoraOptions, adapter_tensors
-from fluxvla_core.train.optim import ScheduledLR
-from fluxvla_core.train.progress import Progress
-from fluxvla_core.train.saving import rng_file
-from fluxvla_core.train.state import rank_seed, seed_all, seeds_of, set_rng_state
-from fluxvla_core.train.weights import LeftOut, check_model_tensors
+from fluxvla_core.train.optim import SavedOptimizer, ScheduledLR
+from fluxvla_core.train.saving import plain, rng_file
+from fluxvla_core.train.state import (
+    Progress,
+    SavedTrainer,
+    rank_seed,
+    seed_all,
+    seeds_of,
+    set_rng_state,
+)
+from fluxvla_core.train.weights import LeftOut, SavedWeights, check_model_tensors
 
 if TYPE_CHECKING:
-    from fluxvla_core.train.strategy import Strategy
+    from fluxvla_core.train.base_runner import BaseTrainRunner
+
 
 AUTO = "auto"
 
@@ -164,6 +177,11 @@ def _listed(seeds: Sequence[int | None]) -> str:
     return ", ".join(map(str, seeds))
 
 
+def _begin_another(checkpoint: str) -> str:
+    weights = shlex.quote(f"runner.init_from={checkpoint}")
+    return f"begin another run from these weights: --set {weights} --work-dir OTHER"
+
+
 def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
     """Refuse to go on with another adapter than the checkpoint's, or with one, or without.
 
@@ -175,8 +193,7 @@ def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, whe
         raise CheckpointError(
             f"lora is {_shown(mine)}, the checkpoint's run had {_shown(saved)}",
             where=where,
-            next="set it back; or begin another run from these weights: init_from = "
-            "'<this checkpoint>' and another --work-dir",
+            next=f"set it back; or {_begin_another(where)}",
         )
 
 
@@ -197,8 +214,7 @@ def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
     raise CheckpointError(
         what,
         where=str(checkpoint.path),
-        next=f"{back}; or begin another run from these weights: init_from = '<this checkpoint>' "
-        "and another --work-dir",
+        next=f"{back}; or {_begin_another(str(checkpoint.path))}",
     )
 
 
@@ -208,7 +224,7 @@ def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: names the statistics that differ.
     """
-    ours = plain(dict(getattr(dataset, "statistics", None) or {}))
+    ours = plain(dict(Dataset.adapt(dataset).statistics or {}))
     changed = changed_statistics(checkpoint.statistics(), ours)
     if changed:
         named = ", ".join(changed[:6]) + (", …" if len(changed) > 6 else "")
@@ -217,12 +233,11 @@ def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
             where=str(checkpoint.path),
             cause="other data, episodes or settings of the dataset: states and actions would now "
             "mean something else to the model",
-            next="set the dataset back; or begin another run from these weights: init_from = "
-            "'<this checkpoint>' and another --work-dir",
+            next=f"set the dataset back; or {_begin_another(str(checkpoint.path))}",
         )
 
 
-def _warnings(run: Strategy, checkpoint: Checkpoint, saved: Mapping[str, Any]) -> list[str]:
+def _warnings(run: BaseTrainRunner, checkpoint: Checkpoint, saved: Mapping[str, Any]) -> list[str]:
     """What to say of settings that may change, and have."""
     said = check_same_run(saved, run.plan, seeds_of(run.dataset), str(checkpoint.path))
     context = run.context
@@ -239,7 +254,7 @@ def _shown(settings: Mapping[str, Any] | None) -> str:
     return ", ".join(f"{key}={settings[key]}" for key in named)
 
 
-def restore(run: Strategy, checkpoint: Checkpoint) -> None:
+def restore(run: BaseTrainRunner, checkpoint: Checkpoint) -> None:
     """Put everything but the random generators back to where ``checkpoint`` was saved.
 
     Raises:
@@ -247,7 +262,8 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
             the two keeps averages.
     """
     where = str(checkpoint.path)
-    saved = checkpoint.json(TRAINER)
+    checkpoint.json(TRAINER, SavedWeights)
+    saved = checkpoint.json(TRAINER, SavedTrainer)
     check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
     check_same_averages(run.options.ema_decay, checkpoint)
     warnings = _warnings(run, checkpoint, saved)
@@ -257,19 +273,34 @@ def restore(run: Strategy, checkpoint: Checkpoint) -> None:
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
     check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
     run._load_model_state(tensors)
-    optimizer = checkpoint.optimizer_tensors(), checkpoint.json(OPTIMIZER_META)
-    if run._load_optimizer_tensors(*optimizer, where) is False:
+    optimizer = checkpoint.optimizer_tensors(), checkpoint.json(OPTIMIZER_META, SavedOptimizer)
+    if run.load_optimizer_tensors(*optimizer, where) is False:
         raise CheckpointError(
             f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
         )
     if run.ema is not None:
         run.ema.load(checkpoint.tensors(EMA), where)
-    run.metric.load_state_dict(saved["metric"])
+    with _state_of("metric", where):
+        run.metric.load_state_dict(saved["metric"])
     run.progress = Progress.from_dict(saved)
-    run.lr_scheduler.load_state_dict(_schedule_state(run, saved))
+    with _state_of("scheduler", where):
+        run.lr_scheduler.load_state_dict(_schedule_state(run, saved))
 
 
-def _schedule_state(run: Strategy, saved: Mapping[str, Any]) -> Any:
+@contextmanager
+def _state_of(what: str, where: str) -> Iterator[None]:
+    """Let what a class raises for a state that it did not write be a CheckpointError."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"the saved state of the {what} does not fit: {type(error).__name__}: {error}",
+            where=where,
+            cause="another class wrote it, or the checkpoint was put together by hand",
+        ) from error
+
+
+def _schedule_state(run: BaseTrainRunner, saved: Mapping[str, Any]) -> Any:
     """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller now.
 
     The rate follows the part of the run that is done. A count of the old steps would be past the
@@ -278,7 +309,28 @@ def _schedule_state(run: Strategy, saved: Mapping[str, Any]) -> Any:
     same = saved["step_samples"] == run.plan.step_samples
     if same or not isinstance(run.lr_scheduler, ScheduledLR):
         return saved["scheduler"]
-    return {"step": run.planned_step}
+    plan, progress, length = run.plan, run.progress, (run.max_steps, run.max_epochs)
+    left = plan.run_steps_left(progress.step, progress.cursor, *length)
+    return {"step": plan.total_steps(*length) - left}
+
+
+def forget_missing(
+    progress: Progress, world: World, work_dir: Path, resumed: Checkpoint | None
+) -> None:
+    """Let ``progress`` forget checkpoints that the ``resumed`` one knows and this work dir lacks.
+
+    The best one may have been removed in favour of a better one that was lost since. Of a
+    checkpoint from elsewhere, neither itself nor the best one before it is here.
+    """
+    elsewhere = lost = False
+    if world.first:
+        here = work_dir / FOLDER / step_name(progress.step)
+        elsewhere = resumed is None or resumed.path.resolve() != here.resolve()
+        lost = not name_best(work_dir, -1 if elsewhere else progress.best_step)
+    if agree(world, elsewhere):
+        progress.saved = -1
+    if agree(world, lost):
+        progress.best, progress.best_step = None, -1
 
 
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
@@ -291,5 +343,94 @@ def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
         seed_all(rank_seed(seed, world.rank))
         return
     seed_all(rank_seed(seed, world.rank, checkpoint.step))
-    if checkpoint.json(TRAINER)["world_size"] == world.size:
-        set_rng_state(checkpoint.tensors(rng_file(world.rank)))
+    if checkpoint.json(TRAINER, SavedTrainer)["world_size"] == world.size:
+        state = checkpoint.tensors(rng_file(world.rank))
+        with _state_of("random generators", str(checkpoint.path)):
+            set_rng_state(state)
+
+
+TABLES = ("model", "train_dataloader", "val_dataloader")
+"""What a run, and its best checkpoint, follow from, besides the section that runs."""
+HARMLESS = frozenset(
+    {
+        # Where things are. A model's frozen weights are compared by their sum, data by statistics.
+        *("init_from", "resume_from", "device"),
+        # How samples are fetched.
+        *("per_device_num_workers", "cache_frames"),
+        # What is told and saved, and how often.
+        *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
+        *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
+        "early_stop_patience",  # how long it goes on
+        # Samples a step: what they come to together is compared on its own.
+        *("per_device_batch_size", "grad_accumulation_steps"),
+    }
+)
+"""Keys that may change without a word."""
+LENGTH = frozenset({"max_epochs", "max_steps"})
+"""And those that may where the learning rate does not follow from them."""
+_UNSET = "not set"
+
+
+def changed_settings(
+    saved: Mapping[str, Any], ours: Mapping[str, Any], section: str
+) -> dict[str, tuple[str, str]]:
+    """Keys of the running ``section`` and of :data:`TABLES` that differ, and both values.
+
+    Args:
+        saved: the checkpoint's config tree.
+        ours: the present one's.
+
+    Returns:
+        Dotted key -> (before, now), as JSON or ``not set``.
+    """
+    steady = all(_steady(tree[section]) for tree in (saved, ours) if section in tree)
+    harmless = HARMLESS | LENGTH if steady else HARMLESS
+    before, now = (
+        {
+            key: value
+            for name in (section, *TABLES)
+            for key, value in _leaves(name, plain(tree.get(name) or {}), harmless)
+        }
+        for tree in (saved, ours)
+    )
+    return {
+        key: (before.get(key, _UNSET), now.get(key, _UNSET))
+        for key in {**before, **now}
+        if before.get(key) != now.get(key)
+    }
+
+
+def _steady(runner: Mapping[str, Any]) -> bool:
+    """Whether the learning rate of a step is the same however long the run is."""
+    constant = runner.get("lr_scheduler_type", "constant") == "constant"
+    return constant and not runner.get("warmup_ratio")
+
+
+def _leaves(name: str, value: Any, harmless: Set[str]) -> Iterator[tuple[str, str]]:
+    """Dotted keys below ``name`` with their values as text; lists of tables count from 0."""
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        value = {str(i): item for i, item in enumerate(value)}
+    if not isinstance(value, Mapping):
+        yield name, json.dumps(value, ensure_ascii=False)
+        return
+    for key, item in value.items():
+        if key not in harmless and not key.endswith("_path"):
+            yield from _leaves(f"{name}.{key}", item, harmless)
+
+
+def changed_statistics(saved: Any, ours: Any, name: str = "") -> list[str]:
+    """Dotted names of statistics that differ by more than another machine's rounding does."""
+    if isinstance(saved, Mapping) and isinstance(ours, Mapping):
+        return [
+            found
+            for key in {**saved, **ours}
+            for found in changed_statistics(
+                saved.get(key), ours.get(key), f"{name}.{key}".strip(".")
+            )
+        ]
+    if isinstance(saved, list) and isinstance(ours, list) and len(saved) == len(ours):
+        pairs = zip(saved, ours, strict=True)
+        return [name] if any(changed_statistics(a, b, name) for a, b in pairs) else []
+    numbers = all(isinstance(v, int | float) for v in (saved, ours))
+    same = math.isclose(saved, ours, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == ours
+    return [] if same else [name]

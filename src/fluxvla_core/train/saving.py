@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+import json
+import re
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
+from fluxvla_core.checkpoints.directory import rotate
 from fluxvla_core.checkpoints.parts import is_split, own_parts
-from fluxvla_core.checkpoints.shelf import rotate
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
-from fluxvla_core.config.resolved import environment
+from fluxvla_core.config.snapshot import environment
+from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.train import lora
-from fluxvla_core.train.changes import plain
-from fluxvla_core.train.distributed import World, on_first, texts
+from fluxvla_core.train.distributed import World, agree, on_first, texts
 from fluxvla_core.train.ema import Ema
-from fluxvla_core.train.saver import Saver
 from fluxvla_core.train.state import rng_state, seeds_of
 from fluxvla_core.train.weights import LeftOut
 
 if TYPE_CHECKING:
-    from fluxvla_core.train.strategy import Strategy
+    from fluxvla_core.train.base_runner import BaseTrainRunner
+
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
 @dataclass(frozen=True)
@@ -153,14 +161,14 @@ def part_file(rank: int) -> str:
     return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
 
 
-def take_snapshot(run: Strategy, train_loss: float | None, only_trainable: bool) -> Snapshot:
+def take_snapshot(run: BaseTrainRunner, train_loss: float | None, only_trainable: bool) -> Snapshot:
     """The runner's present moment.
 
     Args:
         only_trainable: leave out frozen weights that the model brings itself.
     """
     without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
-    state, (optimizer, described) = run._model_tensors(), run._optimizer_tensors()
+    state, (optimizer, described) = run.model_tensors(), run.optimizer_tensors()
     adapter = lora.adapter_names(run.model)
     elsewhere = {*without.names, *adapter}
     documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
@@ -197,9 +205,10 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
     ``policy.json``: ``action_rate_hz`` is the dataset's ``fps`` (Hz), ``horizon`` the first of
     the model's ``action_shape``, else the dataset's ``action_window_size``; null where unknown.
     """
-    shape = getattr(model, "action_shape", None)
-    horizon = shape[0] if shape else getattr(dataset, "action_window_size", None)
-    rate = getattr(dataset, "fps", None)
+    described = Dataset.adapt(dataset)
+    shape = VLA.adapt(model).action_shape
+    horizon = shape[0] if shape else described.action_window_size
+    rate = described.fps
     config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
     documents: dict[str, dict[str, Any]] = {
         ckpt.CONFIG: plain(config),
@@ -208,12 +217,22 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
             "action_rate_hz": None if rate is None else float(rate),
             "horizon": None if horizon is None else int(horizon),
         },
-        ckpt.STATISTICS: dict(getattr(dataset, "statistics", None) or {}),
+        ckpt.STATISTICS: dict(described.statistics or {}),
     }
-    embodiment = getattr(dataset, "embodiment", None)
+    embodiment = described.embodiment
     if embodiment is not None:
         documents[ckpt.EMBODIMENT] = embodiment.to_dict()
     return documents
+
+
+def plain(config: Any) -> Any:
+    """``config`` as JSON values; objects, which one made in Python may hold, are described."""
+    return json.loads(json.dumps(config, default=_described))
+
+
+def _described(value: Any) -> str:
+    """Where it lies in memory is another place in every process."""
+    return _ADDRESS.sub("", repr(value))
 
 
 def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]]:
@@ -226,3 +245,158 @@ def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]
     if save is None:
         return {}
     return {ckpt.PROCESSORS: lambda folder: save(folder / "tokenizer")}
+
+
+@dataclass
+class _Job:
+    """A checkpoint on its way: ``copied`` when nothing of the training is needed any more."""
+
+    step: int
+    copied: threading.Event = field(default_factory=threading.Event)
+    warnings: list[str] = field(default_factory=list)
+    path: Path | None = None
+    error: BaseException | None = None
+    thread: threading.Thread | None = None
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A checkpoint that has its name."""
+
+    step: int
+    path: Path
+    warnings: tuple[str, ...]
+
+
+class Saver:
+    """Writes checkpoints of one run, in a thread of its own or at once.
+
+    Args:
+        world: the processes that save together.
+        beside: use a thread.
+        optimizer: waits, in its ``step``, for the copy; one without ``register_step_pre_hook``
+            is copied before :meth:`start` returns.
+    """
+
+    def __init__(self, world: World, beside: bool, optimizer: Any = None) -> None:
+        self.world, self.beside = world, beside
+        self._threads = world
+        if beside and world.size > 1:
+            # The threads of all ranks talk while the training talks on the other groups.
+            self._threads = replace(world, control=dist.new_group(backend="gloo"))
+        self._job: _Job | None = None
+        self._memory: dict[tuple[str, int], Tensor] = {}
+        self._before_step = getattr(optimizer, "register_step_pre_hook", None)
+        self._hook: Any = None
+
+    def start(
+        self,
+        step: int,
+        files: Sequence[TensorFile],
+        write: Callable[[World, Iterable[TensorFile], Callable[[str], None]], Path],
+    ) -> None:
+        """Let ``write(world, files, warn)`` make the checkpoint of ``step``; all ranks call it.
+
+        The one before must have been settled.
+        """
+        job = self._job = _Job(step)
+        warn = job.warnings.append
+        if not self.beside:
+            self._run(job, lambda: write(self.world, files, warn))
+            return
+        gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
+        ready = _reached(self.world.device)
+        job.thread = threading.Thread(
+            target=self._run,
+            args=(job, lambda: write(self._threads, self._held(job, gathered, ready), warn)),
+            name=f"checkpoint-{step}",
+            daemon=True,
+        )
+        job.thread.start()
+        if self._before_step is None:
+            self.copied()
+        else:
+            # Only while there is something to wait for: each hook costs every step its time.
+            self._hook = self._before_step(lambda *_: self.copied())
+
+    def copied(self) -> None:
+        """Wait until weights and optimizer may change; needed before anything but a step does."""
+        if self._job is not None and self._job.thread is not None:
+            self._job.copied.wait()
+
+    def settle(self, wait: bool) -> Saved | None:
+        """What became of the checkpoint on its way; all ranks call it at the same step.
+
+        Args:
+            wait: for its end; otherwise None is returned while some rank still writes.
+
+        Raises:
+            RunFailed: it could not be saved.
+        """
+        job = self._job
+        if job is None:
+            return None
+        if job.thread is not None:
+            if not wait and agree(self.world, int(job.thread.is_alive())):
+                return None
+            job.thread.join()
+        if self._hook is not None:
+            self._hook.remove()
+        self._job = self._hook = None
+        if job.error is not None:
+            raise job.error
+        assert job.path is not None
+        return Saved(job.step, job.path, tuple(job.warnings))
+
+    def close(self) -> None:
+        """Let the checkpoint on its way be finished, whatever becomes of it."""
+        if self._job is not None and self._job.thread is not None:
+            self._job.thread.join()
+
+    def _run(self, job: _Job, work: Callable[[], Path]) -> None:
+        try:
+            job.path = work()
+        except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
+            job.error = error
+
+    def _held(
+        self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
+    ) -> Iterator[TensorFile]:
+        """Copies of ``files``; all are made before the first is written."""
+        try:
+            with ready:
+                held = [
+                    replace(
+                        file,
+                        tensors=tuple(
+                            self._copy_of(file.name, i, t) for i, t in enumerate(file.tensors)
+                        ),
+                    )
+                    for file in files
+                ]
+        finally:
+            job.copied.set()
+        yield from held
+
+    def _copy_of(self, file: str, index: int, tensor: Tensor) -> Tensor:
+        return self._copy((file, index), tensor)
+
+    def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
+        """``tensor`` in host memory that is kept from save to save, pinned if it is on a GPU."""
+        kept = self._memory.get(place)
+        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
+            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+            self._memory[place] = kept
+        if kept is tensor:
+            return kept
+        with torch.no_grad():
+            return kept.copy_(tensor)
+
+
+def _reached(device: torch.device) -> AbstractContextManager[object]:
+    """Inside, a GPU copies beside the work that is enqueued later than now, and after the rest."""
+    if device.type != "cuda":
+        return nullcontext()
+    stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    stream.wait_stream(torch.cuda.current_stream(device))
+    return torch.cuda.stream(stream)

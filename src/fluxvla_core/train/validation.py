@@ -1,4 +1,4 @@
-"""Loss on samples that are not trained on, and what follows from it."""
+"""Validation: the loss on samples that are not trained on."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import torch
 from torch import nn
 
 from fluxvla_core.build import build_dataset_from_cfg
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.train.batches import loader_source, to_device
 from fluxvla_core.train.distributed import total
-from fluxvla_core.train.forward import to_device
-from fluxvla_core.train.pictures import source
 from fluxvla_core.train.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
 from fluxvla_core.train.stop import StopRequest
 
 if TYPE_CHECKING:
-    from fluxvla_core.train.strategy import Strategy
+    from fluxvla_core.train.base_runner import BaseTrainRunner
 
 
 class NotFinite(RunFailed):
@@ -40,7 +41,7 @@ class Validation:
         stop: asked after every batch.
     """
 
-    def __init__(self, run: Strategy, stop: StopRequest) -> None:
+    def __init__(self, run: BaseTrainRunner, stop: StopRequest) -> None:
         options = run.val_options
         assert options is not None
         self._stop = stop
@@ -58,7 +59,7 @@ class Validation:
         )
         batches: Any = list(sampler.batches(0))
         self._loader = make_loader(
-            source(self._dataset, run.collator, world.device),
+            loader_source(self._dataset, run.collator, world.device),
             run.collator,
             batches,
             options.per_device_num_workers,
@@ -66,7 +67,7 @@ class Validation:
             seed=run.options.seed,
         )
 
-    def loss(self, run: Strategy) -> float | None:
+    def loss(self, run: BaseTrainRunner) -> float | None:
         """Mean loss over the samples and all ranks, of the averaged weights if they are kept.
 
         None if a stop was asked for meanwhile. Leaves weights and random generators as they were,
@@ -76,7 +77,7 @@ class Validation:
             NotFinite: it is not finite.
         """
         losses = []
-        with acting(run):
+        with evaluating(run):
             # Every rank has as many batches, so all ask equally often.
             for batch in self._loader:
                 losses.append(run._training_step(to_device(batch, run.world.device)))
@@ -95,8 +96,8 @@ class Validation:
 
 
 @contextmanager
-def acting(run: Strategy) -> Iterator[None]:
-    """Inside, the model acts: with the weights that are for it, and the same draws every time."""
+def evaluating(run: BaseTrainRunner) -> Iterator[None]:
+    """Inside, the model evaluates: with averaged weights if kept, and the same draws every time."""
     drawn = rng_state()
     seed_all(rank_seed(run.options.seed, run.world.rank))
     run.vla.eval()
@@ -110,7 +111,7 @@ def acting(run: Strategy) -> Iterator[None]:
 
 
 def reshard(model: nn.Module) -> None:
-    """Let go of weights that sharding has gathered for a forward pass without a backward pass."""
+    """Release weights that sharding has gathered for a forward pass without a backward pass."""
     for module in model.modules():
         again = getattr(module, "reshard", None)
         if callable(again):
@@ -125,8 +126,7 @@ def share_statistics(train: Any, val: Any) -> None:
     """
     parts = getattr(val, "datasets", None)
     for dataset in parts if isinstance(parts, list) else [val]:
-        take = getattr(dataset, "use_statistics", None)
-        if take is None:
+        if not implements(dataset, Dataset, "use_statistics"):
             continue
         name = dataset.statistic_name
         if name not in train.statistics:
@@ -134,4 +134,4 @@ def share_statistics(train: Any, val: Any) -> None:
                 f"val_dataloader: its statistic_name {name!r} is none of the training data's, "
                 f"{', '.join(train.statistics)}"
             )
-        take(train.statistics[name])
+        dataset.use_statistics(train.statistics[name])

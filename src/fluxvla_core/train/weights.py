@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
 from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.train import lora
+from fluxvla_core.train.distributed import World, on_first
+from fluxvla_core.train.model import frozen_sources, set_frozen_source
 
 
 @dataclass(frozen=True)
@@ -34,13 +37,24 @@ class LeftOut:
         return {"sources": dict(self.sources), "sha256": self.sha256}
 
 
+@dataclass(frozen=True)
+class SavedLeftOut:
+    """:class:`LeftOut` in ``trainer.json``."""
+
+    sources: dict[str, str] = field(default_factory=dict)
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class SavedWeights:
+    """What ``trainer.json`` says in every checkpoint, exported ones too."""
+
+    left_out: SavedLeftOut
+
+
 def left_out(model: nn.Module) -> LeftOut:
     """What :class:`LeftOut` there is in ``model``; reads those weights once to sum them up."""
-    sources = {
-        name: str(source)
-        for name, module in model.named_modules()
-        if (source := getattr(module, "frozen_source", None)) is not None
-    }
+    sources = frozen_sources(model)
     state = model.state_dict(keep_vars=True)
     # What stands in no part by itself but in the whole model may be a buffer that training changes.
     names = frozenset(
@@ -116,7 +130,8 @@ def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
             f"{now}; then from {before})",
             where=where,
             cause="init_from was changed, or that place has other weights by now",
-            next=f"set init_from to where the weights of {before} are, or resume without it",
+            next=f"--set runner.init_from=DIR, where the weights of {before} are; or resume "
+            "without it",
         )
 
 
@@ -145,14 +160,14 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: they are not this model's, or frozen parts have changed.
     """
-    saved = checkpoint.json(TRAINER)["left_out"]
+    saved = checkpoint.json(TRAINER, SavedWeights)["left_out"]
     options = lora.LoraOptions.of_checkpoint(checkpoint)
     trained = {name: p.requires_grad for name, p in model.named_parameters()}
     if options is not None:
         base = base_of(checkpoint)
         if base is not None:
             start_from(model, base)
-            model.__dict__["frozen_source"] = base
+            set_frozen_source(model, base)
         lora.attach(model, options, trained=True)
     tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
     if checkpoint.has(EMA):
@@ -161,7 +176,7 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     put_model_tensors(model, tensors)
     if options is not None:
         lora.merge_(model)
-        model.__dict__.pop("frozen_source", None)
+        set_frozen_source(model, None)
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(trained[name])
 
@@ -208,8 +223,8 @@ def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
     """Where a checkpoint's base was asked for, and found."""
     if not checkpoint.has(lora.CONFIG):
         return None
-    asked = checkpoint.json(lora.CONFIG)["base_model_name_or_path"]
-    found = checkpoint.json(TRAINER)["left_out"].get("sources", {}).get("")
+    asked = checkpoint.json(lora.CONFIG, lora.SavedAdapter)["base_model_name_or_path"]
+    found = checkpoint.json(TRAINER, SavedWeights)["left_out"].get("sources", {}).get("")
     return None if asked is None or found is None else (asked, found)
 
 
@@ -221,7 +236,7 @@ def exact_place(place: str | Path) -> str:
     Raises:
         CheckpointError: there is none.
     """
-    path = Path(place).resolve()
+    path = Path(os.path.realpath(place))
     return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
 
 
@@ -238,7 +253,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
     Raises:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.
     """
-    path = Path(place).resolve()
+    path = Path(os.path.realpath(place))
     if path.suffix != ".safetensors":
         checkpoint = Checkpoint.open(path)
         checkpoint.verify()
@@ -251,6 +266,24 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
     check_names(tensors, model_tensors(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)
     return path
+
+
+def start_training_from(
+    model: nn.Module, init_from: str | None, before: Checkpoint | None, adapter: bool, world: World
+) -> None:
+    """Give a freshly built ``model`` the weights that ``init_from`` names, if any.
+
+    Args:
+        before: what the run resumes from: all weights are in it, but for an adapter's base.
+        adapter: the model is an adapter's base, whose weights are not saved.
+    """
+    place = base_of(before, init_from) if before is not None else init_from
+    if place is None:
+        return
+    # Found once: ranks that looked one after the other could find different ones.
+    found = start_from(model, on_first(world, lambda: exact_place(place)))
+    if adapter:
+        set_frozen_source(model, str(found))
 
 
 def _inside(name: str, prefix: str) -> bool:

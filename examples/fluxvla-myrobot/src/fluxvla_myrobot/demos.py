@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from fluxvla_sim.operators import URSimOperator
 
-from fluxvla_core.data.writer import LeRobotWriter
+from fluxvla_core.data import LeRobotWriter
 from fluxvla_myrobot.embodiment import HOME, SIZE, SPEC, STROKE
 
 FPS = 10.0

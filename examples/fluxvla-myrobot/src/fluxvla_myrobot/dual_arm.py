@@ -6,10 +6,15 @@ and written, ``RosOperator`` does the rest of the contract, ``AlohaInferenceRunn
 
 from __future__ import annotations
 
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import JOINT_STATE, CommandSpec, StreamSpec, camera_stream
+from fluxvla_core.ros2 import (
+    JOINT_STATE,
+    CommandSpec,
+    RosOperator,
+    StreamSpec,
+    camera_stream,
+    joints,
+    message_class,
+)
 from fluxvla_myrobot.embodiment import DUAL_ARM
 
 

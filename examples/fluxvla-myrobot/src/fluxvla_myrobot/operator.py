@@ -13,8 +13,8 @@ import threading
 from collections import deque
 
 from fluxvla_core.errors import NotReady
-from fluxvla_core.ros2.actions import checked_action
-from fluxvla_core.ros2.images import to_rgb
+from fluxvla_core.ros2 import checked_action
+from fluxvla_core.ros2 import images
 from fluxvla_myrobot.embodiment import SPEC
 
 
@@ -47,7 +47,7 @@ class MyRobotOperator:
 
     def _init_ros(self):
         """Subscribe and advertise."""
-        from fluxvla_core.ros2.connection import Connection
+        from fluxvla_core.ros2 import Connection
         self._connection = Connection('my_robot')
         node = self._connection.node
 
@@ -68,13 +68,13 @@ class MyRobotOperator:
 
     def _img_front_callback(self, msg):
         """A picture of the front camera."""
-        img = to_rgb(msg, msg.height, msg.width)
+        img = images.to_rgb(msg, msg.height, msg.width)
         with self._lock:
             self._img_front_buffer.append(img)
 
     def _img_wrist_callback(self, msg):
         """A picture of the wrist camera."""
-        img = to_rgb(msg, msg.height, msg.width)
+        img = images.to_rgb(msg, msg.height, msg.width)
         with self._lock:
             self._img_wrist_buffer.append(img)
 

@@ -13,11 +13,8 @@ from fluxvla_sim.aloha.world import CUBE as TWO_ARMS
 from fluxvla_sim.ros2.node import NodeSettings, simulate
 from fluxvla_sim.ur.world import CUBE as ONE_ARM
 
-from fluxvla_core.cli.reporters import make_reporter
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import FLOAT64, JOINT_STATE
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.commands import make_reporter
+from fluxvla_core.ros2 import FLOAT64, JOINT_STATE, BadMessage, joints, message_class
 from fluxvla_myrobot.embodiment import DUAL_ARM, SIZE, SPEC
 
 

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 from math import pi, radians
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Joint
+from fluxvla_core.operators import Joint
 
 
 @dataclass(frozen=True)

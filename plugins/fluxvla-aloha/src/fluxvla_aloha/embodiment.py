@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from fluxvla_aloha.arms import arms_called
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.operators import Camera, EmbodimentSpec
 
 RATE_HZ = 50.0
 CAMERAS = (

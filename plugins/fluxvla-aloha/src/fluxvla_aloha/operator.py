@@ -13,24 +13,24 @@ from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
 from fluxvla_aloha.embodiment import CAMERAS, GRIPPERS, RATE_HZ, aloha_spec
 from fluxvla_aloha.presets import PRESETS
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import (
+from fluxvla_core.operators import Camera, EmbodimentSpec
+from fluxvla_core.ros2 import (
     JOINT_STATE,
     ODOMETRY,
     SIDE,
     TWIST,
+    BadMessage,
     CommandSpec,
+    Connection,
+    RosOperator,
     StreamSpec,
     camera_stream,
+    joints,
+    message_class,
 )
-from fluxvla_core.ros2.trouble import BadMessage
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
-    from fluxvla_core.build import RunContext
+    from fluxvla_core.operators import RunContext
 
 Array = npt.NDArray[np.float64]
 SIDES = ("left", "right")

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fluxvla_core.ros2.streams import JOINT_STATE
+from fluxvla_core.ros2 import JOINT_STATE
 
 
 @dataclass(frozen=True)

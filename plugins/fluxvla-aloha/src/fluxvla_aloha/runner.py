@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from fluxvla_core.infer.base_runner import BaseInferenceRunner
+from fluxvla_core.operators import BaseInferenceRunner
 
 
 class AlohaInferenceRunner(BaseInferenceRunner):

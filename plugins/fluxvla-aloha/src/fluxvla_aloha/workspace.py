@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from fluxvla_aloha.arms import VIPERX300
-from fluxvla_core.control.workspace import WorkspaceBox
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.operators import WorkspaceBox
 
 # Offset from the joint before in metres, and axis: waist, shoulder, elbow, forearm roll, wrist
 # angle, wrist rotation.

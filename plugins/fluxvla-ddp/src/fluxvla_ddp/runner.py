@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.train.base_runner import BaseTrainRunner
+from fluxvla_core.training import BaseTrainRunner
 
 if TYPE_CHECKING:
     from torch import nn
@@ -49,12 +49,14 @@ class DDPTrainRunner(BaseTrainRunner):
         """Move the model to its device and keep its copies equal from there on."""
         from torch.nn.parallel import DistributedDataParallel
 
+        from fluxvla_core.training import VLA
+
         device = self.world.device
         vla = vla.to(device)
         if self.world.size == 1:
             return vla
         if self.static_graph is None:
-            declared = bool(getattr(vla, "static_graph", False))
+            declared = bool(VLA.adapt(vla).static_graph)
             self.static_graph = declared and not self.find_unused_parameters
         return DistributedDataParallel(
             vla,
@@ -64,7 +66,7 @@ class DDPTrainRunner(BaseTrainRunner):
             static_graph=self.static_graph,
         )
 
-    def _warm_up(self, batch: dict[str, Any]) -> None:
+    def warm_up(self, batch: dict[str, Any]) -> None:
         """Let torch rearrange its buckets, and learn a static graph, before the first step.
 
         DistributedDataParallel orders its buckets by how gradients arrived in its first backward
@@ -76,7 +78,7 @@ class DDPTrainRunner(BaseTrainRunner):
         needed = self.static_graph or (self.world.size > 2 and not self.find_unused_parameters)
         if self.world.size == 1 or not needed:
             return
-        from fluxvla_core.train.state import rng_state, set_rng_state
+        from fluxvla_core.training import rng_state, set_rng_state
 
         drawn = rng_state()
         buffers = {name: buffer.clone() for name, buffer in self.model.named_buffers()}
@@ -87,5 +89,5 @@ class DDPTrainRunner(BaseTrainRunner):
             buffer.copy_(buffers[name])
         set_rng_state(drawn)
 
-    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
+    def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         return nullcontext() if last or self.world.size == 1 else self.vla.no_sync()

@@ -15,8 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.parts import Stored
-from fluxvla_core.train.distributed import World
+from fluxvla_core.training import Stored, World
 
 
 def start(
@@ -79,11 +78,16 @@ def put_master_weights(
     parameters: Mapping[str, nn.Parameter], values: Mapping[str, Tensor]
 ) -> None:
     """Let ZeRO's fp32 copies of ``parameters`` be the full ``values`` of the same names."""
-    from deepspeed.utils import safe_set_full_fp32_param
+    from deepspeed.utils import safe_set_full_fp32_param, safe_set_local_fp32_param
 
     for name, parameter in parameters.items():
-        if name in values:
-            safe_set_full_fp32_param(parameter, values[name].to(parameter.device, torch.float32))
+        if name not in values:
+            continue
+        value = values[name].to(parameter.device, torch.float32)
+        if _split(parameter):
+            safe_set_local_fp32_param(parameter, _own_part(parameter, value))
+        else:
+            safe_set_full_fp32_param(parameter, value)
 
 
 def on_host(tensor: Tensor, first: bool) -> Tensor:
@@ -128,7 +132,7 @@ def put_state(
 
     A parameter that never had a gradient may have no state yet: it begins with zeros.
     """
-    from deepspeed.utils import safe_set_full_optimizer_state
+    from deepspeed.utils import safe_set_full_optimizer_state, safe_set_local_optimizer_state
 
     shapes = {name: _shape(parameter) for name, parameter in parameters.items()}
     # By key, then by parameter: what is of the parameters' shapes is split, a count is not.
@@ -152,7 +156,29 @@ def put_state(
     for name, parameter in parameters.items():
         for key in (key for key, found in split.items() if name in found):
             value = _whole(tensors[f"{name}/{key}"]).to(parameter.device)
-            safe_set_full_optimizer_state(parameter, value, key)
+            if _split(parameter):
+                safe_set_local_optimizer_state(parameter, _own_part(parameter, value), key)
+            else:
+                safe_set_full_optimizer_state(parameter, value, key)
+
+
+def _split(parameter: nn.Parameter) -> bool:
+    """Whether each process holds a part of this parameter, as with stage 3."""
+    return hasattr(parameter, "ds_tensor")
+
+
+def _own_part(parameter: nn.Parameter, value: Tensor) -> Tensor:
+    """This process's part of the full ``value``, filled up with zeros to the size that ZeRO gives
+    every process.
+
+    DeepSpeed's own functions for full values cut beyond the end of one that cannot be divided by
+    the number of processes.
+    """
+    split: Any = parameter
+    size = split.ds_tensor.ds_numel
+    begin = size * torch.distributed.get_rank(split.ds_process_group)
+    part = value.flatten()[begin : begin + size]
+    return nn.functional.pad(part, (0, size - part.numel()))
 
 
 def _link(engine: Any, inner: torch.optim.Optimizer) -> None:

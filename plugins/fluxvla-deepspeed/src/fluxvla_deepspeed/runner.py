@@ -8,13 +8,13 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.train.base_runner import BaseTrainRunner
+from fluxvla_core.training import BaseTrainRunner
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-    from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.training import Stored
 
 
 class DeepSpeedTrainRunner(BaseTrainRunner):
@@ -29,7 +29,8 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         kwargs: the settings of ``BaseTrainRunner``.
 
     Raises:
-        ConfigError: an unknown stage, averages with stage 3, or DeepSpeed is not installed.
+        ConfigError: an unknown stage, averages with stage 3, or DeepSpeed is not installed; later,
+            in ``run_setup``, a parameter without dimensions.
     """
 
     api: ClassVar[str] = "1.0"
@@ -60,15 +61,20 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
 
     def _wrap_model(self, vla: nn.Module) -> nn.Module:
         """Move the model to its device; the engine is made together with the optimizer."""
+        from fluxvla_core.training import refuse_scalars
+
+        # DeepSpeed views every parameter as bytes, frozen ones as well, which these do not allow.
+        named = dict(vla.named_parameters())
+        refuse_scalars(named, type(self).__name__, self.context.where("model"))
         return vla.to(self.world.device)
 
-    def _unwrap(self, vla: nn.Module) -> nn.Module:
+    def unwrap_model(self, vla: nn.Module) -> nn.Module:
         inside: nn.Module = getattr(vla, "module", vla)
         return inside
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
         """The config's optimizer; from here on its groups hold ZeRO's flat parts."""
-        from fluxvla_core.train.weights import left_out
+        from fluxvla_core.training import left_out
         from fluxvla_deepspeed.engine import start
 
         inner = super()._build_optimizer()
@@ -82,21 +88,21 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         )
         return inner
 
-    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
+    def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         self.vla.set_gradient_accumulation_boundary(last)
         return nullcontext()
 
-    def _backward(self, loss: Tensor) -> None:
+    def backward(self, loss: Tensor) -> None:
         self.vla.backward(loss, scale_wrt_gas=False)
 
-    def _update(self) -> Tensor | None:
+    def optimizer_step(self) -> Tensor | None:
         """Let the engine clip and step; the gradients' norm before clipping.
 
         The engine has it with and without clipping, and leaves out a step whose norm is not finite.
         """
         import torch
 
-        from fluxvla_core.train.distributed import share_buffers
+        from fluxvla_core.training import share_buffers
 
         self.vla.step()
         # DeepSpeed leaves buffers to every process.
@@ -104,21 +110,21 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         return torch.as_tensor(self.vla.get_global_grad_norm(), device=self.world.device).float()
 
     def _trained(self) -> dict[str, nn.Parameter]:
-        from fluxvla_core.train.optim import trainable
+        from fluxvla_core.training import trainable
 
         return trainable(self.model)
 
-    def _model_tensors(self) -> Mapping[str, Tensor]:
+    def model_tensors(self) -> Mapping[str, Tensor]:
         """Whole weights and buffers; with stage 3 gathered, and kept by the first rank only."""
         from fluxvla_deepspeed.engine import gathered, on_host
 
         if self.zero_stage < 3:
-            return super()._model_tensors()
+            return super().model_tensors()
         with gathered(self.model.parameters(), self.zero_stage):
-            state = super()._model_tensors()
+            state = super().model_tensors()
             return {name: on_host(tensor, self.world.first) for name, tensor in state.items()}
 
-    def _optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+    def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         from fluxvla_deepspeed.engine import read_state
 
         tensors = read_state(self.vla, self.optimizer, self._trained(), self.world.first)
@@ -135,7 +141,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         super()._load_model_state(state)
         put_master_weights(self._trained(), state)
 
-    def _load_optimizer_tensors(
+    def load_optimizer_tensors(
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
         from fluxvla_deepspeed.engine import put_state
@@ -154,7 +160,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         return True
 
     def resume(self) -> int:
-        """Go on from the checkpoint that the run was told to; the step it stands at, 0 afresh."""
+        """Resume from the chosen checkpoint; the step it was saved at, 0 for a fresh start."""
         from fluxvla_deepspeed.engine import gathered
 
         with gathered(self.model.parameters(), self.zero_stage):

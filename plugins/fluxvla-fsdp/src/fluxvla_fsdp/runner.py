@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.train.base_runner import BaseTrainRunner
+from fluxvla_core.training import BaseTrainRunner
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor, nn
     from torch.distributed.device_mesh import DeviceMesh
 
@@ -21,7 +23,8 @@ class FSDPTrainRunner(BaseTrainRunner):
 
     The blocks of the model's ``fsdp_units()`` are gathered one by one, those in a tuple together;
     frozen parameters and buffers stay whole on every process. In mixed precision blocks are
-    gathered in bf16, which halves the traffic; gradients are reduced in fp32.
+    gathered in bf16, which halves the traffic, but for batch and instance norms, whose running
+    statistics are fp32; gradients are reduced in fp32.
 
     Args:
         sharding_strategy: ``full-shard``; ``shard-grad-op`` (weights stay gathered from the
@@ -30,7 +33,8 @@ class FSDPTrainRunner(BaseTrainRunner):
         kwargs: the settings of ``BaseTrainRunner``.
 
     Raises:
-        ConfigError: an unknown strategy; later, in ``run_setup``, a weight in two units.
+        ConfigError: an unknown strategy; later, in ``run_setup``, a weight in two units, or a
+            trained parameter without dimensions.
     """
 
     api: ClassVar[str] = "1.0"
@@ -50,23 +54,35 @@ class FSDPTrainRunner(BaseTrainRunner):
         """Split the model's units, then what is left of it, over the mesh."""
         from torch.distributed.fsdp import fully_shard
 
-        from fluxvla_core.train.units import units_of
+        from fluxvla_core.training import refuse_scalars, trainable, units_of
+        from fluxvla_fsdp.norms import kept_fp32
         from fluxvla_fsdp.ties import check_ties
 
+        refuse_scalars(trainable(vla), type(self).__name__, self.context.where("model"))
         check_ties(vla, self.context.where("model"))
         frozen = {p for p in vla.parameters() if not p.requires_grad}
         shared: dict[str, Any] = {
             "mesh": self._mesh(),
-            "mp_policy": self._precision(),
             "ignored_params": frozen,
         }
+        compute, fp32 = self._precision(self.compute_dtype), self._precision(None)
+        norms = kept_fp32(vla, self.world.device) if self.compute_dtype is not None else set()
+
+        def split(modules: Sequence[nn.Module], reshard: bool) -> None:
+            """As one group; those that need their weights in fp32 as another, inside."""
+            apart = [n for m in modules for n in m.modules() if n in norms]
+            norms.difference_update(apart)
+            rest = [m for m in modules if m not in apart]
+            for group, policy in ((apart, fp32), (rest, compute)):
+                if group:
+                    fully_shard(group, mp_policy=policy, reshard_after_forward=reshard, **shared)
+
         reshard = self.sharding_strategy in ("full-shard", "hybrid-shard")
         for unit in units_of(vla):
             modules = [m for m in unit if any(p.requires_grad for p in m.parameters())]
-            if modules:
-                fully_shard(modules, reshard_after_forward=reshard, **shared)
+            split(modules, reshard)
         # Whatever is in no unit is gathered first and used until the end: no use in letting go.
-        fully_shard(vla, reshard_after_forward=False, **shared)
+        split([vla], False)
         # What is split was moved unit by unit: the whole model need not fit one device.
         for parameter in frozen:
             parameter.data = parameter.data.to(self.world.device)
@@ -89,25 +105,26 @@ class FSDPTrainRunner(BaseTrainRunner):
                 )
         return init_device_mesh(kind, (size // parts, parts), mesh_dim_names=("copy", "shard"))
 
-    def _precision(self) -> Any:
+    def _precision(self, dtype: torch.dtype | None) -> Any:
+        """The policy of a group whose weights are gathered in ``dtype``."""
         import torch
         from torch.distributed.fsdp import MixedPrecisionPolicy
 
         # Inputs keep their dtype: casting them would round targets and states as well.
         return MixedPrecisionPolicy(
-            param_dtype=self.compute_dtype,
-            reduce_dtype=torch.float32 if self.compute_dtype else None,
+            param_dtype=dtype,
+            reduce_dtype=torch.float32 if dtype else None,
             cast_forward_inputs=False,
         )
 
-    def _sync_gradients(self, last: bool) -> AbstractContextManager[object]:
+    def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         self.vla.set_requires_gradient_sync(last)
         return nullcontext()
 
-    def _update(self) -> Tensor | None:
-        from fluxvla_core.train.distributed import share_buffers
+    def optimizer_step(self) -> Tensor | None:
+        from fluxvla_core.training import share_buffers
 
-        norm = super()._update()
+        norm = super().optimizer_step()
         # fully_shard leaves buffers to every process.
         share_buffers(self.world, self.model)
         return norm

@@ -19,7 +19,7 @@ def check_ties(model: nn.Module, where: str | None) -> None:
     Raises:
         ConfigError: names one such weight by both its names.
     """
-    from fluxvla_core.train.units import units_of
+    from fluxvla_core.training import units_of
 
     numbers = {id(module): i for i, unit in enumerate(units_of(model)) for module in unit}
     modules = model.named_modules(remove_duplicate=False)

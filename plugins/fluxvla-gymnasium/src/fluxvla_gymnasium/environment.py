@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import MujocoEnvironment, check_render, note_renderer, set_render, use_egl
 
-from fluxvla_core.contracts.environment import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
-from fluxvla_core.evaluate.drawing import check_render, set_render, use_egl
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
-from fluxvla_gymnasium.parts import parts, pictures, state_row
-from fluxvla_gymnasium.success import SUCCESS, is_done
+from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.operators import Camera, EmbodimentSpec
+from fluxvla_gymnasium.parts import parts, pictures, state_row, text
+from fluxvla_gymnasium.success import KEYS, Judge, told
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
 
 Array = npt.NDArray[np.float64]
 
 
-class GymnasiumEnvironment:
+class GymnasiumEnvironment(MujocoEnvironment):
     """One Gymnasium environment as one task.
 
     An episode ends when Gymnasium says so, or with success. Its seed is given to Gymnasium's reset
@@ -40,13 +40,16 @@ class GymnasiumEnvironment:
         module: an installed package that registers the id when it is imported, ``gym_aloha``.
         make: further arguments of ``gymnasium.make``.
         instruction: what a policy is told; the id by default.
+        instruction_from: instead: a text of the observation, which may be another in each episode.
         max_steps: steps after which an episode ends at the latest.
         state: parts of the observation that are the state, in this order, keys of nested parts
-            joined by dots; by default every part that is no picture, by name.
+            joined by dots; by default every part that is no picture and no text, by name.
         cameras: camera of the embodiment -> part of the observation, or ``render`` for what
             Gymnasium's ``render()`` gives; by default the part of that name.
-        success: ``info`` (its ``is_success`` or ``success``) or ``terminated``.
+        success: ``info`` (its ``is_success`` or ``success``), ``terminated``, or ``truncated``:
+            it lasted until the time was up, as a pole that did not fall.
         success_reward: instead: a step's reward from which on the task is done.
+        success_return: instead: a return, the sum of an episode's rewards, from which on it is.
         render: ``cheap`` pictures (no shadows, no multisampling) where the simulator is MuJoCo, or
             the environment's own: ``reference``.
 
@@ -64,11 +67,13 @@ class GymnasiumEnvironment:
         module: str | None = None,
         make: Mapping[str, Any] | None = None,
         instruction: str | None = None,
+        instruction_from: str | None = None,
         max_steps: int = 1000,
         state: Sequence[str] | None = None,
         cameras: Mapping[str, str] | None = None,
         success: str = "info",
         success_reward: float | None = None,
+        success_return: float | None = None,
         render: str = "cheap",
     ) -> None:
         check_render(render)
@@ -79,8 +84,9 @@ class GymnasiumEnvironment:
             )
         if module is not None and not module.isidentifier():
             raise ConfigError(f"module {module!r} is no name of an installed package")
-        if success not in SUCCESS:
-            raise ConfigError(f"success {success!r} is none of {', '.join(SUCCESS)}")
+        self._judge = Judge(success, success_reward, success_return)
+        if instruction is not None and instruction_from is not None:
+            raise ConfigError("instruction and instruction_from both say what a policy is told")
         if max_steps < 1:
             raise ConfigError(f"max_steps must be at least 1, got {max_steps}")
         if not isinstance(embodiment, EmbodimentSpec):
@@ -98,29 +104,42 @@ class GymnasiumEnvironment:
             tasks=(TaskSpec(name, instruction or id, max_steps),),
             details={"render": render},
         )
+        self.distributions = ("gymnasium", "mujoco", *([] if module is None else [module]))
         self._module = module
         self._make = dict(make or {})
         self._keys = state
         self._cameras = {**{n: n for n in embodiment.camera_names}, **(cameras or {})}
         if "render" in self._cameras.values():
             self._make.setdefault("render_mode", "rgb_array")
-        self._success = success
-        self._success_reward = success_reward
+        self._instruction_from = instruction_from
+        self._max_steps = max_steps
+        self._steps, self._return = 0, 0.0
         self._render = render
         self._env: Any = None
         self._parts: dict[str, npt.NDArray[Any]] = {}
-        self._done = False
+        self._done = self._told = False
 
     @property
     def state(self) -> Array:
         """``(state_dim,)``: the observation's numbers in one row."""
         return state_row(self._parts, self._keys)
 
+    @property
+    def simulation(self) -> Any:
+        """``mujoco.MjData`` where there is one: Gymnasium's MuJoCo environments have it, and
+        dm_control's physics."""
+        inner = self._env.unwrapped
+        physics = getattr(getattr(inner, "_env", None), "physics", None)
+        found = (getattr(inner, "data", None), getattr(physics, "data", None))
+        data = [getattr(each, "ptr", each) for each in found]
+        return next((each for each in data if hasattr(each, "warning")), None)
+
     def reset(self, seed: int, task: str) -> None:
         """Begin an episode.
 
         Raises:
             MissingPlugin: no installed package has this id.
+            ConfigError: the environment does not say whether its task is done.
             SpecMismatch: the action or the state has not as many numbers as the embodiment.
             RunFailed: the environment cannot be made.
         """
@@ -129,6 +148,7 @@ class GymnasiumEnvironment:
         self._env.action_space.seed(seed)
         seen, _ = self._env.reset(seed=seed)
         self._parts, self._done = parts(seen), False
+        self._steps, self._return = 0, 0.0
         if len(self.state) != self.spec.embodiment.state_dim:
             raise SpecMismatch(
                 f"the state of {self.spec.name} has {len(self.state)} numbers, "
@@ -136,13 +156,13 @@ class GymnasiumEnvironment:
                 cause=f"the observation's parts are {_shapes(self._parts)}",
                 next="mend state_joints, or name the parts that are the state: state = ['...']",
             )
+        if self._judge.needs_info and not self._told:
+            _check_told(self._env, self._max_steps)
+            self._told = True
+            self.reset(seed, task)
 
     def step(self, action: Array) -> Step:
-        """One step; values beyond the action space's limits are the environment's affair.
-
-        Raises:
-            RunFailed: the environment does not say whether its task is done.
-        """
+        """One step; values beyond the action space's limits are the environment's affair."""
         from gymnasium.spaces import Discrete
 
         space = self._env.action_space
@@ -153,7 +173,10 @@ class GymnasiumEnvironment:
         seen, reward, terminated, truncated, info = self._env.step(given)
         self._parts = parts(seen)
         reward, terminated = float(reward), bool(terminated)
-        self._done |= is_done(self._success, self._success_reward, reward, terminated, info)
+        self._steps += 1
+        self._return += reward
+        lasted = bool(truncated) or self._steps >= self._max_steps
+        self._done |= self._judge.done(reward, self._return, terminated, lasted, info)
         return Step(reward, self._done, terminated or bool(truncated) or self._done)
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
@@ -165,7 +188,7 @@ class GymnasiumEnvironment:
         return {
             "qpos": self.state.astype(np.float32),
             "images": {camera.name: self._picture(camera.name) for camera in cameras},
-            "task_description": self.spec.tasks[0].instruction,
+            "task_description": self._instruction(),
         }
 
     def close(self) -> None:
@@ -174,10 +197,17 @@ class GymnasiumEnvironment:
             self._env.close()
             self._env = None
 
+    def _instruction(self) -> str:
+        if self._instruction_from is None:
+            return self.spec.tasks[0].instruction
+        return text(self._parts, self._instruction_from)
+
     def _picture(self, camera: str) -> npt.NDArray[np.uint8]:
         key = self._cameras.get(camera, camera)
         if key == "render":
-            return np.array(self._env.render(), dtype=np.uint8)
+            drawn = np.array(self._env.render(), dtype=np.uint8)
+            note_renderer()
+            return drawn
         found = pictures(self._parts)
         ends = [name for name in found if name == key or name.endswith(f".{key}")]
         if len(ends) != 1:
@@ -226,6 +256,30 @@ class GymnasiumEnvironment:
         for model in _mujoco_models(env):
             set_render(model, self._render)
         return env
+
+
+def _check_told(env: Any, max_steps: int) -> None:
+    """Refuse an environment whose ``info`` never says whether the task is done: by one step as a
+    rule, by a whole episode of random actions where it might say so only at the end.
+
+    Raises:
+        ConfigError: with what to set instead.
+    """
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    info: Mapping[str, Any] = {}
+    for _ in range(max_steps):
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        if told(info):
+            return
+        if terminated or truncated:
+            break
+    raise ConfigError(
+        f"{env.spec.id} does not say whether its task is done: its info has "
+        f"{', '.join(sorted(map(str, info))) or 'nothing'}, and neither of {', '.join(KEYS)}",
+        next="set success = 'terminated' or 'truncated', success_reward = <a step's reward when it "
+        "is done>, or success_return = <an episode's>",
+    )
 
 
 def _mujoco_models(env: Any) -> list[Any]:

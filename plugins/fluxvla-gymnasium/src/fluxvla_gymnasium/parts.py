@@ -1,4 +1,4 @@
-"""A Gymnasium observation taken apart: arrays by name, pictures among them."""
+"""A Gymnasium observation taken apart: arrays by name, pictures and texts among them."""
 
 from __future__ import annotations
 
@@ -14,17 +14,47 @@ Parts = Mapping[str, npt.NDArray[Any]]
 
 
 def parts(seen: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
-    """Arrays by name, sorted; the names of nested ones are joined by dots.
+    """Arrays by name, sorted; the names of nested ones are joined by dots. Texts are arrays, too.
 
     An observation that is one array has the name ``""``, or ``image`` if it is a picture.
+
+    Raises:
+        SpecMismatch: a part is no array of numbers, and no text.
     """
+    if isinstance(seen, (tuple, list)) and not all(np.isscalar(each) for each in seen):
+        seen = {str(number): each for number, each in enumerate(seen)}
     if isinstance(seen, Mapping):
         found: dict[str, npt.NDArray[Any]] = {}
         for key in sorted(seen):
             found |= parts(seen[key], f"{prefix}.{key}" if prefix else str(key))
         return found
     array = np.asarray(seen)
+    if array.dtype.kind not in "biufU":
+        raise SpecMismatch(
+            f"the observation's part {prefix or 'as a whole'!r} is a {type(seen).__name__}: "
+            "no array of numbers, and no text",
+            next="make the environment with a wrapper that gives arrays",
+        )
     return {prefix or ("image" if is_picture(array) else ""): array}
+
+
+def is_text(array: npt.NDArray[Any]) -> bool:
+    """Whether it is words."""
+    return array.dtype.kind == "U"
+
+
+def text(found: Parts, key: str) -> str:
+    """The text called ``key``.
+
+    Raises:
+        SpecMismatch: there is no such text.
+    """
+    if key not in found or not is_text(found[key]):
+        texts = ", ".join(name for name, array in found.items() if is_text(array))
+        raise SpecMismatch(
+            f"instruction_from: the observation has no text {key!r}; it has {texts or 'none'}"
+        )
+    return str(found[key])
 
 
 def is_picture(array: npt.NDArray[Any]) -> bool:
@@ -38,17 +68,23 @@ def pictures(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
 
 
 def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float64]:
-    """The parts ``keys``, or all that are no pictures, as one row.
+    """The parts ``keys``, or all that are no pictures and no texts, as one row.
 
     Raises:
-        SpecMismatch: there is no such part.
+        SpecMismatch: there is no such part, or it is a text.
     """
     if keys is None:
-        keys = [name for name, array in found.items() if not is_picture(array)]
+        keys = [n for n, array in found.items() if not is_picture(array) and not is_text(array)]
     missing = [key for key in keys if key not in found]
     if missing:
         raise SpecMismatch(
             f"state: the observation has no part {missing[0]!r}; it has {', '.join(found)}"
+        )
+    words = [key for key in keys if is_text(found[key])]
+    if words:
+        raise SpecMismatch(
+            f"state: the observation's part {words[0]!r} is a text",
+            next=f"leave it out; a policy is told it by instruction_from = {words[0]!r}",
         )
     rows = [np.asarray(found[key], dtype=np.float64).ravel() for key in keys]
     return np.concatenate(rows) if rows else np.zeros(0)

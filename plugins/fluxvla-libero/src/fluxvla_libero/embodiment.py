@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import MujocoEnvironment, check_render
 
-from fluxvla_core.contracts.environment import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.errors import ConfigError, SpecMismatch
-from fluxvla_core.evaluate.drawing import check_render
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.operators import Camera
 from fluxvla_libero.embodiment import CAMERAS, PICTURE, SCENE_CAMERAS, libero_spec
 from fluxvla_libero.suites import (
     NUM_STEPS_WAIT,
@@ -25,19 +25,26 @@ from fluxvla_libero.suites import (
 )
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
     from fluxvla_libero.scene import LiberoScene
 
 FIXED, RANDOM = "fixed", "random"
+FLUXVLA, OPENVLA = "fluxvla", "openvla"
 
 
-class LiberoEnvironment:
+class LiberoEnvironment(MujocoEnvironment):
     """A suite's tasks by the standard protocol.
 
     An episode with seed ``n`` begins in the task's ``n``-th fixed state, or, with
     ``begin="random"``, with everything placed at random by the seed; then the arm holds still for
     ``num_steps_wait`` steps. Success is LIBERO's own goal test, at any step, and ends the episode.
     Of scenes only the last one is kept, because one takes hundreds of MB.
+
+    The fixed states say nothing about what cannot move (cabinets, stoves, 1 to 2 cm): LIBERO's
+    random numbers place it, at each reset. They start from 0, and when is a matter of the protocol.
+    ``fluxvla``: before each episode, so that everything stands alike in all of a task's episodes.
+    ``openvla``: as in OpenVLA's evaluation, once for a task before its first episode; episode ``n``
+    then has the places of the ``n``-th reset, whichever episodes are run, and in whatever order.
 
     Args:
         suite: libero_spatial, _object, _goal, _10, _90, or one of LIBERO-PRO's.
@@ -46,9 +53,10 @@ class LiberoEnvironment:
             scene does not say what to do. Tasks are called ``<task>-in-scene-<index>``.
         cameras: of the scene, also by the names that public datasets give them.
         height, width: of their pictures, where nobody asks for another size.
-        render: how pictures are drawn, see ``fluxvla_core.evaluate.drawing``.
+        render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
         begin: ``fixed`` or ``random``.
         num_steps_wait: they do not count.
+        protocol: ``fluxvla`` or ``openvla``; results of one do not compare with the other's.
         instruction: what a policy is told instead of the task's own words.
 
     Raises:
@@ -70,6 +78,7 @@ class LiberoEnvironment:
         begin: str = FIXED,
         num_steps_wait: int = NUM_STEPS_WAIT,
         instruction: str | None = None,
+        protocol: str = FLUXVLA,
     ) -> None:
         check_suite(suite)
         check_render(render)
@@ -82,6 +91,10 @@ class LiberoEnvironment:
             raise ConfigError(f"pictures of {height}x{width} are too small")
         if begin not in (FIXED, RANDOM):
             raise ConfigError(f"begin {begin!r} is none of {FIXED}, {RANDOM}")
+        if protocol not in (FLUXVLA, OPENVLA):
+            raise ConfigError(f"protocol {protocol!r} is none of {FLUXVLA}, {OPENVLA}")
+        if protocol == OPENVLA and begin == RANDOM:
+            raise ConfigError("protocol 'openvla' has fixed states: it cannot begin at random")
         if num_steps_wait < 0:
             raise ConfigError(f"num_steps_wait must be at least 0, got {num_steps_wait}")
         self.suite = suite
@@ -92,6 +105,7 @@ class LiberoEnvironment:
         self._render = render
         self._begin = begin
         self._wait = num_steps_wait
+        self._protocol = protocol
         self._instruction = instruction
         self._scene: LiberoScene | None = None
         self._name = self._told = ""
@@ -119,6 +133,7 @@ class LiberoEnvironment:
                 "render": self._render,
                 "begin": self._begin,
                 "num_steps_wait": self._wait,
+                "protocol": self._protocol,
             },
         )
 
@@ -145,6 +160,11 @@ class LiberoEnvironment:
     def state(self) -> npt.NDArray[np.float64]:
         """``(8,)``, see ``libero_spec``."""
         return self.scene.state
+
+    @property
+    def simulation(self) -> Any:
+        """``mujoco.MjData``."""
+        return self.scene.data
 
     @property
     def task(self) -> SuiteTask:
@@ -175,7 +195,7 @@ class LiberoEnvironment:
         if state is None:
             scene.reset(seed=seed)
         else:
-            scene.reset(state)
+            scene.reset(state, resets=seed + 1 if self._protocol == OPENVLA else 1)
         scene.settle(self._wait)
         self._name = self._told = task
         here = {name: pair[1] for name, pair in self.pairs.items() if self._shares(name, where)}

@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from fluxvla_core.build import RunContext
+from fluxvla_mujoco import RENDERS
+
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluate.drawing import RENDERS
-from fluxvla_core.evaluate.runner import EvalRunner
+from fluxvla_core.evaluation import EvalRunner
+from fluxvla_core.operators import RunContext
 from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
+from fluxvla_libero.environment import FLUXVLA, OPENVLA
 from fluxvla_libero.suites import NUM_STEPS_WAIT, check_suite, choose_tasks
 
 TRIALS = 50
@@ -40,6 +42,9 @@ class LiberoEvalRunner(EvalRunner):
             trained by default.
         num_trials_per_task: episodes for each task, from the first initial state on; at most 50.
         num_steps_wait: steps that the arm holds still before; they do not count.
+        protocol: when LIBERO's random numbers start, which place what cannot move: ``fluxvla``
+            before each episode, ``openvla`` once for a task, as OpenVLA's evaluation does. Results
+            say which; see :class:`~fluxvla_libero.environment.LiberoEnvironment`.
         max_steps: instead of the suite's limit.
         mixed_precision_dtype, enable_mixed_precision_training: ``bf16`` inference, if enabled.
         policy: ``checkpoint``, or ``expert``, ``untrained``, ``random`` for comparison.
@@ -48,7 +53,8 @@ class LiberoEvalRunner(EvalRunner):
         baseline: repeat every episode with the same model before training.
         render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones (nor details),
             or LIBERO's own: ``reference``.
-        workers, batch_size, serve_policy, device, episode_timeout_s: see :class:`EvalRunner`.
+        workers, batch_size, serve_policy, device, episode_timeout_s, reuse: see
+            :class:`EvalRunner`.
         record_videos: how many episodes to show: failures first, then successes.
         video_fps: at most 20.
 
@@ -74,6 +80,7 @@ class LiberoEvalRunner(EvalRunner):
         resize_size: int | None = None,
         num_trials_per_task: int = TRIALS,
         num_steps_wait: int = NUM_STEPS_WAIT,
+        protocol: str = FLUXVLA,
         max_steps: int | None = None,
         mixed_precision_dtype: str = "bf16",
         enable_mixed_precision_training: bool = False,
@@ -88,6 +95,7 @@ class LiberoEvalRunner(EvalRunner):
         video_fps: float = 10.0,
         device: str = "cpu",
         episode_timeout_s: float = 1800.0,
+        reuse: bool = False,
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
         try:
@@ -96,6 +104,8 @@ class LiberoEvalRunner(EvalRunner):
             raise self.wrong("task_suite_name", f"is wrong: {error.what}") from error
         if render not in RENDERS:
             raise self.wrong("render", f"{render!r} is none of {', '.join(RENDERS)}")
+        if protocol not in (FLUXVLA, OPENVLA):
+            raise self.wrong("protocol", f"{protocol!r} is none of {FLUXVLA}, {OPENVLA}")
         if not 1 <= num_trials_per_task <= TRIALS:
             raise self.wrong(
                 "num_trials_per_task", f"must be 1 to {TRIALS}, got {num_trials_per_task}"
@@ -122,6 +132,7 @@ class LiberoEvalRunner(EvalRunner):
                 "cameras": tuple(CAMERAS),
                 "render": render,
                 "num_steps_wait": num_steps_wait,
+                "protocol": protocol,
             },
             policy=policy,
             ckpt_path=ckpt_path,
@@ -150,6 +161,7 @@ class LiberoEvalRunner(EvalRunner):
                 mixed_precision_dtype if enable_mixed_precision_training else "float32"
             ),
             episode_timeout_s=episode_timeout_s,
+            reuse=reuse,
         )
 
     def run_setup(self) -> None:

@@ -13,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import Policy
 from fluxvla_libero.embodiment import CLOSED, CONTROL_HZ, OPEN, libero_spec
 from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.suites import SuiteTask, goal
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
     from fluxvla_libero.scene import LiberoScene
 
 Array = npt.NDArray[np.float64]
@@ -110,7 +111,7 @@ class Expert:
         return self._waypoints[min(self._index, len(self._waypoints) - 1)]
 
 
-class LiberoExpert:
+class LiberoExpert(Policy):
     """The expert as a policy: one action at a time, for the instruction's task.
 
     Its success through an evaluation is an upper bound for any policy, and a check of it.

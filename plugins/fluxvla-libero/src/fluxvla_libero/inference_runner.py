@@ -9,22 +9,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from fluxvla_core.build import RunContext
+from fluxvla_mujoco import check_render
+
 from fluxvla_core.errors import ConfigError, RunFailed, UsageError
-from fluxvla_core.evaluate.drawing import check_render
-from fluxvla_core.evaluate.policies import (
+from fluxvla_core.evaluation import (
     FROM_CHECKPOINT,
+    RolloutSettings,
     Source,
+    chosen_checkpoint,
+    find_task,
     fit,
     make_policy,
     resolve_name,
+    run_episode,
 )
-from fluxvla_core.evaluate.rollout import Course, find_task, run_episode
-from fluxvla_core.evaluate.subject import chosen_checkpoint
-from fluxvla_core.infer.sources import task_source, tasks
-from fluxvla_core.infer.tasks import Task, check_descriptions
-from fluxvla_core.record.trace import EpisodeTrace, next_folder
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import (
+    Camera,
+    EpisodeTrace,
+    RunContext,
+    Task,
+    check_descriptions,
+    next_folder,
+    task_source,
+    tasks,
+)
 from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
 from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import TRIALS
@@ -42,8 +50,8 @@ FOLDER = "inference"
 class LiberoInferenceRunner:
     """Runs a policy in one scene: ``run_setup()``, then ``run()``.
 
-    ``--task`` names an id of ``task_descriptions`` or an instruction in words; without
-    ``task_descriptions`` the ids are the indices of the suite's tasks. Time is simulated. An
+    ``--task`` names an id or an instruction of ``task_descriptions``; without it the suite's tasks
+    are known, by their indices. Time is simulated. An
     episode goes as the trial of that number in ``LiberoEvalRunner``.
 
     Writes ``<work_dir>/inference/<NNN>-<task>/``: ``episode.json``, ``trace.jsonl``, a video for
@@ -66,6 +74,7 @@ class LiberoInferenceRunner:
         video_size: side of the videos' pictures.
         record_fps: of the videos; must divide 20.
         device: of torch.
+        free_tasks: allow other instructions, as ``--free-task`` does.
 
     Raises:
         ConfigError, UsageError: a value is impossible.
@@ -98,8 +107,10 @@ class LiberoInferenceRunner:
         video_size: int = 256,
         record_fps: float = 20.0,
         device: str = "cpu",
+        free_tasks: bool = False,
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
+        self.free_tasks = free_tasks or self.context.free_task
         check_suite(task_suite_name)
         check_render(render)
         if not 0 <= init_state < TRIALS:
@@ -117,7 +128,7 @@ class LiberoInferenceRunner:
         self.record_fps = record_fps
         self._wait = num_steps_wait
         self._videos = tuple(Camera(name, video_size, video_size) for name in SCENE_CAMERAS)
-        self._course = Course((), eval_chunk_size, max_steps, seed)
+        self._course = RolloutSettings((), eval_chunk_size, max_steps, seed)
         self._named = policy
         self._source = Source(
             what="checkpoint",
@@ -160,10 +171,10 @@ class LiberoInferenceRunner:
         known = self.task_descriptions or {
             str(task.index): task.language for task in choose_tasks(self.suite, None)
         }
-        source = task_source(self.context, known)
+        source = task_source(self.context, known, free=self.free_tasks)
         with self._live() as show, closing(source):
             source.open()
-            asked = tasks(source, known, idle=lambda: time.sleep(0.05))
+            asked = tasks(source, known, lambda: time.sleep(0.05), free=self.free_tasks)
             return [self._episode(task, show) for task in asked]
 
     def _episode(self, asked: Task, show: Any) -> dict[str, Any]:
@@ -180,8 +191,8 @@ class LiberoInferenceRunner:
         def watch(world: Any, steps: int) -> None:
             if steps:
                 t = steps / CONTROL_HZ
-                event = {"event": "command", "t": t, "command": world.action, "clamps": []}
-                trace.write({**event, "state": world.state})
+                event = {"event": "command", "t": t, "phase": "run", "command": world.action}
+                trace.write({**event, "clamps": [], "state": world.state})
             if steps % stride == 0:
                 images = world.observe(self._videos)["images"]
                 trace.frames(images)
@@ -198,6 +209,7 @@ class LiberoInferenceRunner:
             "embodiment": body.name,
             "joints": list(body.joint_names),
             "rate_hz": CONTROL_HZ,
+            "lockstep": True,
             "render": self.render,
             "outcome": "failed",
             "success": None,

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
 
+from fluxvla_mujoco import use_egl
+
 from fluxvla_core.errors import MissingPlugin, RunFailed
-from fluxvla_core.evaluate.drawing import use_egl
 
 INSTALL = "pip install 'fluxvla-libero[libero]'"
 

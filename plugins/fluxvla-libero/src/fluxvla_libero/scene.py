@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import Drawing, check_render
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluate.drawing import Drawing, check_render
 from fluxvla_libero.embodiment import ACTION_DIM, CONTROL_HZ, NO_OP, axis_angle
 from fluxvla_libero.require import quiet, require_libero
 from fluxvla_libero.suites import SuiteTask, goal
@@ -23,9 +24,9 @@ from fluxvla_libero.suites import SuiteTask, goal
 Array = npt.NDArray[np.float64]
 
 ENV_SEED = 0
-"""What the simulator's random numbers start from before each reset. It places what cannot move
-(cabinets, stoves), also where the fixed states place everything else. OpenVLA's evaluation takes 0
-as well, but draws on from one episode to the next."""
+"""What the simulator's random numbers start from. They place what cannot move (cabinets, stoves),
+also where the fixed states place everything else. When they start is a matter of the protocol, see
+:class:`~fluxvla_libero.environment.LiberoEnvironment`."""
 
 _MAX_TRIES = 20
 
@@ -38,7 +39,7 @@ class LiberoScene:
 
     Args:
         task: the task.
-        render: how pictures are drawn, see ``fluxvla_core.evaluate.drawing``.
+        render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
 
     Raises:
         MissingPlugin, RunFailed: see ``require_libero``.
@@ -55,6 +56,7 @@ class LiberoScene:
         self._observed: Any = None
         model = self._sim.model._model
         self._shown = _follow(self._env)
+        self._samplers = list(self._env.object_property_initializers)
         self._fixed = {name: getattr(model, name).copy() for name in _CHANGED_BY_EPISODES}
 
     @property
@@ -84,34 +86,41 @@ class LiberoScene:
         """The gripper's orientation in the world, x, y, z, w."""
         return np.array(self._observed["robot0_eef_quat"])
 
-    def reset(self, init_state: Array | None = None, seed: int = ENV_SEED) -> None:
+    @functools.cached_property
+    def _built(self) -> dict[str, Array]:
+        """Where everything stands by the model's file, before anything was placed: there each of
+        LIBERO's own resets begins, because it builds the model anew."""
+        with quiet():
+            from robosuite.utils.binding_utils import MjSim
+
+            model = MjSim.from_xml_string(self._env.model.get_xml()).model._model
+        places = {name: getattr(model, name).copy() for name in ("body_pos", "body_quat")}
+        return {**self._fixed, **places}  # colours as they are once its marks are hidden
+
+    def reset(self, init_state: Array | None = None, seed: int = ENV_SEED, resets: int = 1) -> None:
         """Begin an episode; nothing of the ones before is left.
 
         Args:
             init_state: ``(1 + nq + nv,)``, one of the suite's fixed states; without one everything
                 is placed at random within the task's regions.
             seed: of what is placed at random.
+            resets: how often LIBERO's environment would have been reset since it was seeded, this
+                time included: each reset draws on, and places what cannot move elsewhere.
 
         Raises:
             RunFailed: the simulator finds no room for the objects, or the state does not fit.
         """
-        env, model = self._env, self.model
-        for name, values in self._fixed.items():
-            getattr(model, name)[:] = values
+        env = self._env
         np.random.seed(seed)
-        for _ in range(_MAX_TRIES):
-            if self._place():
-                break
+        if init_state is None:
+            self._place_anew(self._fixed, seed)
         else:
-            raise RunFailed(
-                f"{self.task.name}: no room for all objects in {_MAX_TRIES} tries", where=str(seed)
-            )
+            loads = 1
+            for _ in range(resets):
+                loads += self._place_anew(self._built, seed, loads)
         self._sim.forward()
         env._obs_cache = {}
         if init_state is not None:
-            # Fixtures stand where the model was built with them, as after LIBERO's own reset.
-            for name, values in self._fixed.items():
-                getattr(model, name)[:] = values
             self._set_state(init_state)
         self._observed = env._get_observations(force_update=True)
         self.steps = 0
@@ -166,6 +175,27 @@ class LiberoScene:
             with quiet():
                 self._env.close()
             self._env = None
+
+    def _place_anew(self, model: Mapping[str, Array], seed: int, loads: int = 0) -> int:
+        """Place everything, from what the model says; how many tries that took.
+
+        Args:
+            loads: how often LIBERO would have loaded the model before. Each time it adds another
+                set of samplers for what is open or turned on, and all of them draw.
+        """
+        for tries in range(1, _MAX_TRIES + 1):
+            self._put(model)
+            copies = loads + tries if loads else 1
+            self._env.object_property_initializers = self._samplers * copies
+            if self._place():
+                return tries
+        raise RunFailed(
+            f"{self.task.name}: no room for all objects in {_MAX_TRIES} tries", where=str(seed)
+        )
+
+    def _put(self, values: Mapping[str, Array]) -> None:
+        for name, value in values.items():
+            getattr(self.model, name)[:] = value
 
     def _place(self) -> bool:
         """robosuite's soft reset, without what it forgets; False if there was no room."""

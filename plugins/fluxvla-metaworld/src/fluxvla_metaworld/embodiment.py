@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 
 CONTROL_HZ = 80.0
 """Five simulation steps of 2.5 ms."""

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import Drawing, MujocoEnvironment, check_render, use_egl
 
-from fluxvla_core.contracts.environment import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed
-from fluxvla_core.evaluate.drawing import Drawing, check_render, use_egl
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.operators import Camera
 from fluxvla_metaworld.embodiment import CAMERAS, PICTURE, TURNED, metaworld_spec
 from fluxvla_metaworld.tasks import INSTRUCTIONS, choose_tasks
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ LIMIT = 500
 """Steps of an episode in Meta-World; it refuses any beyond."""
 
 
-class MetaWorldEnvironment:
+class MetaWorldEnvironment(MujocoEnvironment):
     """Meta-World's 50 tasks, each with its objects and goals placed by the episode's seed.
 
     A policy sees pictures and the state (4,): the hand and its fingers. What Meta-World's own
@@ -98,6 +98,11 @@ class MetaWorldEnvironment:
     def privileged(self) -> Array:
         """``(39,)``, Meta-World's own observation: hand and objects now and one step ago, goal."""
         return self._seen.copy()
+
+    @property
+    def simulation(self) -> Any:
+        """``mujoco.MjData``."""
+        return self._env.data
 
     @property
     def task(self) -> str:

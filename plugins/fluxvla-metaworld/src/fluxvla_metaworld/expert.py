@@ -13,14 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import Policy
 from fluxvla_metaworld.embodiment import CONTROL_HZ, metaworld_spec
 from fluxvla_metaworld.environment import MetaWorldEnvironment
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
 
 
-class MetaWorldExpert:
+class MetaWorldExpert(Policy):
     """The expert of whatever task its environment is in; it sees where things truly are."""
 
     api: ClassVar[str] = "1.0"

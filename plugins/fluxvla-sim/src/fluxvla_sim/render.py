@@ -2,7 +2,7 @@
 
 A robot's scene is drawn by whoever looks: the thread that observes, the one that records, the
 cameras' thread of a ROS 2 node. What qualities there are and what they cost is in
-``fluxvla_core.evaluate.drawing``.
+``fluxvla_mujoco.drawing``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from fluxvla_mujoco import APT, note_renderer, use_egl
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluate.drawing import APT, use_egl
 
 
 def import_mujoco() -> Any:
@@ -149,6 +149,7 @@ class Renderer:
                 cause="no EGL driver is installed, or none works without a display",
                 next=APT,
             ) from error
+        note_renderer()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         # The other way round rounds what is far to one distance.
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR

@@ -6,19 +6,20 @@ import threading
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from fluxvla_mujoco import divergence
 
-from fluxvla_core.contracts.frame import STATE, Frame
-from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
-from fluxvla_core.errors import NotReady, Rejected
+from fluxvla_core.errors import Faulted, NotReady, Rejected
+from fluxvla_core.operators import Frame, MonotonicClock, Operator, SimulatedClock
+from fluxvla_core.ros2 import STATE
 from fluxvla_sim.world import SimRobot, task_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from fluxvla_core.spec.embodiment import Camera
+    from fluxvla_core.operators import Camera
 
 
-class SimOperator:
+class SimOperator(Operator):
     """One simulated robot behind the operator contract.
 
     In simulated time (the default) a control period passes with each ``send_action``, and the
@@ -64,6 +65,7 @@ class SimOperator:
         self._target: npt.NDArray[np.float64] = np.zeros(self.embodiment.dim)
         self._moving = False  # commanded since the last stop
         self._facts = self.world.begin()
+        self._judged = True
 
     @property
     def scene(self) -> Any:
@@ -100,7 +102,8 @@ class SimOperator:
         any, is the one that is judged.
         """
         with self._lock:
-            self.task = task_of(self.world, instruction) or self.task
+            found = task_of(self.world, instruction)
+            self.task, self._judged = found or self.task, found is not None
             self.reset(self.seed + episode)
 
     def get_state(self) -> npt.NDArray[np.float64]:
@@ -130,21 +133,25 @@ class SimOperator:
             stamps = dict.fromkeys((STATE, *images), now)
             return Frame(state=np.array(scene.state), images=images, stamps=stamps)
 
-    def task_success(self) -> bool:
-        """Whether ``task`` is done, judged now, over everything since :meth:`reset`."""
+    def task_success(self) -> bool | None:
+        """Whether ``task`` is done, judged now, over everything since :meth:`reset`.
+
+        None in an episode whose instruction is none of the world's: nobody can judge that.
+        """
         with self._lock:
-            return self.task.success(self._facts)
+            return self.task.success(self._facts) if self._judged else None
 
     def task_done(self) -> bool:
         """Whether the episode can end: nothing that comes could change :meth:`task_success`."""
         with self._lock:
-            return self.task.done(self._facts)
+            return self._judged and self.task.done(self._facts)
 
     def send_action(self, action: npt.NDArray[np.float64]) -> None:
         """Command joint targets; in simulated time one control period passes.
 
         Raises:
             NotReady: not connected.
+            Faulted: the simulation diverged.
             Rejected: wrong shape, non-finite, or outside the embodiment's position limits.
         """
         target = self._checked(action)
@@ -179,6 +186,9 @@ class SimOperator:
     def _step(self) -> None:
         self._scene.step(self._target)
         self._periods += 1
+        why = divergence(self._scene.data)
+        if why is not None:
+            raise Faulted(f"the simulation diverged: {why}", next="begin another episode")
         if isinstance(self.clock, SimulatedClock):
             self.clock.advance(self._period)
         self._facts = self._facts.after(self._scene)

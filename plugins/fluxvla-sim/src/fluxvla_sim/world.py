@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+    from fluxvla_core.operators import Camera, EmbodimentSpec
 
     Array = npt.NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from math import radians
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 
 JOINTS = (
     "shoulder_pan_joint",

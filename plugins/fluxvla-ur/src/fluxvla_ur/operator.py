@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,20 +10,21 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError, Faulted, Rejected
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import (
+from fluxvla_core.operators import Camera
+from fluxvla_core.ros2 import (
     FLOAT64,
     FLOAT64_ARRAY,
     JOINT_STATE,
     SIDE,
+    BadMessage,
     CommandSpec,
+    RosOperator,
+    Stale,
     StreamSpec,
     camera_stream,
+    joints,
+    message_class,
 )
-from fluxvla_core.ros2.trouble import BadMessage, Stale
-from fluxvla_core.spec.embodiment import Camera
 from fluxvla_ur.embodiment import CAMERAS, JOINTS, RATE_HZ, ur_spec
 from fluxvla_ur.readiness import check_not_paused
 from fluxvla_ur.servo import STEP, STREAMED, check_rate, is_taken, servo_rate
@@ -33,8 +33,6 @@ Array = npt.NDArray[np.float64]
 TRAJECTORY = "trajectory_msgs.msg:JointTrajectory"
 BOOL = "std_msgs.msg:Bool"
 _ARM = len(JOINTS)
-# How long, and how often, the command that holds an arm is said again if the robot ignores it.
-_HOLD_S, _AGAIN_S = 0.5, 0.01
 
 CONTROLLERS: Mapping[str, tuple[str, str]] = {
     STREAMED: ("/forward_position_controller/commands", FLOAT64_ARRAY),
@@ -257,17 +255,6 @@ class UROperator(RosOperator):
         gripper = message_class(self._gripper_message)()
         gripper.data = float(closed + action[_ARM] * (opened - closed))
         self.publish(self._gripper_command, gripper)
-
-    def publish_hold(self, target: Array, last: Array) -> None:
-        self.publish_action(target)
-        taken = not self._streamed or is_taken(target[:_ARM], last[:_ARM])
-        until = time.monotonic() + _HOLD_S
-        # A blocked joint is held where it is, which may be further from its last position than the
-        # robot takes; then it takes it as soon as the other joints have come to theirs.
-        while not taken and time.monotonic() < until:
-            time.sleep(_AGAIN_S)
-            taken = is_taken(target[:_ARM], self.get_state()[:_ARM])
-            self.publish_action(target)
 
     def _fill_trajectory(self, command: Any, positions: Array) -> None:
         point = message_class("trajectory_msgs.msg:JointTrajectoryPoint")()

@@ -17,21 +17,20 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
-from fluxvla_core.ros2.actions import checked_action
-from fluxvla_core.ros2.trouble import Stale
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import Camera, Frame, Operator
+from fluxvla_core.ros2 import STATE, Stale, checked_action
 from fluxvla_ur.embodiment import ACCELERATION, JOINTS, RATE_HZ, ur_spec
 from fluxvla_ur.readiness import check_not_paused, check_safety
 from fluxvla_ur.robotiq import PORT as GRIPPER_PORT
 from fluxvla_ur.robotiq import RobotiqGripper
-from fluxvla_ur.rtde_client import disconnect, import_rtde
+from fluxvla_ur.rtde_client import disconnect, import_rtde, within
 from fluxvla_ur.video import VideoCamera
 
 Array = npt.NDArray[np.float64]
@@ -51,7 +50,9 @@ _VARIABLES = [
 ]
 # As often as is looked; the controller could send at 500 Hz, which costs this machine a core.
 _DATA_HZ = 125.0
-_DISCONNECT_S = 4.0
+# The client waits for the controller's answer for ever: how long that may take while the controller
+# speaks, and once it fell silent.
+_STOP_S, _DISCONNECT_S, _SILENT_S = 2.0, 4.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class _Reading:
     scaling: float
 
 
-class URRTDEOperator:
+class URRTDEOperator(Operator):
     """A UR arm on the network, without ROS.
 
     The controller is told to stop by itself when this program falls silent (``watchdog_hz``).
@@ -274,7 +275,7 @@ class URRTDEOperator:
                 return
             steps: list[Callable[[], object]] = []
             if self._moving and self._listens():
-                steps.append(lambda: self._control.servoStop(ACCELERATION))
+                steps.append(self._stop_servo)
             self._moving = False
             if self._gripper is not None and self._last is not None:
                 steps.append(self._gripper.stop)
@@ -357,12 +358,14 @@ class URRTDEOperator:
                 log.error("%s: reading failed: %s", self.embodiment.name, error)
 
     def _kick(self, now: float) -> None:
-        due = self._spoke and now - self._spoke > 0.4 / self._watchdog_hz
+        # An arm that nobody sees is for the controller's watchdog to stop.
+        due = self._spoke and now - self._spoke > 0.4 / self._watchdog_hz and not self._silent()
         if self._lock.acquire(blocking=False):
             try:
                 # Looked at even if not due: a connection may be lost and back between commands.
                 if self._control is not None and self._listens() and due:
-                    self._control.kickWatchdog()
+                    # With the lock held: stop() must not wait for a controller that fell silent.
+                    self._broken = not within(self._max_age, self._control.kickWatchdog)
                     self._spoke = now
             finally:
                 self._lock.release()
@@ -382,6 +385,19 @@ class URRTDEOperator:
         position = self._gripper.position()
         self._check_age("gripper", position[0])
         return position
+
+    def _silent(self) -> bool:
+        reading = self._newest
+        return reading is None or time.monotonic() - reading.receipt > self._max_age
+
+    def _stop_servo(self) -> None:
+        stop = partial(self._control.servoStop, ACCELERATION)
+        if not within(_SILENT_S if self._silent() else _STOP_S, stop):
+            # The call still waits, in its thread, and the client bears one at a time.
+            self._broken = True
+            log.error(
+                "%s: the controller does not answer; its watchdog stops the arm", self.robot_ip
+            )
 
     def _check_age(self, name: str, receipt: float | None) -> None:
         age = math.inf if receipt is None else time.monotonic() - receipt
@@ -420,9 +436,6 @@ class URRTDEOperator:
         self._cameras, self._spoke = [], 0.0
         if control is None and receive is None:
             return
-        # The client's own calls may hang for ever while it looks for its controller.
-        ending = threading.Thread(target=disconnect, args=(control, receive), daemon=True)
-        ending.start()
-        ending.join(_DISCONNECT_S)
-        if ending.is_alive():
+        seconds = _SILENT_S if self._broken or self._silent() else _DISCONNECT_S
+        if not within(seconds, partial(disconnect, control, receive)):
             log.error("%s: the connection does not end; it will with the program", self.robot_ip)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,21 @@ def import_rtde() -> tuple[Any, Any]:
             next="pip install 'fluxvla-ur[rtde]'",
         ) from error
     return rtde_control, rtde_receive
+
+
+def within(seconds: float, call: Callable[[], object]) -> bool:
+    """Whether ``call`` returns in that time; else it goes on in its thread. Failures are logged."""
+
+    def guarded() -> None:
+        try:
+            call()
+        except Exception as error:  # noqa: BLE001 - the caller ends a motion for another reason
+            log.error("the robot's client failed: %s", error)
+
+    thread = threading.Thread(target=guarded, name="fluxvla-rtde-call", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()
 
 
 def disconnect(control: Any, receive: Any) -> None:

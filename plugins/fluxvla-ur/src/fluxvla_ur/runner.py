@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from fluxvla_core.infer.base_runner import BaseInferenceRunner
+from fluxvla_core.operators import BaseInferenceRunner
 
 
 class URInferenceRunner(BaseInferenceRunner):

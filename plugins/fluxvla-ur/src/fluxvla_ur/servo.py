@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.operators import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 STREAMED = "forward_position_controller"

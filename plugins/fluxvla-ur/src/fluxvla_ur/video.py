@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import LoadFailed, NotReady
-from fluxvla_core.ros2.trouble import BadMessage
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.operators import Camera
+from fluxvla_core.ros2 import BadMessage
 
 Image = npt.NDArray[np.uint8]
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from math import pi
 from typing import ClassVar
 
-from fluxvla_core.control.workspace import WorkspaceBox
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.operators import WorkspaceBox
 from fluxvla_ur.embodiment import JOINTS
 
 # (d1, a2, a3, d4, d5, d6) in metres; the other lengths are 0, the twists the same for all.

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from fluxvla_mujoco import set_render
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluate.drawing import set_render
 from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.world import SUBSTEPS
 
@@ -70,7 +70,7 @@ class TwoArms:
     A subclass says in ``file`` which, places the objects in :meth:`reset`, and gives the reward.
 
     Args:
-        render: quality of the pictures, see ``fluxvla_core.evaluate.drawing``.
+        render: quality of the pictures, see ``fluxvla_mujoco.drawing``.
 
     Attributes:
         steps: commands since the last reset.

@@ -16,7 +16,7 @@ from fluxvla_sim.aloha.tasks import MAX_STEPS, Facts, LiftHold, TransferCube
 from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
 
 if TYPE_CHECKING:
-    from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+    from fluxvla_core.operators import Camera, EmbodimentSpec
 
 CAMERAS = (
     "top",

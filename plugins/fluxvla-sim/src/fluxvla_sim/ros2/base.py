@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import ODOMETRY
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2 import ODOMETRY, BadMessage, message_class
 
 TIMEOUT_S = 0.5
 """A speed that is not asked for again within this time ends, as real bases have it."""

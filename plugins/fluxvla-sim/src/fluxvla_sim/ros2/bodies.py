@@ -14,10 +14,15 @@ from fluxvla_ur.operator import BOOL, CONTROLLERS, TRAJECTORY
 from fluxvla_ur.servo import STEP, STREAMED, is_taken
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import FLOAT64, JOINT_STATE, ODOMETRY, TWIST
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2 import (
+    FLOAT64,
+    JOINT_STATE,
+    ODOMETRY,
+    TWIST,
+    BadMessage,
+    joints,
+    message_class,
+)
 from fluxvla_sim.ros2.base import Base
 
 Array = npt.NDArray[np.float64]

@@ -7,10 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.ros2 import images
-from fluxvla_core.ros2.faults import Faults, Outbox
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE, depth_stream
+from fluxvla_core.ros2 import IMAGE, Faults, Outbox, depth_stream, images, message_class
 from fluxvla_sim.render import Renderer, import_mujoco
 
 if TYPE_CHECKING:

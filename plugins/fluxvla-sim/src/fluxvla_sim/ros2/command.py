@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from fluxvla_mujoco import RENDERS
+
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluate.drawing import RENDERS
 
 
 class SimCommand:
@@ -104,8 +105,8 @@ class SimCommand:
         )
 
     def run(self, args: Any) -> int:
-        from fluxvla_core.cli.reporters import make_reporter
-        from fluxvla_core.ros2.require import require_rclpy
+        from fluxvla_core.commands import make_reporter
+        from fluxvla_core.ros2 import require_rclpy
         from fluxvla_sim.ros2.streams import stream_latency, timed_fault
 
         if not args.ros2:
@@ -156,7 +157,7 @@ class SimCommand:
 
 
 def _modes() -> str:
-    from fluxvla_core.ros2.faults import AMOUNTS, MODES
+    from fluxvla_core.ros2 import AMOUNTS, MODES
 
     names = {mode: f"{mode}:AMOUNT" if mode in AMOUNTS else mode for mode in MODES}
     return "; ".join(f"{names[mode]}: {what}" for mode, what in MODES.items())

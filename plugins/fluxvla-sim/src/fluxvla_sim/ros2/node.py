@@ -24,14 +24,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_mujoco import divergence
+
+from fluxvla_core.commands import Reporter
 from fluxvla_core.errors import ConfigError, FluxError
-from fluxvla_core.ros2 import qos
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.faults import Fault, Faults, Outbox
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.evaluation import Diverged
+from fluxvla_core.ros2 import (
+    IMAGE,
+    BadMessage,
+    Connection,
+    Fault,
+    Faults,
+    Outbox,
+    message_class,
+    qos,
+)
 from fluxvla_sim.ros2.bodies import Body
 from fluxvla_sim.ros2.cameras import Cameras
 from fluxvla_sim.ros2.judge import Judge
@@ -165,7 +172,7 @@ class RobotNode:
 
         Raises:
             Faulted: the ROS thread ended.
-            RunFailed: nothing can be drawn.
+            RunFailed: nothing can be drawn, or the simulation diverged.
         """
         cameras = Cameras(
             self._scene.model,
@@ -224,6 +231,9 @@ class RobotNode:
         with self._lock:
             simulated = self._simulated(now)
             self._scene.advance(self._body.target(simulated), SUBSTEPS // parts)
+            why = divergence(self._scene.data)
+            if why is not None:  # a robot that jumps home by itself is none
+                raise Diverged(f"the simulation diverged: {why}")
             if whole and self._commanded:
                 self._judge.after(self._scene)
             due = self._settings.states_by(self._parts) > self._settings.states_by(self._parts - 1)
@@ -359,7 +369,7 @@ def simulate(
     """A robot in a world until Ctrl-C or SIGTERM, or for ``seconds``; says what it does.
 
     Args:
-        render: quality of the pictures, see ``fluxvla_core.evaluate.drawing``.
+        render: quality of the pictures, see ``fluxvla_mujoco.drawing``.
 
     Raises:
         As ``RobotNode`` and its ``run``.

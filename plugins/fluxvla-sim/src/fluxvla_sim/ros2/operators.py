@@ -19,13 +19,19 @@ import numpy.typing as npt
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_ur.operator import UROperator
 
-from fluxvla_core.control.clock import MonotonicClock
 from fluxvla_core.errors import ConfigError, NotReady
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.frames import RobotFrame
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import CAMERA, SIDE, STATE, CommandSpec, StreamSpec
+from fluxvla_core.operators import MonotonicClock
+from fluxvla_core.ros2 import (
+    CAMERA,
+    SIDE,
+    STATE,
+    CommandSpec,
+    Connection,
+    RobotFrame,
+    RosOperator,
+    StreamSpec,
+    message_class,
+)
 from fluxvla_sim.operators import check_arms
 from fluxvla_sim.ros2.clock import SlowedClock
 

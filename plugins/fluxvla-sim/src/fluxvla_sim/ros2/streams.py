@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.ros2.faults import Fault
-from fluxvla_core.ros2.streams import FLOAT64, ODOMETRY, depth_stream
+from fluxvla_core.ros2 import FLOAT64, ODOMETRY, Fault, depth_stream
 from fluxvla_sim.ros2.bodies import Body
 
 

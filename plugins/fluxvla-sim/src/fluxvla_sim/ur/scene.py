@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from fluxvla_mujoco import set_render
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluate.drawing import set_render
 from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.world import SUBSTEPS
 

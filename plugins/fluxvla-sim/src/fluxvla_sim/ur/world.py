@@ -13,7 +13,7 @@ from fluxvla_sim.ur.tasks import MAX_STEPS, LiftCube, LiftFacts
 from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
 
 if TYPE_CHECKING:
-    from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+    from fluxvla_core.operators import Camera, EmbodimentSpec
 
 CUBE = World(
     tasks=(LiftCube(),),

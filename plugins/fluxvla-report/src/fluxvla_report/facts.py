@@ -1,0 +1,211 @@
+"""What a report is made of, whatever files it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+WRONG_INSTRUCTION = "swapped"
+"""The group of an evaluation that is told another task than its scene is for."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """The rows of ``metrics.jsonl``: one for each optimizer step.
+
+    Args:
+        steps: global step of each row.
+        columns: name -> one value for each row, NaN where a row lacks it (``loss``, ``lr``,
+            ``grad_norm``, ``samples_per_s``, ``step_time`` s, ``data_wait`` share in 0..1).
+    """
+
+    steps: Sequence[float]
+    columns: Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Video:
+    """An mp4 of one episode and what to say of it; ``success`` None: nobody judged it.
+
+    ``group`` and ``task`` are those of an evaluation's results.
+    """
+
+    path: Path
+    caption: str
+    success: bool | None = None
+    group: str = ""
+    task: str = ""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How many episodes succeeded; ``low``, ``high``: bounds of the 95 % interval, in 0..1.
+
+    ``errors`` episodes gave no result and are not among ``episodes`` (> 0).
+    """
+
+    task: str
+    successes: int
+    episodes: int
+    low: float
+    high: float
+    errors: int = 0
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.episodes
+
+
+@dataclass(frozen=True)
+class Group:
+    """Who acted and what it was told: ``name`` as results have it, ``label`` for people."""
+
+    name: str
+    label: str
+    total: Score
+    tasks: Sequence[Score]
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What a group did after one instruction: how many of its episodes did which task."""
+
+    group: str
+    instruction: str
+    episodes: int
+    counts: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation: its groups, and videos in the order in which to show them.
+
+    ``problems`` say in how many episodes what went wrong, the most frequent first. ``details`` are
+    plain values that the results state beside the rates; ``obeyed`` is how often a group did the
+    task that it was told, whatever its scene is for; ``live`` says that the world ran on the wall
+    clock and did not wait for the policy, ``unseen`` that the seeds of the training are known and
+    none of them was evaluated; ``made`` is a line on when it ran, of which commit, with which
+    versions.
+    """
+
+    name: str
+    groups: Sequence[Group]
+    problems: Sequence[str] = ()
+    behaviours: Sequence[Behaviour] = ()
+    videos: Sequence[Video] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    made: str = ""
+    live: bool = False
+    unseen: bool = False
+    obeyed: Mapping[str, Score] = field(default_factory=dict)
+
+    def listens(self, group: Group) -> bool:
+        """Whether what counts of the group is that it does what it is told: the scene's own task is
+        not what it is asked for."""
+        return group.name == WRONG_INSTRUCTION and group.name in self.obeyed
+
+
+@dataclass(frozen=True)
+class JointTrace:
+    """One joint over an episode: what was commanded, what was measured, where a limit acted.
+
+    ``times`` s from the first command; ``wanted`` is the target before the limits, ``clamped``
+    holds the times and the commands given, ``limits`` the lowest and the highest position.
+    """
+
+    name: str
+    unit: str
+    times: Sequence[float]
+    commands: Sequence[float]
+    states: Sequence[float]
+    clamped: Sequence[tuple[float, float]] = ()
+    wanted: Sequence[float] = ()
+    limits: tuple[float, float] | None = None
+    gripper: bool = False
+
+
+@dataclass(frozen=True)
+class Span:
+    """A named stretch of an episode, s from its first command."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Something that happened, s from the first command, and what to say of it."""
+
+    at: float
+    name: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One inference episode: how it went, its joints, how long each stage of its loop took.
+
+    Args:
+        name: its folder's.
+        task: the instruction.
+        outcome: how it ended; ``success`` is None when nobody judged it.
+        joints: in the robot's order; empty when no command was sent.
+        timings: stage -> ``count``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``max_ms``.
+        problem: why it ended before its time; empty if it did not.
+        phases: what the commands were for: ``ramp``, ``run``, ``hold``, ``stop``.
+        chunks: when the policy's answers arrived, s from the first command.
+        stops: the safe stops and trips.
+        simulated: whether time stood still while the policy thought: its latencies say nothing.
+        notes: rows for its table.
+    """
+
+    name: str
+    task: str
+    outcome: str
+    success: bool | None
+    joints: Sequence[JointTrace]
+    timings: Mapping[str, Mapping[str, Any]]
+    videos: Sequence[Video] = ()
+    problem: str = ""
+    phases: Sequence[Span] = ()
+    chunks: Sequence[float] = ()
+    stops: Sequence[Moment] = ()
+    simulated: bool = False
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        """From the first command to the last."""
+        return max((joint.times[-1] for joint in self.joints if joint.times), default=0.0)
+
+    @property
+    def clamped(self) -> int:
+        """How many commands a limit changed."""
+        return len({time for joint in self.joints for time, _ in joint.clamped})
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A named part of the whole job and how long it took (s)."""
+
+    name: str
+    seconds: float
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Everything that was found of a run; what was not is empty, and ``problems`` says why."""
+
+    work_dir: Path
+    training: Training | None = None
+    evaluations: Sequence[Evaluation] = ()
+    episodes: Sequence[Episode] = ()
+    stages: Sequence[Stage] = ()
+    dataset: Mapping[str, Any] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    problems: Sequence[str] = ()

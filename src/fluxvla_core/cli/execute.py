@@ -1,0 +1,202 @@
+"""One section of a config, run in this process, and what it leaves in its work dir."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.cli import ranks
+from fluxvla_core.cli.plan import Plan
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.signals import handling, requests_to_stop
+
+
+def execute(plan: Plan, args: argparse.Namespace) -> int:
+    """Build the section's runner and run it, reporting.
+
+    Returns:
+        The signal that asked to stop it when it was done, or 0.
+    """
+    from fluxvla_core.build import RunContext, build_runner_from_cfg
+    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
+    from fluxvla_core.config.tree import freeze
+    from fluxvla_core.contracts.reporter import SilentReporter
+
+    context = RunContext(
+        config=freeze(plan.config.tree),
+        section=plan.section,
+        work_dir=plan.work_dir,
+        resume=ranks.resume_from(args.resume, plan.work_dir) if plan.trains else None,
+        origins=plan.config.origins,
+        config_file=plan.config.file,
+        task=args.task,
+        task_file=args.tasks,
+        free_task=args.free_task,
+        nproc=ranks.world_size() or args.nproc or (1 if plan.trains else None),
+    )
+    if ranks.rank() != 0:
+        context = replace(context, reporter=SilentReporter())
+        return _run_section(plan, build_runner_from_cfg, context)[1]
+    reporter = KeepAliveReporter(make_reporter(args.log_format))
+    try:
+        with _claimed(plan, reporter):
+            first = _leave_records(plan)
+            reporter.event("start", section=plan.section, work_dir=plan.work_dir)
+            for text in ranks.restart_notice():
+                reporter.warn(text)
+            context = replace(context, reporter=reporter)
+            result, late = _run_section(plan, build_runner_from_cfg, context, not first)
+        if isinstance(result, Mapping):
+            for name, value in result.items():
+                if isinstance(value, (bool, int, float, str)):
+                    reporter.info(
+                        f"{name}: {value:.6g}" if isinstance(value, float) else f"{name}: {value}"
+                    )
+            reporter.event("result", section=plan.section, result=result)
+        reporter.artifact("work dir", plan.work_dir)
+        return late
+    except Exception as error:
+        reporter.event("error", type=type(error).__name__, text=str(error))
+        raise
+    finally:
+        reporter.close()
+
+
+def _claimed(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
+    """A training has its work dir for itself, from before it leaves the first file there."""
+    if not plan.trains:
+        return nullcontext()
+    from fluxvla_core.checkpoints.owner import claim
+
+    plan.work_dir.mkdir(parents=True, exist_ok=True)
+    return closing(claim(plan.work_dir, reporter.warn))
+
+
+def _run_section(
+    plan: Plan, build: Any, context: Any, own_records: bool = False
+) -> tuple[Any, int]:
+    """The call order of the specification: construct, ``run_setup``, ``run``.
+
+    Args:
+        own_records: what evaluates leaves its config in its section's folder, unless its runner
+            keeps it where its results are.
+
+    Returns:
+        What the section gave, and the signal that asked to stop it when it was done, or 0.
+    """
+    from fluxvla_core.contracts import Runner, TrainRunner
+    from fluxvla_core.contracts.check import is_train_runner
+
+    runner = build(context.config[plan.section], context)
+    if not is_train_runner(type(runner)):
+        if own_records and not Runner.adapt(runner).keeps_config:
+            _write_records(plan, plan.work_dir / plan.section)
+        runner.run_setup()
+        return runner.run(), 0
+    from fluxvla_core.build import build_dataset_from_cfg
+
+    dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
+    try:
+        runner.run_setup(n_train_examples=len(dataset))
+        ranks.mark_started(plan.work_dir)
+        return runner.run(dataset), TrainRunner.adapt(runner).late_stop
+    except (RuntimeError, MemoryError, OSError) as error:
+        from fluxvla_core.train.memory import explain
+
+        known = explain(error)
+        if known is None:
+            raise
+        raise known from error
+
+
+def _leave_records(plan: Plan) -> bool:
+    """``config.resolved.json`` and ``environment.json`` at the top of the work dir, and whether
+    they were written: a training's own stay when something is evaluated there later."""
+    from fluxvla_core.config.snapshot import CONFIG_FILE
+
+    if not plan.trains and (plan.work_dir / CONFIG_FILE).exists():
+        return False
+    _write_records(plan, plan.work_dir)
+    return True
+
+
+def _write_records(plan: Plan, folder: Path) -> None:
+    from fluxvla_core.config.snapshot import (
+        CONFIG_FILE,
+        ENVIRONMENT_FILE,
+        environment,
+        write_json,
+        write_resolved,
+    )
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_resolved(folder / CONFIG_FILE, plan.config)
+    write_json(folder / ENVIRONMENT_FILE, environment())
+
+
+def folders_to_make(plan: Plan) -> list[Path]:
+    """Folders that a run of ``plan`` makes, inner ones first."""
+    folders = [plan.work_dir / plan.section, plan.work_dir, *plan.work_dir.parents]
+    return [path for path in folders if not path.exists()]
+
+
+def remove_folders(made: list[Path]) -> None:
+    """Remove what a run that was refused has made; a folder with more in it stays."""
+    with suppress(OSError):
+        for folder in made:
+            _remove_records(folder)
+
+
+def _remove_records(folder: Path) -> None:
+    """Remove a folder in which nothing is but what every run leaves as it begins."""
+    from fluxvla_core.checkpoints.owner import LOCK
+    from fluxvla_core.config.snapshot import CONFIG_FILE, ENVIRONMENT_FILE
+
+    inside = list(folder.iterdir()) if folder.is_dir() else []
+    if {path.name for path in inside} <= {CONFIG_FILE, ENVIRONMENT_FILE, LOCK}:
+        for path in inside:
+            path.unlink()
+        with suppress(FileNotFoundError):  # nothing was left there yet
+            folder.rmdir()
+
+
+class _Terminated(BaseException):
+    """SIGTERM or SIGHUP. Not an ``Exception``: nobody's ``except`` may swallow it."""
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """They unwind the stack as Ctrl-C does, so that everything that was opened is closed.
+
+    Loops that know better (a robot's, a training's) take the signal over while they run.
+    """
+
+    def handle(number: int, frame: Any) -> None:
+        raise _Terminated(number)
+
+    try:
+        with handling(handle, *(n for n in requests_to_stop() if n != signal.SIGINT)):
+            yield
+    except _Terminated as ended:
+        name = signal.Signals(ended.args[0]).name
+        raise RunFailed(f"stopped by {name}", reason="stopped") from None
+
+
+@contextmanager
+def full_disk_explained(work_dir: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise RunFailed(
+            f"no space left on the disk while writing {error.filename or work_dir}",
+            next="make room and run the same command again, training with --resume auto",
+        ) from error

@@ -1,0 +1,44 @@
+"""What commands print: no traceback of its own, and no escapes of others."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+from typing import TextIO
+
+from fluxvla_core.errors import EXIT_FAILED, printable
+
+
+class OutputFailed(OSError):
+    """stdout takes no more: its disk is full, or its reader has gone."""
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print text that may hold names from files: terminal escapes in it are shown, not obeyed.
+
+    Raises:
+        OutputFailed: it cannot be written.
+    """
+    try:
+        print(printable(text), file=stream, flush=True)
+    except OSError as error:
+        raise OutputFailed(error.errno, error.strerror) from error
+
+
+def prepare() -> None:
+    """Let stdout and stderr take any text: what a terminal has no letter for becomes an escape."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def give_up(error: OSError) -> int:
+    """The exit code where stdout takes no more; said on stderr, unless its reader just left."""
+    broken = isinstance(error, BrokenPipeError) or isinstance(error.__cause__, BrokenPipeError)
+    if not broken:  # `fluxvla plugins list | head`
+        with suppress(OSError):  # stderr is full as well: there is nowhere to say it
+            print(f"the output cannot be written: {error.strerror or error}", file=sys.stderr)
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the interpreter flushes it at exit
+    return EXIT_FAILED

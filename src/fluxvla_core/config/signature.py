@@ -1,0 +1,445 @@
+"""What a class's constructor takes, read from source: nothing is imported.
+
+``**kwargs`` are followed into the constructors of base classes, ``**options`` into the fields of
+the dataclass that the class attribute ``Options`` names; what each parameter means is read from
+docstrings.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+from fluxvla_core.config.source import (
+    Module,
+    Opaque,
+    Source,
+    dotted_name,
+    find,
+    linearize,
+    member,
+)
+from fluxvla_core.plugins._metadata import Plugin
+
+_SECTION = re.compile(r"^(\s*)Args:\s*$", re.MULTILINE)
+_ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: \([^)]*\))?:\s*(.*)$")
+
+OPTIONS = "Options"
+"""The class attribute that names the dataclass of a constructor's ``**options``."""
+OPTIONS_KEYWORDS = "options"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One constructor parameter; ``text`` is its annotation and default as written."""
+
+    name: str
+    required: bool
+    place: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Forward:
+    """How an ``__init__`` hands its ``**kwargs`` to the next one."""
+
+    positional: int = 0
+    named: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Init:
+    """One ``__init__`` on the way up.
+
+    Args:
+        parameters: its own.
+        kwargs: the name of its ``**kwargs``; None if it has none.
+        forward: None if ``**kwargs`` go nowhere known.
+        filled: keywords that it sets itself where the caller did not.
+        taken: keywords that it takes out of ``**kwargs``.
+    """
+
+    parameters: tuple[Parameter, ...]
+    kwargs: str | None = None
+    forward: Forward | None = None
+    filled: frozenset[str] = frozenset()
+    taken: tuple[Parameter, ...] = ()
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a config may say for a class.
+
+    ``open`` means that further keys cannot be ruled out (``**kwargs`` that go nowhere known);
+    ``meanings`` is what docstrings say of parameters, those of the class before its bases'.
+    """
+
+    name: str
+    place: str
+    parameters: tuple[Parameter, ...]
+    open: bool = False
+    doc: str = ""
+    api: str | None = None
+    trains: bool = False
+    meanings: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+
+def read_signature(plugin: Plugin) -> Signature | None:
+    """The signature of an installed class from its source; None where there is none to read."""
+    source = find(plugin.module, plugin.attribute)
+    if isinstance(source, Opaque):
+        return None
+    node = source.node
+    if isinstance(node, ast.FunctionDef):
+        init = _init(node, source.module, drop_self=False)
+        meanings = argument_texts(ast.get_docstring(node))
+        return Signature(
+            node.name,
+            source.place,
+            init.parameters,
+            init.kwargs is not None,
+            _doc(node),
+            meanings=meanings,
+        )
+    order = linearize(source)
+    inits: list[Init] = []
+    unknown = False
+    for base in order:
+        if isinstance(base, Opaque):
+            unknown = unknown or not base.plain
+        elif isinstance(base.node, ast.ClassDef):
+            found = _class_init(base, order)
+            if found is not None and not unknown:
+                inits.append(found)
+    options = _options_order(order)
+    parameters, is_open = combine(inits, unknown, _fields(options) if options else None)
+    return Signature(
+        node.name,
+        source.place,
+        parameters,
+        is_open,
+        _doc(node),
+        _literal(order, "api"),
+        _trains(order),
+        {**_meanings(options), **_meanings(order)},
+    )
+
+
+def read_help(plugin: Plugin) -> str:
+    """The ``help`` of a command's class as its source has it; empty where it cannot be read."""
+    source = find(plugin.module, plugin.attribute)
+    return "" if isinstance(source, Opaque) else _literal(linearize(source), "help") or ""
+
+
+def combine(
+    inits: Iterable[Init], unknown: bool = False, options: Sequence[Parameter] | None = None
+) -> tuple[tuple[Parameter, ...], bool]:
+    """The parameters that reach some ``__init__`` of the chain, and whether others may.
+
+    Args:
+        inits: from the class upwards.
+        unknown: whether the chain ends in a class whose constructor could not be read.
+        options: fields of the class's ``Options``, for an ``__init__`` that ends the chain and
+            takes ``**options``; None if it has none.
+    """
+    reached: dict[str, Parameter] = {}
+    blocked: set[str] = set()
+    filled: set[str] = set()
+    skip = 0
+    for init in inits:
+        for index, parameter in enumerate(init.parameters):
+            if index >= skip and parameter.name not in blocked:
+                required = parameter.required and parameter.name not in filled
+                reached.setdefault(parameter.name, replace(parameter, required=required))
+        if init.kwargs is None:
+            return tuple(reached.values()), False
+        for parameter in init.taken:
+            reached.setdefault(parameter.name, parameter)
+        blocked |= {p.name for p in init.parameters}
+        filled |= init.filled
+        if init.forward is None:
+            if options is None or init.kwargs != OPTIONS_KEYWORDS:
+                return tuple(reached.values()), True
+            for option in options:
+                if option.name not in blocked:
+                    required = option.required and option.name not in filled
+                    reached.setdefault(option.name, replace(option, required=required))
+            return tuple(reached.values()), False
+        blocked |= init.forward.named
+        skip = init.forward.positional
+    return tuple(reached.values()), unknown
+
+
+# -- from source -----------------------------------------------------------------------------
+
+
+def _class_init(base: Source, order: list[Any]) -> Init | None:
+    node = base.node
+    assert isinstance(node, ast.ClassDef)
+    init = _init_of(node)
+    if init is not None:
+        return _init(init, base.module)
+    if _is_dataclass(node):
+        return Init(_fields(order[order.index(base) :]))
+    return None
+
+
+def _init_of(node: ast.ClassDef | ast.FunctionDef) -> ast.FunctionDef | None:
+    found = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
+    return found[-1] if found else None
+
+
+def _init(node: ast.FunctionDef, module: Module | None, drop_self: bool = True) -> Init:
+    def place(line: int) -> str:
+        return module.place(line) if module else ""
+
+    spec = node.args
+    plain = [*spec.posonlyargs, *spec.args][1 if drop_self else 0 :]
+    defaults = [*[None] * (len(plain) - len(spec.defaults)), *spec.defaults, *spec.kw_defaults]
+    pairs = zip([*plain, *spec.kwonlyargs], defaults, strict=True)
+    parameters = tuple(
+        Parameter(a.arg, d is None, place(a.lineno), _text(a.annotation, d)) for a, d in pairs
+    )
+    if spec.kwarg is None:
+        return Init(parameters)
+    return with_kwargs(parameters, node, spec.kwarg.arg, place)
+
+
+def _text(annotation: ast.expr | None, default: ast.expr | None) -> str:
+    left = f": {ast.unparse(annotation)}" if annotation else ""
+    return f"{left} = {ast.unparse(default)}" if default else left
+
+
+def with_kwargs(
+    parameters: tuple[Parameter, ...], node: ast.FunctionDef, kwargs: str, place: Any
+) -> Init:
+    """An ``__init__`` that takes ``**kwargs``: what it sets and pops there, and hands on."""
+    filled: set[str] = set()
+    taken: list[Parameter] = []
+    for inner in ast.walk(node):
+        if isinstance(inner, ast.Assign):
+            for target in inner.targets:
+                name = _item(target, kwargs)
+                if name:
+                    filled.add(name)
+        elif isinstance(inner, ast.Call) and isinstance(inner.func, ast.Attribute):
+            owner, method = dotted_name(inner.func.value), inner.func.attr
+            first = inner.args[0] if inner.args else None
+            if owner == kwargs and isinstance(first, ast.Constant) and isinstance(first.value, str):
+                if method == "setdefault":
+                    filled.add(first.value)
+                elif method == "pop":
+                    taken.append(Parameter(first.value, len(inner.args) == 1, place(inner.lineno)))
+    forward = _forward(node, kwargs)
+    return Init(parameters, kwargs, forward, frozenset(filled), tuple(taken))
+
+
+def _forward(node: ast.FunctionDef, kwargs: str) -> Forward | None:
+    """The call ``super().__init__(..., **kwargs)`` (or ``Base.__init__(self, ..., **kwargs)``)."""
+    for inner in ast.walk(node):
+        if not isinstance(inner, ast.Call) or not isinstance(inner.func, ast.Attribute):
+            continue
+        passed = any(k.arg is None and dotted_name(k.value) == kwargs for k in inner.keywords)
+        if inner.func.attr == "__init__" and passed:
+            given = [a for a in inner.args if not isinstance(a, ast.Starred)]
+            explicit = dotted_name(inner.func.value) is not None  # Base.__init__(self, ...)
+            return Forward(
+                len(given) - explicit,
+                frozenset(k.arg for k in inner.keywords if k.arg),
+            )
+    return None
+
+
+def _options(node: ast.FunctionDef, module: Module) -> tuple[Source, frozenset[str]] | None:
+    """The dataclass that ``Options(x=1, **kwargs)`` makes of a constructor's ``**kwargs``.
+
+    Returns:
+        The dataclass, and the fields that the call itself gives.
+    """
+    kwargs = node.args.kwarg.arg if node.args.kwarg else None
+    for call in (n for n in ast.walk(node) if isinstance(n, ast.Call)):
+        passed = any(k.arg is None and dotted_name(k.value) == kwargs for k in call.keywords)
+        name = dotted_name(call.func)
+        found = find(module.name, name) if passed and name else None
+        if isinstance(found, Source) and _is_dataclass(found.node):
+            return found, frozenset(k.arg for k in call.keywords if k.arg)
+    return None
+
+
+def _item(target: ast.expr, kwargs: str) -> str | None:
+    if isinstance(target, ast.Subscript) and dotted_name(target.value) == kwargs:
+        index = target.slice
+        if isinstance(index, ast.Constant) and isinstance(index.value, str):
+            return index.value
+    return None
+
+
+def _is_dataclass(node: ast.ClassDef | ast.FunctionDef) -> bool:
+    return any(
+        (dotted_name(d.func if isinstance(d, ast.Call) else d) or "").rpartition(".")[2]
+        == "dataclass"
+        for d in node.decorator_list
+    )
+
+
+def _fields(order: list[Any]) -> tuple[Parameter, ...]:
+    """Fields of a dataclass and of the dataclasses that it inherits from, bases first."""
+    found: dict[str, Parameter] = {}
+    for base in reversed(order):
+        if not _is_dataclass_source(base):
+            continue
+        for node in base.node.body:
+            if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+                continue
+            kind = (dotted_name(node.annotation) or "").rpartition(".")[2]
+            if kind in {"ClassVar", "KW_ONLY"} or _left_out(node.value):
+                continue
+            found[node.target.id] = Parameter(
+                node.target.id,
+                not _has_default(node.value),
+                base.module.place(node.lineno),
+                _text(node.annotation, _default(node.value)),
+            )
+    return tuple(found.values())
+
+
+def _options_order(order: list[Any]) -> list[Any]:
+    """The dataclass that the class attribute ``Options`` names, and its bases; empty if none."""
+    for base in order:
+        found = member(base, OPTIONS) if isinstance(base, Source) else None
+        if found is not None:
+            is_data = isinstance(found, Source) and isinstance(found.node, ast.ClassDef)
+            bases = linearize(found) if is_data and isinstance(found, Source) else []
+            return bases if any(_is_dataclass_source(one) for one in bases) else []
+    return []
+
+
+def _is_dataclass_source(base: Any) -> bool:
+    return (
+        isinstance(base, Source)
+        and isinstance(base.node, ast.ClassDef)
+        and _is_dataclass(base.node)
+    )
+
+
+def _field_options(value: ast.expr | None) -> dict[str, ast.expr] | None:
+    if isinstance(value, ast.Call) and (dotted_name(value.func) or "").endswith("field"):
+        return {k.arg: k.value for k in value.keywords if k.arg}
+    return None
+
+
+def _left_out(value: ast.expr | None) -> bool:
+    option = (_field_options(value) or {}).get("init")
+    return isinstance(option, ast.Constant) and option.value is False
+
+
+def _has_default(value: ast.expr | None) -> bool:
+    return _default(value) is not None
+
+
+def _default(value: ast.expr | None) -> ast.expr | None:
+    """A field's default as an expression; a factory's is the call of it."""
+    options = _field_options(value)
+    if options is None:
+        return value
+    factory = options.get("default_factory")
+    return ast.Call(factory, [], []) if factory else options.get("default")
+
+
+def _doc(node: ast.ClassDef | ast.FunctionDef) -> str:
+    return (ast.get_docstring(node) or "").partition("\n")[0]
+
+
+def _meanings(order: list[Any]) -> dict[str, str]:
+    """What the docstrings of these classes say of parameters; the first to say it counts."""
+    found: dict[str, str] = {}
+    for base in order:
+        if isinstance(base, Source):
+            found = {**_argument_texts_of(base.node), **found}
+    return found
+
+
+def _argument_texts_of(node: ast.ClassDef | ast.FunctionDef) -> dict[str, str]:
+    """By a class itself: strings below its fields, its docstring, and its ``__init__``'s."""
+    inits = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
+    found = argument_texts(ast.get_docstring(inits[-1])) if inits else {}
+    found |= argument_texts(ast.get_docstring(node))
+    return found | (field_texts(node) if isinstance(node, ast.ClassDef) else {})
+
+
+def field_texts(node: ast.ClassDef) -> dict[str, str]:
+    """Attribute docstrings: the string below ``name: type = default``."""
+    found = {}
+    for stated, below in pairwise(node.body):
+        if (
+            isinstance(stated, ast.AnnAssign)
+            and isinstance(stated.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+            and isinstance(below.value.value, str)
+        ):
+            found[stated.target.id] = " ".join(below.value.value.split())
+    return found
+
+
+def _literal(order: list[Any], name: str) -> str | None:
+    """The class attribute ``name`` where it is a string literal."""
+    for base in order:
+        for node in base.node.body if isinstance(base, Source) else ():
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", 0)]
+            if any(isinstance(t, ast.Name) and t.id == name for t in targets):
+                value = getattr(node, "value", None)
+                return str(value.value) if isinstance(value, ast.Constant) else None
+    return None
+
+
+def _trains(order: list[Any]) -> bool:
+    """Whether ``run_setup`` takes ``n_train_examples``: what distinguishes a train runner."""
+    for base in order:
+        for node in base.node.body if isinstance(base, Source) else ():
+            if isinstance(node, ast.FunctionDef) and node.name == "run_setup":
+                spec = node.args
+                return any(a.arg == "n_train_examples" for a in (*spec.args, *spec.kwonlyargs))
+    return False
+
+
+# -- from docstrings ----------------------------------------------------------------------------
+
+
+def argument_texts(docstring: str | None) -> dict[str, str]:
+    """Parameter -> its description, on one line; empty where there is no such section.
+
+    ``height, width: of the pictures`` is said of both.
+    """
+    text = inspect.cleandoc(docstring or "")
+    section = _SECTION.search(text)
+    if section is None:
+        return {}
+    margin = len(section[1])
+    found: dict[str, str] = {}
+    names: list[str] = []
+    inner: int | None = None
+    for line in text[section.end() :].splitlines():
+        if not line.strip():
+            continue
+        indent = len(line) - len(line.lstrip())
+        if indent <= margin:  # the next section, or what is said after it
+            break
+        inner = indent if inner is None else inner
+        entry = _ENTRY.match(line.strip()) if indent == inner else None
+        if entry:
+            names = [name.strip("* ") for name in entry[1].split(",")]
+            found.update(dict.fromkeys(names, entry[2].strip()))
+        else:
+            for name in names:
+                found[name] = f"{found[name]} {line.strip()}".strip()
+    return found

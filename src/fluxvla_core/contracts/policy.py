@@ -1,0 +1,137 @@
+"""The contract of policies: observation in, chunk of actions out."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from fluxvla_core.contracts.contract import Contract, attribute, implements, required
+from fluxvla_core.contracts.environment import Environment
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """The rest of the chunk that is being played, at the times of the chunk that is asked for.
+
+    Args:
+        actions: ``(T, dim)`` float64 in physical units, ``T`` being the policy's horizon: where
+            the arm is going to be at the times of the new chunk's keyframes if no new chunk comes.
+            Rows beyond the end of what is known repeat its last.
+        weights: ``(T,)`` float64, how much the new chunk has to agree with each row: 1 for rows
+            that will have been executed before the answer arrives, 0 for those that are free.
+        frozen: how many rows at the beginning will have been executed, by measured latency.
+        max_guidance_weight: bound of the pull towards ``actions``, for policies that are guided.
+    """
+
+    actions: npt.NDArray[np.float64]
+    weights: npt.NDArray[np.float64]
+    frozen: int
+    max_guidance_weight: float = 5.0
+
+
+class Actor(Contract):
+    """What acts in an environment: a policy, an expert, a demonstrator."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> None:
+        """Begin an episode; everything random in it follows from ``seed``."""
+
+    @abstractmethod
+    def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
+        """``(T, dim)``: the next T actions, in physical units."""
+
+    # -- optional abilities ----------------------------------------------------------------------
+
+    @attribute
+    def embodiment(self) -> EmbodimentSpec | None:
+        """What its numbers mean, which is checked; None: whatever the environment's mean."""
+        return None
+
+    @attribute
+    def cameras(self) -> Sequence[str]:
+        """Names of the cameras that it looks at; all of its ``embodiment`` by default."""
+        return () if self.embodiment is None else self.embodiment.camera_names
+
+    @attribute
+    def action_rate_hz(self) -> float | None:
+        """Actions a second; None is the environment's own rate."""
+        return None
+
+    @attribute
+    def horizon(self) -> int | None:
+        """Actions in a chunk; None where that is not known."""
+        return None
+
+    @attribute
+    def executed(self) -> npt.NDArray[np.float64] | None:
+        """``(N, dim)`` commands that lead to the last chunk's first action; None: a straight line.
+
+        What a demonstrator does may be noisier than what it means.
+        """
+        return None
+
+    def enter(self, environment: Environment) -> None:
+        """Told once an episode has begun where it acts; called before ``reset``.
+
+        Scripted experts see there what others must look for.
+        """
+
+    @attribute
+    def continues(self) -> bool:
+        """Whether ``continue_action`` works; by default where a class brings it."""
+        return implements(self, Actor, "continue_action")
+
+    def continue_action(
+        self, observation: Observation, rest: Continuation
+    ) -> npt.NDArray[np.float64]:
+        """Real-time chunking: ``(horizon, dim)`` actions in physical units that fit ``rest``."""
+        raise NotImplementedError(f"{type(self).__name__} cannot go on from a chunk")
+
+
+class Policy(Actor):
+    """A policy that can drive a robot. Local model, remote server and replay are three of it.
+
+    ``horizon`` actions come at ``action_rate_hz``; action ``j`` is to be reached
+    ``(j + 1) / action_rate_hz`` seconds after the observation.
+    """
+
+    @required
+    def embodiment(self) -> EmbodimentSpec:
+        """What its numbers mean; must fit the robot's."""
+
+    @required
+    def action_rate_hz(self) -> float:
+        """Actions a second."""
+
+    @required
+    def horizon(self) -> int:
+        """Actions in a chunk."""
+
+    # -- optional abilities ----------------------------------------------------------------------
+
+    @attribute
+    def source(self) -> object:
+        """Where it comes from, for the record: a checkpoint's path, a server's address."""
+        return ""
+
+    @attribute
+    def stages(self) -> Mapping[str, float]:
+        """Seconds that the parts of the last answer took, for the record."""
+        return {}
+
+    @attribute
+    def whole_motion(self) -> bool:
+        """Whether one chunk is the whole motion.
+
+        It is then played to its end, however few actions of a chunk the runner's settings let be
+        used before the next is asked for.
+        """
+        return False

@@ -1,0 +1,166 @@
+"""The contracts of what runs at the rate of the robot: operator, action filter, clock."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from fluxvla_core.contracts.contract import Contract, attribute, required
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+class Clock(Protocol):
+    """The time that the control loop lives in: monotonic on robots, stepped in simulations."""
+
+    def now(self) -> float:
+        """Seconds; only differences mean something."""
+
+    def sleep_until(self, deadline: float) -> None:
+        """Return at ``deadline`` (seconds on this clock), at once if it is past."""
+
+
+class Operator(Contract):
+    """Driver of one robot. The constructor names every parameter and does no I/O.
+
+    A class that inherits nothing needs ``get_frame`` only, where its runner sends the commands and
+    the config gives the embodiment; one with ``send_action`` needs ``stop``, too.
+    """
+
+    @required
+    def embodiment(self) -> EmbodimentSpec:
+        """Joints, cameras, limits and rate of the robot; valid before ``connect``."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open the connection. Raises NotReady (try again), Rejected, or Faulted."""
+
+    @abstractmethod
+    def get_frame(self) -> Frame:
+        """The newest reading, in fresh arrays. Raises NotReady before the first one."""
+
+    @abstractmethod
+    def send_action(self, action: npt.NDArray[np.float64]) -> None:
+        """Send one ``(dim,)`` command in the embodiment's units.
+
+        Raises Rejected for a wrong shape, a non-finite or out-of-spec value, before any I/O.
+        """
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Come to a safe stop and hold: in any state, from any thread, any number of times.
+
+        A later stop, ``close``'s among them, sends the arm nothing unless ``send_action`` succeeded
+        since: it may have been moved, and would be thrown back. An arm that somebody else commands
+        is sent nothing at all. A speed, a mobile base's, is set to zero by every stop.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give everything back; any number of times."""
+
+    # -- optional abilities ----------------------------------------------------------------------
+
+    @attribute
+    def clock(self) -> Clock | None:
+        """The robot's own time; None is the monotonic clock.
+
+        A simulation that steps its physics in ``send_action`` has one. Its ``lockstep`` (True by
+        default) says whether that time stands still between commands.
+        """
+        return None
+
+    @attribute
+    def follows_commands(self) -> bool:
+        """Whether the arm does what it is sent; False for a recorded one.
+
+        Its tracking error is then no fault.
+        """
+        return True
+
+    @attribute
+    def last_action(self) -> npt.NDArray[np.float64] | None:
+        """``(dim,)`` the command that holds the arm: the last one, or what ``stop`` made of it.
+
+        None if it has none, or one of somebody else's. Where this is defined episodes begin from
+        there: an arm lags behind what holds it, and a gripper presses, and neither is to be let go.
+        After a stop, a joint further from it than ``robot.tracking.HOLD_REACH`` was moved, and
+        begins where it is.
+        """
+        return None
+
+    @attribute
+    def speed_scaling(self) -> float:
+        """Share of its speed that a person lets the robot have: 0 (paused) to 1.
+
+        Commands keep to it. ``send_action`` refuses while the robot is paused.
+        """
+        return 1.0
+
+    def get_state(self) -> npt.NDArray[np.float64] | None:
+        """The newest ``(state_dim,)`` state alone, at no cost; None where that cannot be had.
+
+        The arm is then watched at every command. Called from the thread that sends commands.
+        """
+        return None
+
+    def state_stamp(self) -> float | None:
+        """When the newest state arrived, in seconds on ``clock``; None takes it for new.
+
+        An arm whose joint states are old is then not taken for one that does not follow.
+        """
+        return None
+
+    def begin_episode(self, instruction: str, episode: int) -> None:
+        """Episode number ``episode`` (from 0) begins; the arm has not moved in it yet.
+
+        A simulation puts its objects in place.
+        """
+
+    def task_done(self) -> bool:
+        """Whether the episode can end here; asked after each command."""
+        return False
+
+    def task_success(self) -> bool | None:
+        """Whether the task is done as of now; None if unknown. Asked at the end of an episode."""
+        return None
+
+    def episode_facts(self) -> Mapping[str, Any]:
+        """JSON values that go into the results of an evaluation, after each episode."""
+        return {}
+
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[Sequence[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """Pictures that are kept for recordings, which then have all that arrive.
+
+        Stamps and ``(H, W, 3)`` uint8 RGB pictures, oldest first, and how many ever arrived.
+        Called often, from a thread of its own; ``after`` is the stamp of the last one it has.
+        Without this method recordings have the pictures of the frames.
+        """
+        return (), 0
+
+    @classmethod
+    def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
+        if getattr(candidate, "send_action", None) is not None:
+            return (("get_frame", "send_action", "stop"),)
+        return (("get_frame",),)
+
+
+class ActionFilter(Contract):
+    """Changes a policy's targets before the limits are applied, which no filter can undo."""
+
+    @abstractmethod
+    def __call__(self, action: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The ``(dim,)`` target, in physical units, that takes the place of ``action``."""
+
+    def bind(self, embodiment: EmbodimentSpec) -> None:
+        """Called once, before the robot is connected. Raises ConfigError if it does not fit."""
+
+    def reset(self, pose: npt.NDArray[np.float64]) -> None:
+        """An episode begins with the arm at ``(dim,)`` ``pose``."""

@@ -1,0 +1,112 @@
+"""The contracts of what the command line runs, and of what watches it: runner, hook, command."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from fluxvla_core.contracts.contract import Contract, attribute, public_methods
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from fluxvla_core.contracts.frame import Observation
+
+
+class Runner(Contract):
+    """Inference or evaluation: what a config section runs.
+
+    The command line calls the constructor, ``run_setup()`` and ``run()``.
+    """
+
+    @abstractmethod
+    def run(self) -> Any:
+        """Do the work; what it returns is shown and written."""
+
+    @abstractmethod
+    def run_setup(self) -> None:
+        """Prepare: build what the constructor was told of."""
+
+    @attribute
+    def keeps_config(self) -> bool:
+        """Whether it keeps the config beside its results; the command line does it otherwise."""
+        return False
+
+
+class TrainRunner(Contract):
+    """Training: called as ``run_setup(n_train_examples=len(dataset))``, then ``run(dataset)``."""
+
+    @abstractmethod
+    def run(self, vla_dataset: Any) -> Any:
+        """Train on the dataset; what it returns is shown and written."""
+
+    @abstractmethod
+    def run_setup(self, *, n_train_examples: int) -> None:
+        """Build model, optimizer and schedule."""
+
+    @attribute
+    def late_stop(self) -> int:
+        """The signal that asked to stop when training was done already, else 0."""
+        return 0
+
+
+class Hook(Contract):
+    """Observer of a run: overrides the methods that it wants to be called by. None may act.
+
+    A method may take any subset of its arguments, by name. A hook is active only where a config
+    names it (``hooks = [dict(type="LatencyLog", every=10)]``): installing a package never changes
+    what a run does. In training hooks are called on rank 0. ``context`` is the ``RunContext``.
+    """
+
+    _any_arguments: ClassVar[bool] = True
+
+    def run_started(self, context: Any) -> None:
+        """Once, after everything is built and before the first unit of work."""
+
+    def run_finished(self, context: Any, outcome: str) -> None:
+        """Once, always, also after an error; ``outcome``: ``ok``, ``interrupted`` or ``failed``."""
+
+    def before_step(self, context: Any, step: int) -> None:
+        """Before optimizer step ``step`` (counted from 1) reads its first batch."""
+
+    def after_step(self, context: Any, step: int, metrics: Mapping[str, float]) -> None:
+        """After each step whose metrics were fetched (every log interval)."""
+
+    def checkpoint_saved(self, context: Any, path: Path, step: int) -> None:
+        """After a checkpoint directory has its final name."""
+
+    def episode_started(self, context: Any, task: str) -> None:
+        """Before the first observation of an episode on a robot."""
+
+    def observed(self, context: Any, observation: Observation) -> None:
+        """After each observation that a policy is asked with; its arrays are read-only."""
+
+    def inferred(self, context: Any, chunk: npt.NDArray[np.float64], latency_s: float) -> None:
+        """After each answer of a policy: ``(T, D)`` physical units, read-only, and its duration."""
+
+    def action_sent(self, context: Any, action: npt.NDArray[np.float64], stamp: float) -> None:
+        """After each command, as it was sent: ``(D,)`` physical units, read-only."""
+
+    def episode_finished(self, context: Any, reason: str) -> None:
+        """After the safe stop that ends every episode; ``reason`` says what ended it."""
+
+    @classmethod
+    def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
+        return tuple((name,) for name in public_methods(cls))
+
+
+class Command(Contract):
+    """A plugin's own ``fluxvla NAME …`` command."""
+
+    help: ClassVar[str]
+
+    @abstractmethod
+    def add_arguments(self, parser: Any) -> None:
+        """Add options to the ``argparse`` parser."""
+
+    @abstractmethod
+    def run(self, args: Any) -> int:
+        """Do it; returns the exit code."""

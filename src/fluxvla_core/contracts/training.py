@@ -1,0 +1,220 @@
+"""The contracts of what trains: model, dataset, transform, collator, tokenizer, metric, optimizer.
+
+Nothing here imports torch: ``VLA`` is inherited beside ``torch.nn.Module``.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from fluxvla_core.contracts.contract import Contract, attribute
+from fluxvla_core.contracts.frame import Sample
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+class VLA(Contract):
+    """A model, and what training strategies must know of it: ``class MyVLA(VLA, nn.Module)``.
+
+    It has ``forward(...)``, to be trained, whose parameters are keys of a batch, or
+    ``predict_action(...)``, to act.
+    """
+
+    @attribute
+    def action_shape(self) -> tuple[int, int] | None:
+        """``(horizon, dim)`` of a chunk; None where the dataset says how long one is."""
+        return None
+
+    @attribute
+    def static_graph(self) -> bool:
+        """Whether every step uses the same parameters, which DDP may then rely on."""
+        return False
+
+    def fsdp_units(self) -> Sequence[Any]:
+        """The blocks that are sharded, recomputed and compiled one by one; none by default.
+
+        Each is a module whose ``forward`` is what the model calls, or a tuple of modules that are
+        used together and whose weights are gathered together.
+        """
+        return []
+
+    @classmethod
+    def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
+        return (("forward",), ("predict_action",))
+
+
+class Dataset(Contract):
+    """Map-style samples; everything random in one follows from (seed, epoch, index).
+
+    What prepares a robot's observations (``inference.dataset``) has ``__call__(observation)``
+    instead, and inherits nothing.
+    """
+
+    _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """How many samples there are."""
+
+    @abstractmethod
+    def get_sample(self, index: int, epoch: int) -> Sample:
+        """Sample ``index`` as ``epoch`` sees it."""
+
+    # -- optional abilities ----------------------------------------------------------------------
+
+    def get_samples(self, keys: Sequence[Any]) -> list[Sample]:
+        """Several samples at once; ``keys`` have ``index`` and ``epoch``."""
+        return [self.get_sample(key.index, key.epoch) for key in keys]
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.get_sample(index, 0)
+
+    def prepare(self, reporter: Any) -> None:
+        """Called once before the first sample: decode what is kept in memory."""
+
+    def use_seed(self, seed: int) -> None:
+        """Draw by the run's seed from now on, unless the config gave one."""
+
+    def warnings(self) -> list[str]:
+        """What is questionable in the data; reported before training begins."""
+        return []
+
+    def use_statistics(self, entry: Mapping[str, Any]) -> None:
+        """Normalise by these instead of its own: validation data by the training data's."""
+        raise NotImplementedError(f"{type(self).__name__} takes no statistics")
+
+    @attribute
+    def statistics(self) -> Mapping[str, Any]:
+        """``statistic_name`` -> what states and actions are normalised by; for checkpoints."""
+        return {}
+
+    @attribute
+    def embodiment(self) -> EmbodimentSpec | None:
+        """The robot that the data are of; goes into checkpoints."""
+        return None
+
+    @attribute
+    def fps(self) -> float | None:
+        """Frames a second: the rate of the actions that are learned."""
+        return None
+
+    @attribute
+    def action_window_size(self) -> int | None:
+        """Actions in a sample's chunk."""
+        return None
+
+    @attribute
+    def tasks(self) -> Sequence[str]:
+        """The instructions in the data."""
+        return ()
+
+    @attribute
+    def episode_ends(self) -> npt.NDArray[np.int64] | None:
+        """``(episodes,)`` index behind each episode's last sample, for ``shuffle_episodes``."""
+        return None
+
+    @classmethod
+    def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
+        return (("__len__", "get_sample"), ("__len__", "get_samples"), ("__call__",))
+
+
+class _Changes(Contract):
+    """What both kinds of transforms may have besides."""
+
+    training_only: ClassVar[bool] = False
+    """Whether a robot's observations do not pass it: augmentation, noise."""
+
+    def denormalizer(self, norm_stats: Mapping[str, Any], statistic_name: str) -> Any:
+        """The transform that undoes what this one does to actions."""
+        raise NotImplementedError(f"{type(self).__name__} normalises no actions")
+
+    def defer(self, sample: Sample) -> Sample:
+        """As ``__call__``, with the normalisation of pictures left to be done on the device."""
+        raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
+
+
+class Transform(_Changes):
+    """Sample in, sample out; never changes the arrays that it was given."""
+
+    needs_rng: ClassVar[bool] = False
+
+    @abstractmethod
+    def __call__(self, sample: Sample) -> Sample:
+        """The changed sample."""
+
+
+class RandomTransform(_Changes):
+    """A transform that draws, by the generator that it is handed."""
+
+    needs_rng: ClassVar[bool] = True
+
+    @abstractmethod
+    def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        """The changed sample."""
+
+
+class Collator(Contract):
+    """Makes a batch of samples."""
+
+    @abstractmethod
+    def __call__(self, samples: Sequence[Sample]) -> Mapping[str, Any]:
+        """The batch, whose keys are the model's arguments."""
+
+
+class Tokenizer(Contract):
+    """Turns text into numbers."""
+
+    padding_side: str = "right"
+    pad_token_id: int | None = None
+
+    @abstractmethod
+    def encode(self, text: str) -> Sequence[int]:
+        """Token ids."""
+
+    def save_pretrained(self, folder: Any) -> Any:
+        """Write what is needed to load it again; goes into checkpoints."""
+
+
+class Metric(Contract):
+    """Keeps the numbers of a training and hands them to trackers; called on the first rank only."""
+
+    @abstractmethod
+    def start(self, step: int, config: Mapping[str, Any]) -> None:
+        """Training begins, or goes on, after ``step``."""
+
+    @abstractmethod
+    def commit(self, *, global_step: int, epoch: int, loss: float, lr: float, **more: Any) -> None:
+        """The numbers of one optimizer step."""
+
+    @abstractmethod
+    def push(self) -> Any:
+        """Hand on what was committed since the last time."""
+
+    @abstractmethod
+    def sync(self) -> None:
+        """Make sure that what was pushed outlives the process; before each checkpoint."""
+
+    @abstractmethod
+    def state_dict(self) -> Mapping[str, Any]:
+        """JSON values that go into a checkpoint."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint."""
+
+    @abstractmethod
+    def finalize(self) -> None:
+        """Training has ended."""
+
+
+class Optimizer(Contract):
+    """An optimizer's settings."""
+
+    @abstractmethod
+    def build(self, groups: list[dict[str, Any]], learning_rate: float) -> Any:
+        """The ``torch.optim.Optimizer`` of the parameter ``groups``."""

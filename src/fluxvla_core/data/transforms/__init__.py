@@ -1,0 +1,1 @@
+"""Transforms: what changes a sample between dataset and model, and actions on their way back."""

@@ -1,0 +1,319 @@
+"""Transforms of camera images: crop, resize, random shift, normalise.
+
+``sample["images"]`` is a list of ``(3, H, W)`` arrays, one a camera, or one ``(3N, H, W)`` array
+of N cameras of equal size. Images stay uint8 until they are normalised, and are never resized
+twice.
+
+Normalisation can be left to the device that computes the model: images then travel as uint8, with
+what is left to do as ``image_scale``, ``(4, 3N)`` float32: for each plane what to divide by,
+multiply by, subtract and divide by, in this order. Doing nothing is exact (by 1, or 0), so one
+formula serves every normaliser, bit for bit, and each sample of a batch has its own numbers.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.training import RandomTransform, Transform
+from fluxvla_core.errors import ConfigError, DataError
+
+Sample = dict[str, Any]
+Image = npt.NDArray[Any]
+Images = list[Image] | Image
+Row = npt.NDArray[np.float32] | None
+Steps = tuple[Row, Row, Row, Row]
+"""Divide by, multiply by, subtract, divide by: each ``(3N,)``, or None for nothing."""
+SCALE = "image_scale"
+"""The sample's key of what is left to do."""
+INTERPOLATIONS = ("linear", "area")
+_OTHER_ORDER = "height, width and channels are in another order, or there is an alpha channel"
+_Operation = Callable[[Any, Any], Any]
+_OPERATIONS: tuple[_Operation, ...] = (
+    operator.itruediv,
+    operator.imul,
+    operator.isub,
+    operator.itruediv,
+)
+_NOTHING = (1, 1, 0, 1)
+
+
+class ResizeImages(Transform):
+    """Resize every image to ``height`` x ``width``; gives ``(3N, height, width)``, same dtype.
+
+    Args:
+        interpolation: ``linear``, or ``area``, which does not alias when it shrinks.
+    """
+
+    def __init__(self, height: int, width: int, interpolation: str = "linear") -> None:
+        if height < 1 or width < 1:
+            raise ConfigError(f"ResizeImages: {height} x {width} is no size")
+        if interpolation not in INTERPOLATIONS:
+            raise ConfigError(
+                f"ResizeImages: interpolation {interpolation!r} is none of "
+                f"{', '.join(INTERPOLATIONS)}"
+            )
+        self.height = height
+        self.width = width
+        self.interpolation = interpolation
+
+    def __call__(self, sample: Sample) -> Sample:
+        resized = [self._resize(image) for image in split_images(sample["images"])]
+        return {**sample, "images": join_planes(resized)}
+
+    def _resize(self, image: Image) -> Image:
+        if image.shape[1:] == (self.height, self.width):
+            return image
+        import cv2
+
+        flag = cv2.INTER_AREA if self.interpolation == "area" else cv2.INTER_LINEAR
+        tall = np.ascontiguousarray(image.transpose(1, 2, 0))
+        out: Image = cv2.resize(tall, (self.width, self.height), interpolation=flag)
+        return out.transpose(2, 0, 1)
+
+
+class CropImages(Transform):
+    """Crop the same rectangle from every image; a list stays a list.
+
+    Args:
+        top, left: of the rectangle's corner, in pixels of the picture as it arrives here.
+        height, width: of the rectangle.
+
+    Raises:
+        DataError: a picture is smaller than the rectangle asks for.
+    """
+
+    def __init__(self, top: int, left: int, height: int, width: int) -> None:
+        if min(top, left) < 0 or min(height, width) < 1:
+            raise ConfigError(
+                f"CropImages: top {top}, left {left}, height {height}, width {width} "
+                "is no rectangle"
+            )
+        self.top = top
+        self.left = left
+        self.height = height
+        self.width = width
+
+    def __call__(self, sample: Sample) -> Sample:
+        images = sample["images"]
+        if isinstance(images, list):
+            return {**sample, "images": [self._crop(image) for image in images]}
+        return {**sample, "images": self._crop(images)}
+
+    def _crop(self, image: Image) -> Image:
+        bottom, right = self.top + self.height, self.left + self.width
+        if bottom > image.shape[1] or right > image.shape[2]:
+            raise DataError(
+                f"CropImages: rows {self.top}:{bottom}, columns {self.left}:{right} are not in a "
+                f"picture of {image.shape[1]} x {image.shape[2]} pixels"
+            )
+        return image[:, self.top : bottom, self.left : right]
+
+
+class RandomShiftImages(RandomTransform):
+    """Shift each camera's image randomly by up to ``pixels`` both ways; borders are repeated.
+
+    Source: Kostrikov et al., "Image augmentation is all you need", 2020.
+    """
+
+    training_only = True
+
+    def __init__(self, pixels: int) -> None:
+        if pixels < 0:
+            raise ConfigError(f"RandomShiftImages: pixels must be at least 0, got {pixels}")
+        self.pixels = pixels
+
+    def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        images = sample["images"]
+        shifted = [self._shift(image, rng) for image in split_images(images)]
+        whole = shifted if isinstance(images, list) else np.concatenate(shifted)
+        return {**sample, "images": whole}
+
+    def _shift(self, image: npt.NDArray[Any], rng: np.random.Generator) -> npt.NDArray[Any]:
+        down, right = rng.integers(-self.pixels, self.pixels + 1, size=2)
+        rows = np.clip(np.arange(image.shape[1]) + down, 0, image.shape[1] - 1)
+        columns = np.clip(np.arange(image.shape[2]) + right, 0, image.shape[2] - 1)
+        return image[:, rows[:, None], columns]
+
+
+class NormalizeImages(Transform):
+    """Normalise by mean and std: ``(x - mean) / (std + 1e-8)``; gives ``(3N, H, W)`` float32.
+
+    Args:
+        means, stds: one group of 3, for all cameras, or one group a camera; in the picture's own
+            units, that is 0..255 for uint8.
+        scale_to_unit_interval: divide by 255 first; means and stds are then in 0..1.
+
+    Raises:
+        ConfigError: groups that fit no number of cameras.
+    """
+
+    def __init__(
+        self,
+        means: Sequence[Any],
+        stds: Sequence[Any],
+        scale_to_unit_interval: bool = False,
+    ) -> None:
+        self.means = _groups(means, "means")
+        self.stds = _groups(stds, "stds")
+        if self.means.shape != self.stds.shape:
+            raise ConfigError(
+                f"NormalizeImages: {len(self.means)} groups of means, {len(self.stds)} of stds"
+            )
+        if (self.stds <= 0).any():
+            raise ConfigError("NormalizeImages: every std must be positive")
+        self.scale_to_unit_interval = scale_to_unit_interval
+
+    def __call__(self, sample: Sample) -> Sample:
+        return _normalize(sample, self._steps)
+
+    def defer(self, sample: Sample) -> Sample:
+        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the images still are."""
+        return _defer(sample, self._steps)
+
+    def _steps(self, cameras: int) -> Steps:
+        if len(self.means) not in (1, cameras):
+            raise ConfigError(
+                f"NormalizeImages: {len(self.means)} groups of means and stds, {cameras} cameras",
+                next="give one group for all cameras, or one for each",
+            )
+        repeat = cameras // len(self.means)
+        means, stds = (np.tile(v, (repeat, 1)).reshape(-1) for v in (self.means, self.stds))
+        unit = np.full(3 * cameras, 255, np.float32) if self.scale_to_unit_interval else None
+        return unit, None, means, stds + np.float32(1e-8)
+
+
+class SimpleNormalizeImages(Transform):
+    """Normalise to -1..1: ``x / 255 * 2 - 1``; gives ``(3N, H, W)`` float32."""
+
+    def __call__(self, sample: Sample) -> Sample:
+        return _normalize(sample, self._steps)
+
+    def defer(self, sample: Sample) -> Sample:
+        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the images still are."""
+        return _defer(sample, self._steps)
+
+    def _steps(self, cameras: int) -> Steps:
+        factor, one = (np.full(3 * cameras, v, np.float32) for v in (2 / 255, 1))
+        return None, factor, one, None
+
+
+def split_images(images: Images) -> list[Image]:
+    """Split into one ``(3, H, W)`` array a camera.
+
+    Raises:
+        DataError: an array whose channels are not a multiple of 3, or no image at all.
+    """
+    if not isinstance(images, list):
+        if images.ndim != 3 or len(images) == 0 or len(images) % 3:
+            raise DataError(
+                f"images of shape {images.shape} are not (3N, height, width)",
+                cause=_OTHER_ORDER,
+            )
+        return list(images.reshape(-1, 3, *images.shape[1:]))
+    if not images:
+        raise DataError("the sample has no pictures")
+    for image in images:
+        if image.ndim != 3 or len(image) != 3:
+            raise DataError(
+                f"an image of shape {image.shape} is not (3, height, width)",
+                cause=_OTHER_ORDER,
+            )
+    return images
+
+
+def stack_images(images: Images) -> Image:
+    """Stack all cameras' images: ``(3N, H, W)``.
+
+    Raises:
+        DataError: the cameras' sizes differ.
+    """
+    parts = split_images(images)
+    sizes = [part.shape[1:] for part in parts]
+    if len(set(sizes)) > 1:
+        listed = ", ".join(f"{h} x {w}" for h, w in sizes)
+        raise DataError(
+            f"cameras of different sizes cannot be stacked: {listed}",
+            next="put ResizeImages before this transform",
+        )
+    return images if isinstance(images, np.ndarray) else join_planes(parts)
+
+
+def join_planes(images: Sequence[Image]) -> Image:
+    """Copy ``(3, H, W)`` arrays of equal size to one new, contiguous ``(3N, H, W)``.
+
+    Decoded images are views of (H, W, 3) memory. Copying such a view plane by plane in numpy takes
+    longer than decoding it; OpenCV splits it with vector instructions.
+    """
+    first = images[0]
+    out = np.empty((3 * len(images), *first.shape[1:]), np.result_type(*images))
+    if any(i.dtype != np.uint8 or i.strides[0] != 1 or min(i.strides) < 1 for i in images):
+        return np.concatenate(images, out=out)
+    import cv2
+
+    for image, planes in zip(images, out.reshape(-1, *first.shape), strict=True):
+        cv2.split(image.transpose(1, 2, 0), list(planes))
+    return out
+
+
+def normalized(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Apply a batch's ``image_scale``: the batch without it, with normalised float32 images."""
+    rest = dict(batch)
+    scale = rest.pop(SCALE, None)
+    if scale is not None:
+        images = rest["images"].to(scale.dtype, copy=True)
+        rest["images"] = scale_(images, scale.unbind(1))
+    return rest
+
+
+def scale_(images: Any, rows: Sequence[Any]) -> Any:
+    """Scale ``images`` ``(..., 3N, H, W)`` float32, numpy's or torch's, in place by ``rows``."""
+    for operation, row in zip(_OPERATIONS, rows, strict=True):
+        if row is not None:
+            images = operation(images, row[..., None, None])
+    return images
+
+
+def as_array(steps: Steps, planes: int) -> npt.NDArray[np.float32]:
+    """``steps`` as one array ``(4, planes)``, to travel with the sample."""
+    rows = [
+        np.full(planes, nothing, np.float32) if row is None else row
+        for row, nothing in zip(steps, _NOTHING, strict=True)
+    ]
+    return np.stack(rows)
+
+
+def _normalize(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
+    images = _float_planes(sample["images"])
+    return {**sample, "images": scale_(images, steps(len(images) // 3))}
+
+
+def _defer(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
+    images = stack_images(sample["images"])
+    if images.dtype != np.uint8:
+        images = _float_planes(images)
+    planes = len(images)
+    return {**sample, "images": images, SCALE: as_array(steps(planes // 3), planes)}
+
+
+def _float_planes(images: Images) -> npt.NDArray[np.float32]:
+    """A new, contiguous ``(3N, H, W)`` float32 array.
+
+    Decoded images are views of (H, W, 3) memory; arithmetic by channel is ten times slower there.
+    """
+    return stack_images(images).astype(np.float32, order="C")
+
+
+def _groups(values: Sequence[Any], what: str) -> npt.NDArray[np.float32]:
+    array = np.asarray(values, np.float32)
+    array = array.reshape(1, -1) if array.ndim == 1 else array
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+        raise ConfigError(
+            f"NormalizeImages: {what} must be 3 numbers, or 3 for each camera; "
+            f"got shape {np.shape(values)}"
+        )
+    return array

@@ -1,0 +1,186 @@
+"""Tokenise instructions: prompts as text to token ids and masks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import build_tokenizer_from_cfg
+from fluxvla_core.contracts.training import Transform
+from fluxvla_core.errors import ConfigError
+
+Sample = dict[str, Any]
+Encoded = tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]
+
+
+class ProcessPrompts(Transform):
+    """Tokenise the instruction: add ``lang_tokens`` int64 and ``lang_masks`` bool, ``(max_len,)``.
+
+    The text is ``sample["prompt"]``, or ``sample["task_description"]`` where there is none.
+    Padding follows on the tokenizer's ``padding_side``, right unless it says otherwise; the mask
+    is True on real tokens.
+
+    Args:
+        tokenizer: a table of ``fluxvla.tokenizers``, or one already built: ``encode(text)``
+            gives ids, ``pad_token_id`` fills up.
+        max_len: length of the result.
+
+    Raises:
+        ConfigError: the text is missing, or longer than ``max_len``: half an instruction is
+            another instruction, so it is never cut.
+    """
+
+    keeps_images = True
+
+    def __init__(self, tokenizer: Mapping[str, Any] | Any, max_len: int = 180) -> None:
+        self._who = type(self).__name__
+        if max_len < 1:
+            raise ConfigError(f"{self._who}: max_len must be at least 1, got {max_len}")
+        self.tokenizer = build_tokenizer_from_cfg(tokenizer)
+        self.max_len = max_len
+        self.padding_side = getattr(self.tokenizer, "padding_side", "right")
+        # A dataset has a handful of instructions and millions of frames.
+        self._known: dict[str, Encoded] = {}
+
+    def __call__(self, sample: Sample) -> Sample:
+        text = sample.get("prompt", sample.get("task_description"))
+        if not isinstance(text, str) or not text.strip():
+            raise ConfigError(
+                f"{self._who}: there is no instruction: neither 'prompt' nor "
+                f"'task_description' is in the sample ({text!r})"
+            )
+        if text not in self._known:
+            self._known[text] = self._pad(self._encode(text), text)
+        tokens, mask = self._known[text]
+        return {**sample, "lang_tokens": tokens.copy(), "lang_masks": mask.copy()}
+
+    def _encode(self, text: str) -> Sequence[int]:
+        ids: Sequence[int] = self.tokenizer.encode(text)
+        return ids
+
+    def _pad(self, ids: Sequence[int], text: str) -> Encoded:
+        if len(ids) > self.max_len:
+            raise ConfigError(
+                f"{self._who}: the instruction {text!r} has {len(ids)} tokens{self._counted()}, "
+                f"max_len is {self.max_len}",
+                next=f"set max_len to {len(ids)} or more where the model was trained, "
+                "or use shorter words",
+            )
+        pad = int(getattr(self.tokenizer, "pad_token_id", 0) or 0)
+        left = self.padding_side == "left"
+        place = slice(self.max_len - len(ids), None) if left else slice(len(ids))
+        tokens = np.full(self.max_len, pad, dtype=np.int64)
+        mask = np.zeros(self.max_len, dtype=np.bool_)
+        tokens[place], mask[place] = ids, True
+        return tokens, mask
+
+    def _counted(self) -> str:
+        return ""
+
+
+class ProcessPromptsWithImage(ProcessPrompts):
+    """Tokenise a chat prompt with image placeholders, for models that take images between words.
+
+    The text is ``<|im_start|>system``, the system's words, ``<|im_end|>``, ``<|im_start|>user``,
+    for each camera ``<image 1><img>``, ``fixed_img_tokens`` times ``<IMG_CONTEXT>`` and
+    ``</img>``, then the instruction, ``<|im_end|>`` and ``<|im_start|>assistant``, as Eagle 2 (the
+    eyes of GR00T N1.5) was trained.
+
+    Args:
+        tokenizer, max_len: as of ``ProcessPrompts``; the places of pictures count.
+        num_images: cameras, as many as ``img_keys`` names.
+        fixed_img_tokens: places for each picture.
+        system_prompt: the system's words; none with an empty text.
+        task_pos: ``after_images`` or ``before_images``.
+        padding_side: ``left`` or ``right``.
+
+    Raises:
+        ConfigError: as ``ProcessPrompts``; ``<IMG_CONTEXT>`` is no token of the tokenizer; samples
+            have another number of pictures, or an instruction holds ``<IMG_CONTEXT>`` itself.
+    """
+
+    keeps_images = True
+
+    def __init__(
+        self,
+        tokenizer: Mapping[str, Any] | Any,
+        max_len: int = 900,
+        num_images: int = 3,
+        fixed_img_tokens: int = 256,
+        system_prompt: str = "You are a helpful assistant.",
+        task_pos: str = "after_images",
+        padding_side: str = "left",
+    ) -> None:
+        super().__init__(tokenizer, max_len)
+        for name, value, known in (
+            ("task_pos", task_pos, ("after_images", "before_images")),
+            ("padding_side", padding_side, ("left", "right")),
+        ):
+            if value not in known:
+                raise ConfigError(f"{self._who}: {name} {value!r} is none of {', '.join(known)}")
+        if num_images < 1 or fixed_img_tokens < 1:
+            raise ConfigError(
+                f"{self._who}: num_images {num_images} and fixed_img_tokens {fixed_img_tokens} "
+                "must be at least 1"
+            )
+        self.num_images = num_images
+        self.fixed_img_tokens = fixed_img_tokens
+        self.system_prompt = system_prompt
+        self.task_pos = task_pos
+        self.padding_side = padding_side
+        self._place = self._find_place()
+
+    def __call__(self, sample: Sample) -> Sample:
+        seen = len(sample.get("img_masks", ()))
+        if seen not in (0, self.num_images):
+            raise ConfigError(
+                f"{self._who}: num_images is {self.num_images}, the sample has {seen} pictures",
+                next="set num_images to the number of img_keys",
+            )
+        return super().__call__(sample)
+
+    def _encode(self, text: str) -> Sequence[int]:
+        ids = super()._encode(self._chat(text))
+        found, expected = list(ids).count(self._place), self.num_images * self.fixed_img_tokens
+        if found != expected:
+            raise ConfigError(
+                f"{self._who}: the chat around the instruction {text!r} has {found} places for "
+                f"pictures, {expected} expected",
+                cause=f"the instruction itself holds {_PLACE}",
+            )
+        return ids
+
+    def _chat(self, text: str) -> str:
+        pictures = "".join(
+            f"<image {i}><img>{_PLACE * self.fixed_img_tokens}</img>"
+            for i in range(1, self.num_images + 1)
+        )
+        first = self.task_pos == "before_images"
+        content = f"{text}\n{pictures}" if first else f"{pictures}{text}"
+        system = _turn("system", self.system_prompt) if self.system_prompt else ""
+        return f"{system}{_turn('user', content)}<|im_start|>assistant\n"
+
+    def _find_place(self) -> int:
+        """The token that is the placeholder of an image's part."""
+        encode = self.tokenizer.encode
+        added = Counter(encode(_PLACE * 2)) - Counter(encode(_PLACE))
+        if list(added.values()) != [1]:
+            raise ConfigError(
+                f"{self._who}: {_PLACE} is no token of this tokenizer, it is cut into several",
+                cause="the tokenizer is not the one of the model that sees pictures",
+            )
+        return int(next(iter(added)))
+
+    def _counted(self) -> str:
+        return f" with {self.num_images} x {self.fixed_img_tokens} places for pictures"
+
+
+_PLACE = "<IMG_CONTEXT>"
+
+
+def _turn(role: str, content: str) -> str:
+    return f"<|im_start|>{role}\n{content}<|im_end|>\n"

@@ -1,0 +1,214 @@
+"""The formula of normalisation, one for both directions, and dimensions that hardly move.
+
+A value ``x`` becomes ``(x - offset) / scale``. ``relative`` in a statistics entry marks dimensions
+that are counted from the present state; they are shifted by it before and after.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import ConfigError
+
+Floats = npt.NDArray[np.float64]
+_RANGES = {"quantile": ("q01", "q99"), "min_max": ("min", "max")}
+NORM_TYPES = ("mean_std", *_RANGES, "none")
+EPS = 1e-6
+LARGEST_RANGE = 200.0
+"""A dimension's range after scaling is ordinarily smaller: 2 by ``min_max``, some 20 by a
+``quantile`` or standard deviation if it moves now and then."""
+SMALLEST_SCALE = 1e-4
+"""If a state is divided by less, an error of 0.01 in a reading becomes more than 100."""
+
+
+@dataclass(frozen=True)
+class Affine:
+    """Offset and scale, each ``(D,)`` or ``(T, D)``; ``relative`` is ``(D,)`` of 0 and 1."""
+
+    offset: Floats
+    scale: Floats
+    relative: Floats | None = None
+
+    @property
+    def dim(self) -> int:
+        return int(self.offset.shape[-1])
+
+    def forward(self, values: npt.ArrayLike, state: npt.ArrayLike | None = None) -> Floats:
+        """Physical ``(..., D)`` -> normalised ``(..., D)``, in float64."""
+        return (np.asarray(values, np.float64) - self._base(state) - self.offset) / self.scale
+
+    def inverse(self, values: npt.ArrayLike, state: npt.ArrayLike | None = None) -> Floats:
+        """Normalised ``(..., D)`` -> physical ``(..., D)``, in float64."""
+        return np.asarray(values, np.float64) * self.scale + self.offset + self._base(state)
+
+    def _base(self, state: npt.ArrayLike | None) -> Floats | float:
+        if self.relative is None:
+            return 0.0
+        if state is None:
+            raise ConfigError(
+                "these actions are counted from the present state, and no state was given",
+                next="pass the state in physical units as data['states']",
+            )
+        base: Floats = np.asarray(state, np.float64).reshape(-1)[: self.dim] * self.relative
+        return base
+
+
+def check_norm_type(norm_type: str, who: str) -> None:
+    """Check a ``norm_type``.
+
+    Raises:
+        ConfigError: it is unknown; lists the known ones and suggests the nearest.
+    """
+    if norm_type in NORM_TYPES:
+        return
+    near = difflib.get_close_matches(str(norm_type), NORM_TYPES, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ConfigError(
+        f"{who}: norm_type {norm_type!r} is none of {', '.join(NORM_TYPES)}{hint}",
+        cause="state_key and action_key select the statistics, norm_type the formula",
+    )
+
+
+def make_affine(
+    stats: Mapping[str, Any],
+    norm_type: str,
+    who: str,
+    std_floor: float = 0.0,
+    norm_mask: Sequence[bool] | None = None,
+) -> Affine:
+    """Compute offset and scale from one statistics entry.
+
+    Args:
+        stats: ``mean``, ``std``, ``min``, ``max``, ``q01``, ``q99``: ``(D,)`` or ``(T, D)``;
+            optionally ``relative`` ``(D,)``.
+        norm_type: ``mean_std``: (x - mean) / (std + 1e-6); ``quantile`` and ``min_max``:
+            2 (x - low) / (high - low + 1e-6) - 1; ``none``: x.
+        std_floor: no dimension is divided by less than this, in the data's units: a joint that
+            hardly moved in the demonstrations otherwise turns noise into huge values.
+        norm_mask: ``(D,)``; False leaves a dimension as it is.
+
+    Raises:
+        ConfigError: a statistic is missing, or the mask has another length.
+    """
+    mean = _entry(stats, "mean", who)
+    used = ("std",) if norm_type == "mean_std" else _RANGES.get(norm_type, ())
+    for name in used:
+        shape = _entry(stats, name, who).shape
+        if shape != mean.shape:
+            raise ConfigError(
+                f"{who}: {name!r} of the statistics has shape {shape}, 'mean' {mean.shape}"
+            )
+    if norm_type == "none":
+        offset, scale = np.zeros_like(mean), np.ones_like(mean)
+    elif norm_type == "mean_std":
+        offset, scale = mean, np.maximum(_entry(stats, "std", who), std_floor) + EPS
+    else:
+        low, high = (_entry(stats, name, who) for name in _RANGES[norm_type])
+        scale = np.maximum((high - low + EPS) / 2, std_floor)
+        offset = _center(low, high, scale)
+    if norm_mask is not None:
+        mask = np.asarray(norm_mask, bool)
+        if mask.shape != offset.shape[-1:]:
+            raise ConfigError(
+                f"{who}: action_norm_mask has {mask.size} entries, "
+                f"the statistics have {offset.shape[-1]}"
+            )
+        offset, scale = np.where(mask, offset, 0.0), np.where(mask, scale, 1.0)
+    if stats.get("relative") is None:
+        return Affine(offset, scale)
+    relative = _numbers(stats["relative"], "relative", who)
+    if relative.shape != offset.shape[-1:]:
+        raise ConfigError(
+            f"{who}: 'relative' of the statistics has shape {relative.shape}, "
+            f"there are {offset.shape[-1]} dimensions"
+        )
+    return Affine(offset, scale, relative)
+
+
+@dataclass(frozen=True)
+class IdleDimension:
+    """A dimension that hardly moves: ``spread`` is its max - min, ``scale`` what it is divided by.
+
+    ``blown_up``: its small moves in the data become huge, not only a robot's readings.
+    ``rare``: it moves in under 2 % of the frames, so that its q01 and q99 are equal.
+    """
+
+    name: str
+    spread: float
+    scale: float
+    blown_up: bool
+    rare: bool
+
+    def __str__(self) -> str:
+        return f"{self.name} (range {self.spread:.2g}, divided by {self.scale:.2g})"
+
+
+def find_idle_dimensions(
+    what: str,
+    stats: Mapping[str, Any],
+    scale: Floats,
+    names: Sequence[str],
+    mask: Sequence[bool] | None = None,
+) -> Iterator[IdleDimension]:
+    """Dimensions that hardly move, by one statistics entry; of several steps the worst one counts.
+
+    Args:
+        what: put before the names.
+        scale: what is divided by, as wide as the statistics.
+        names: of the dimensions; their numbers are used where there are none.
+        mask: ``(D,)``; False where nothing is divided.
+    """
+    if not {"min", "max", "q01", "q99"} <= set(stats):
+        return
+    low, high, q01, q99 = (np.atleast_2d(stats[k]) for k in ("min", "max", "q01", "q99"))
+    spread, scale = high - low, np.atleast_2d(scale)
+    rare = (q01 == q99) & (spread > 0)
+    for d in range(spread.shape[1]):
+        reach = spread[:, d] / scale[:, d]
+        blown_up = bool(reach.max() > LARGEST_RANGE)
+        step = int(reach.argmax() if blown_up else scale[:, d].argmin())
+        used = mask is None or mask[d]
+        if used and (blown_up or scale[step, d] < SMALLEST_SCALE):
+            name = f"{what} {names[d] if names else d}"
+            yield IdleDimension(
+                name, spread[step, d], scale[step, d], blown_up, bool(rare[step, d])
+            )
+
+
+def _center(low: Floats, high: Floats, scale: Floats) -> Floats:
+    """``low`` maps to -1 unless the floor widened the range; then its middle maps to 0."""
+    widened = scale > (high - low + EPS) / 2
+    return np.where(widened, (low + high) / 2, low + scale)
+
+
+def _entry(stats: Mapping[str, Any], name: str, who: str) -> Floats:
+    if name not in stats:
+        raise ConfigError(
+            f"{who}: the statistics have no {name!r}; they have {', '.join(sorted(stats))}"
+        )
+    return _numbers(stats[name], name, who)
+
+
+def _numbers(value: Any, name: str, who: str) -> Floats:
+    """``(D,)`` or ``(T, D)`` finite numbers, as the statistics of a file may not be.
+
+    Raises:
+        ConfigError: it is anything else.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    plain = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+    if not plain or array.ndim not in (1, 2) or not array.size or not np.isfinite(array).all():
+        raise ConfigError(
+            f"{who}: {name!r} of the statistics is no list of finite numbers, one a dimension, "
+            "nor of such lists, one a step"
+        )
+    return array.astype(np.float64)

@@ -1,0 +1,171 @@
+"""What results come from beside their settings: code, versions, machine, commit and date.
+
+An episode's outcome follows from its key, the evaluation's settings, the code that ran it and the
+libraries below. The last two are a ``Code``: every episode log holds the one that its episodes are
+from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.plugins import _metadata
+from fluxvla_core.plugins.files import plugin_files
+
+SOURCES = (".py", ".xml")
+WITHOUT_INFLUENCE = ("cli", "testing")
+"""Rooms of the core that no episode passes through."""
+DEPTH = 2
+"""A plugin requires a simulator, which requires a physics engine. What these require, in turn, are
+hundreds of tools that no outcome follows from."""
+
+
+@dataclass(frozen=True)
+class Code:
+    """What ran.
+
+    Args:
+        versions: distribution -> version: the core, the plugins that provide what a config names,
+            and what these compute with.
+        hash: of the sources of the core, those plugins and the ``fluxvla-`` distributions that
+            they require, and of ``--plugin`` files.
+    """
+
+    versions: Mapping[str, str]
+    hash: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return asdict(self)
+
+
+def code_of(tables: Iterable[Any], simulators: Iterable[str], computes: Iterable[str]) -> Code:
+    """The code that what ``tables`` name by ``type`` runs.
+
+    Args:
+        tables: of a config, or of a checkpoint's.
+        simulators: distributions that are used beside what the plugins require.
+        computes: the same, without what these require.
+    """
+    names = {name for table in tables for name in _types(table)}
+    used = [
+        plugin
+        for (_, name), providers in _metadata.index().plugins.items()
+        for plugin in providers
+        if name in names
+    ]
+    own = {plugin.dist for plugin in used} - {_metadata.CORE}
+    versions = {
+        **_metadata.with_required(own, DEPTH, extras=True),
+        **_metadata.with_required(simulators, DEPTH),
+        **_metadata.with_required([_metadata.CORE, "numpy", *computes], 0),
+    }
+    packages = {plugin.module.partition(".")[0] for plugin in used}
+    # What these share with others (fluxvla-mujoco) is their code, too.
+    packages |= {name.replace("-", "_") for name in versions if name.startswith("fluxvla-")}
+    return Code(dict(sorted(versions.items())), _hash(sorted(packages)))
+
+
+def differences(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> list[str]:
+    """What is another in ``now``, in words; both as :meth:`Code.to_dict` gives them."""
+    if before is None:
+        return ["the code is not known: a former version of FluxVLA kept these episodes"]
+    old, new = before.get("versions", {}), now["versions"]
+    lines = [
+        f"{name} {old.get(name, 'not there')} -> {new.get(name, 'not there')}"
+        for name in sorted({*old, *new})
+        if old.get(name) != new.get(name)
+    ]
+    if before.get("hash") != now["hash"]:
+        lines.append(f"source code {before.get('hash')} -> {now['hash']}")
+    return lines
+
+
+def provenance(code: Code) -> dict[str, Any]:
+    """``date`` (UTC), ``commit``, ``versions``, ``code`` and ``machine``, as JSON values."""
+    return {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": commit(Path(__file__).parent),
+        "versions": dict(code.versions),
+        "code": code.hash,
+        "machine": machine(),
+    }
+
+
+def commit(folder: Path) -> str | None:
+    """Of the git checkout that ``folder`` is tracked in, with ``+changes`` where files were
+    changed since; None where there is none, or no git."""
+    if _git(folder, "ls-files", "--error-unmatch", ".") is None:
+        return None  # an environment within somebody else's repository
+    head = _git(folder, "rev-parse", "HEAD")
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return f"{head}+changes" if head and changed else head
+
+
+def machine() -> str:
+    """``x86_64, 2 CPUs (their name), Linux 6.1``."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    cpus = f"{os.cpu_count()} CPUs" + (f" ({names[0]})" if names else "")
+    return f"{platform.machine()}, {cpus}, {platform.system()} {platform.release()}"
+
+
+def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How the pictures of ``records`` were drawn: ``sizes`` (camera -> height, width), and ``by``
+    (GL backend and renderer), which has several entries where machines differ."""
+    pictures = [record["pictures"] for record in records if record.get("pictures")]
+    return {
+        "sizes": {name: size for each in pictures for name, size in each["sizes"].items()},
+        "by": sorted({each["by"] for each in pictures if each["by"]}),
+    }
+
+
+def _types(table: Any) -> Iterator[str]:
+    if isinstance(table, Mapping):
+        if isinstance(table.get("type"), str):
+            yield table["type"].rpartition(":")[2]
+        table = list(table.values())
+    if isinstance(table, (list, tuple)):
+        for value in table:
+            yield from _types(value)
+
+
+def _hash(packages: Iterable[str]) -> str:
+    digest = hashlib.sha256()
+    for package in packages:
+        spec = find_spec(package)
+        for root in (spec.submodule_search_locations or []) if spec is not None else []:
+            for path in sorted(Path(root).rglob("*")):
+                inner = path.relative_to(root)
+                skipped = package == "fluxvla_core" and inner.parts[0] in WITHOUT_INFLUENCE
+                if path.suffix in SOURCES and not skipped:
+                    digest.update(f"{package}/{inner.as_posix()}\0".encode())
+                    digest.update(path.read_bytes())
+    for file in plugin_files():
+        digest.update(f"{Path(file).name}\0".encode() + Path(file).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    """What git says; None where it fails."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *words],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,1 +1,0 @@
-"""Policies on robots: loading one, and running it."""

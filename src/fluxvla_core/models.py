@@ -1,0 +1,38 @@
+"""Models and policies: what a model family is written with, and how a trained policy is loaded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fluxvla_core import _lazy
+
+if TYPE_CHECKING:
+    from fluxvla_core.build import build_head_from_cfg as build_head_from_cfg
+    from fluxvla_core.build import build_llm_backbone_from_cfg as build_llm_backbone_from_cfg
+    from fluxvla_core.build import build_projector_from_cfg as build_projector_from_cfg
+    from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
+    from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
+    from fluxvla_core.contracts.frame import Observation as Observation
+    from fluxvla_core.contracts.policy import Policy as Policy
+    from fluxvla_core.contracts.training import VLA as VLA
+    from fluxvla_core.data.pretrained import model_folder as model_folder
+    from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
+    from fluxvla_core.robot.local_policy import load_policy as load_policy
+
+__getattr__, __dir__, __all__ = _lazy.attach(
+    __name__,
+    {
+        "fluxvla_core.build": [
+            "build_head_from_cfg",
+            "build_llm_backbone_from_cfg",
+            "build_projector_from_cfg",
+            "build_vision_backbone_from_cfg",
+            "build_vlm_backbone_from_cfg",
+        ],
+        "fluxvla_core.contracts.frame": ["Observation"],
+        "fluxvla_core.contracts.policy": ["Policy"],
+        "fluxvla_core.contracts.training": ["VLA"],
+        "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
+        "fluxvla_core.robot.local_policy": ["load_policy"],
+    },
+)

@@ -1,0 +1,68 @@
+"""Names that first-party distributions provide, so that a missing one can be named with its
+pip command. Shipped with the core and never built from what a user typed: suggesting
+``pip install fluxvla-<typo>`` would invite typosquatters. A test compares it with the
+distributions' own pyproject files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "fluxvla-aloha": {
+        "action_filters": ("AlohaWorkspaceBox",),
+        "operators": ("AlohaOperator",),
+        "runners": ("AlohaInferenceRunner", "AlohaRTCInferenceRunner"),
+    },
+    "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
+    "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
+    "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
+    "fluxvla-libero": {
+        "environments": ("LiberoEnvironment",),
+        "policies": ("LiberoExpert",),
+        "runners": ("LiberoEvalRunner", "LiberoInferenceRunner"),
+    },
+    "fluxvla-metaworld": {
+        "environments": ("MetaWorldEnvironment",),
+        "policies": ("MetaWorldExpert",),
+    },
+    "fluxvla-models": {
+        "heads": ("FlowMatchingHead",),
+        "llm_backbones": ("SentenceEncoder",),
+        "projectors": ("FiLMProjector",),
+        "vision_backbones": ("ConvEncoder",),
+        "vlas": ("CompactVLA",),
+    },
+    "fluxvla-report": {"commands": ("report",)},
+    "fluxvla-sim": {
+        "commands": ("collect", "sim"),
+        "environments": ("AlohaSimEnvironment", "URSimEnvironment"),
+        "operators": (
+            "AlohaSimOperator",
+            "AlohaSimROSOperator",
+            "URSimOperator",
+            "URSimROSOperator",
+        ),
+        "policies": ("SimExpert",),
+        "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
+    },
+    "fluxvla-ur": {
+        "action_filters": ("URWorkspaceBox",),
+        "operators": ("UROperator", "URRTDEOperator"),
+        "runners": ("URInferenceRunner",),
+    },
+}
+
+
+def owner(registry: str, name: str) -> str | None:
+    """The first-party distribution that provides ``name`` in ``registry``, if one does."""
+    for dist, provided in FIRST_PARTY.items():
+        if name in provided.get(registry, ()):
+            return dist
+    return None
+
+
+def names(registry: str) -> list[str]:
+    """Every first-party name of ``registry``, installed or not."""
+    return sorted(n for provided in FIRST_PARTY.values() for n in provided.get(registry, ()))

@@ -1,1 +1,0 @@
-"""Tokenizers, and where pretrained files are found."""

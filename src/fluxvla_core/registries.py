@@ -1,0 +1,90 @@
+"""The table of registries: every kind of class that a plugin may provide.
+
+Everything else follows from it: the entry-point groups (``fluxvla.runners``), the registries
+(``RUNNERS``), the build functions (``build_runner_from_cfg``), the contract that a class is checked
+against, the versions of the contracts, and what ``fluxvla_core`` exports. A new registry is one
+line here.
+
+It imports nothing: ``import fluxvla_core`` and the scan of installed packages read it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+PREFIX = "fluxvla."
+"""Of every entry-point group."""
+
+_ROBOT = "fluxvla_core.contracts.robot"
+_POLICY = "fluxvla_core.contracts.policy"
+_TRAINING = "fluxvla_core.contracts.training"
+_ENVIRONMENT = "fluxvla_core.contracts.environment"
+_RUNNER = "fluxvla_core.contracts.runner"
+
+
+class RegistryRow(NamedTuple):
+    """What there is to know of one registry.
+
+    Args:
+        name: in messages and code; the entry-point group is ``fluxvla.<name>``.
+        kind: one of its classes, in the name of its build function; None builds none.
+        contract: ``module:class`` of the base class whose methods are the contract; None for
+            classes that only the plugin that builds them calls.
+        about: what its classes are, for people.
+        api: version of the contract that this core speaks. A class declares ``api = "1.0"``: the
+            same major and no newer minor is accepted.
+    """
+
+    name: str
+    kind: str | None
+    contract: str | None
+    about: str
+    api: str = "1.0"
+
+    @property
+    def group(self) -> str:
+        """The entry-point group."""
+        return PREFIX + self.name
+
+    @property
+    def constant(self) -> str:
+        """The registry's own name in code: ``RUNNERS``."""
+        return self.name.upper()
+
+    @property
+    def builder(self) -> str | None:
+        """The build function's name: ``build_runner_from_cfg``."""
+        return self.kind and f"build_{self.kind}_from_cfg"
+
+
+ROWS = (
+    RegistryRow("runners", "runner", f"{_RUNNER}:Runner", "runner: what a section runs"),
+    RegistryRow("operators", "operator", f"{_ROBOT}:Operator", "operator: a robot"),
+    RegistryRow("vlas", "vla", f"{_TRAINING}:VLA", "VLA model"),
+    RegistryRow("vision_backbones", "vision_backbone", None, "part of a model"),
+    RegistryRow("llm_backbones", "llm_backbone", None, "part of a model"),
+    RegistryRow("vlm_backbones", "vlm_backbone", None, "part of a model"),
+    RegistryRow("projectors", "projector", None, "part of a model"),
+    RegistryRow("heads", "head", None, "part of a model"),
+    RegistryRow("datasets", "dataset", f"{_TRAINING}:Dataset", "dataset"),
+    RegistryRow("transforms", "transform", f"{_TRAINING}:Transform", "transform: changes a sample"),
+    RegistryRow("collators", "collator", f"{_TRAINING}:Collator", "collator: samples to a batch"),
+    RegistryRow("tokenizers", "tokenizer", f"{_TRAINING}:Tokenizer", "tokenizer"),
+    RegistryRow("processors", "processor", None, "processor"),
+    RegistryRow("metrics", "metric", f"{_TRAINING}:Metric", "metric: logs training steps"),
+    RegistryRow("optimizers", "optimizer", f"{_TRAINING}:Optimizer", "optimizer"),
+    RegistryRow("action_filters", "action_filter", f"{_ROBOT}:ActionFilter", "action filter"),
+    RegistryRow("hooks", None, f"{_RUNNER}:Hook", "hook: observes a run"),
+    RegistryRow(
+        "environments",
+        "environment",
+        f"{_ENVIRONMENT}:Environment",
+        "environment: a simulator",
+    ),
+    RegistryRow("policies", "policy", f"{_POLICY}:Policy", "policy"),
+    RegistryRow("commands", None, f"{_RUNNER}:Command", "command of the CLI"),
+)
+
+BY_NAME = {row.name: row for row in ROWS}
+REGISTRIES = tuple(BY_NAME)
+GROUPS = tuple(row.group for row in ROWS)

@@ -1,0 +1,1 @@
+"""Policies on robots: the episode engine, its safety, and recordings of what happened."""

@@ -1,0 +1,179 @@
+"""Clocks, and the control rate: the monotonic clock for robots, a stepped one for simulations.
+
+What a clock must offer is ``contracts.Clock``: ``now()`` and ``sleep_until(deadline)``. A simulated
+operator that steps its physics in ``send_action`` has a clock of its own as attribute ``clock``.
+Its time stands still while a policy thinks and passes with each command, so that an episode is
+the same on every machine; the loop then runs in lockstep with it. ``SimulatedClock`` is one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from fluxvla_core.contracts.robot import Clock
+from fluxvla_core.robot import priority
+
+
+class MonotonicClock:
+    """Real time; wall-clock adjustments do not touch it."""
+
+    lockstep = False
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def sleep_until(self, deadline: float) -> None:
+        left = deadline - time.monotonic()
+        if left > 0:
+            time.sleep(left)
+
+
+class SimulatedClock:
+    """Time that passes only by ``advance``, which the operator calls once for each command."""
+
+    lockstep = True
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        return self._now
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass.
+
+        Raises:
+            ValueError: it would run backwards.
+        """
+        if not seconds >= 0:
+            raise ValueError(f"time does not run backwards: {seconds}")
+        self._now += seconds
+
+    def sleep_until(self, deadline: float) -> None:
+        """Return at once: waiting for time that only the next command makes would never end."""
+
+
+def clock_of(operator: object) -> Clock:
+    """The operator's own clock, or the monotonic one."""
+    clock: Clock | None = getattr(operator, "clock", None)
+    return clock if clock is not None else MonotonicClock()
+
+
+def in_lockstep(clock: Clock) -> bool:
+    """Whether time stands still between commands: what a clock of one's own means by default."""
+    own = not isinstance(clock, MonotonicClock)
+    return bool(getattr(clock, "lockstep", own))
+
+
+class Rate:
+    """``sleep()`` returns at the next deadline; deadlines are ``1 / hz`` apart.
+
+    Deadlines that were missed are skipped, never made up for: two commands sent at once would ask
+    the arm for a jump. Two ticks are at least half a period apart, however late the first one was.
+
+    What a command is made of takes a while, and not always the same. So ``sleep`` may return
+    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself; in
+    real time no other thread of the interpreter comes between.
+
+    In a lockstep simulation both return at once.
+
+    Args:
+        hz: ticks a second.
+        clock: whose time counts; the monotonic clock by default.
+        lead_s: how long before each deadline ``sleep`` returns, less than a period.
+        on_tick: called at each tick, after the wait; what it raises leaves ``sleep``. The runner
+            supervises there, so that a loop of one's own around ``rate.sleep()`` is supervised too.
+
+    ``ticks`` were had and ``skipped`` were not; ``late_s`` tells how late the last one was, or,
+    once ``wait`` was called, what was sent at the last deadline.
+    """
+
+    def __init__(
+        self,
+        hz: float,
+        clock: Clock | None = None,
+        on_tick: Callable[[], None] | None = None,
+        lead_s: float = 0.0,
+    ) -> None:
+        if not hz > 0:
+            raise ValueError(f"a rate must be positive, got {hz} Hz")
+        self.hz = hz
+        self.period = 1.0 / hz
+        self.clock: Clock = clock or MonotonicClock()
+        if not 0.0 <= lead_s < self.period:
+            raise ValueError(f"a lead must be shorter than a period, got {lead_s} s at {hz} Hz")
+        self.on_tick = on_tick
+        self.lead_s = lead_s
+        self._lockstep = in_lockstep(self.clock)
+        self._keeps = lead_s > 0.0 and type(self.clock) is MonotonicClock
+        self.ticks = 0
+        self.skipped = 0
+        self.late_s = 0.0
+        # Of the next return of ``sleep``, and of the next ``wait``.
+        self._deadline: float | None = None
+        self._due: float | None = None
+        self._woke: float | None = None
+        self._waits = False
+
+    def reset(self) -> None:
+        """Begin anew: the next deadline is one period from the next ``sleep``'s call."""
+        self._deadline = self._due = self._woke = None
+
+    def sleep(self) -> float:
+        """Wait for the next deadline.
+
+        Returns:
+            How late this returns, in seconds; 0 in a lockstep simulation.
+        """
+        if self._lockstep:
+            # Time passed with the command; waiting for more of it would let the robot live on.
+            self._tick()
+            return 0.0
+        now = self.clock.now()
+        # The first call comes right after the first command: the deadline is a period later.
+        first = now + self.period - self.lead_s
+        deadline = first if self._deadline is None else self._deadline
+        # Deadlines that are over, but for the last of them, and those too near to a late tick.
+        over = int(max(0.0, now - deadline) / self.period)
+        near = 0
+        if self._woke is not None:
+            near = math.ceil((self._woke + self.period / 2 - deadline) / self.period - 1e-6)
+        missed = max(over, near, 0)
+        self.skipped += missed
+        deadline += missed * self.period
+        if self._keeps:
+            priority.share()
+        self.clock.sleep_until(deadline)
+        if self._keeps:
+            priority.keep()
+        self._woke = self.clock.now()
+        late = max(0.0, self._woke - deadline)
+        if not self._waits:
+            self.late_s = late
+        self._due = deadline + self.lead_s
+        self._deadline = deadline + self.period
+        self._tick()
+        return late
+
+    def wait(self) -> float:
+        """Wait for the deadline that the last ``sleep`` returned ahead of; nothing before any.
+
+        Returns:
+            How late this returns, in seconds; 0 in a lockstep simulation.
+        """
+        self._waits = True
+        self.late_s = 0.0
+        if self._due is not None:
+            if self._keeps:
+                priority.wait_until(self._due)
+            else:
+                self.clock.sleep_until(self._due)
+            self.late_s = max(0.0, self.clock.now() - self._due)
+        return self.late_s
+
+    def _tick(self) -> None:
+        self.ticks += 1
+        if self.on_tick is not None:
+            self.on_tick()

@@ -1,0 +1,346 @@
+"""The one path from a target to a command that is sent: filters, limits, latch, control tick.
+
+``CommandFormer`` forms commands, for a robot and for a stepped environment alike;
+``CommandSender`` sends them on a robot at its control rate.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.robot.clock import Rate
+from fluxvla_core.robot.limits import Clamp, CommandLimiter, PassThrough
+from fluxvla_core.robot.stops import BadCommand, Latch
+from fluxvla_core.robot.tracking import TrackingWatch
+from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+
+Array = npt.NDArray[np.float64]
+Filter = Callable[[Array], Array]
+Execute = Callable[[Array, Rate], None]
+# How long an arm is led to where it is held, at most. No arm's limits are as low as that.
+_LEAD_S = 3.0
+_THERE = 1e-9  # from a pose that is moved to, in the joints' units
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One command that was sent: ``(D,)`` target as it was planned, and command as it was sent.
+
+    ``held``: there was no target, so the arm brakes or stays.
+    """
+
+    target: Array
+    command: Array
+    clamps: tuple[Clamp, ...]
+    held: bool = False
+
+
+class CommandFormer:
+    """Makes commands of targets: the filters in their order, then the limits, always last.
+
+    Args:
+        limiter: of the robot, or ``PassThrough`` where actions are no joint targets.
+        filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
+    """
+
+    def __init__(
+        self, limiter: CommandLimiter | PassThrough, filters: Sequence[Filter] = ()
+    ) -> None:
+        self._limiter = limiter
+        self._filters = tuple(filters)
+
+    def form(self, targets: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[list[Clamp]]]:
+        """``(N, D)`` commands of ``(N, D)`` targets, and what of each was clamped.
+
+        Raises:
+            BadCommand: a target is not finite or of another shape.
+        """
+        return self.limited(self.filtered(targets), speed)
+
+    def filtered(self, targets: npt.ArrayLike) -> Array:
+        """``(N, D)`` targets after the filters.
+
+        Raises:
+            BadCommand: a filter made an action of another shape.
+        """
+        return np.array([self._filter(row) for row in np.asarray(targets, dtype=np.float64)])
+
+    def limited(
+        self, targets: npt.ArrayLike, speed: float = 1.0
+    ) -> tuple[Array, list[list[Clamp]]]:
+        """``(N, D)`` filtered targets within the limits; ``speed`` as ``CommandLimiter`` has it."""
+        return self._limiter.run(targets, speed)
+
+    def _filter(self, row: Array) -> Array:
+        embodiment = self._limiter.embodiment
+        for apply in self._filters:
+            row = np.asarray(apply(row.copy()), dtype=np.float64)
+            if row.shape != (embodiment.dim,):
+                raise BadCommand(
+                    f"action filter {type(apply).__name__} made an action of shape {row.shape}; "
+                    f"{embodiment.name} takes ({embodiment.dim},)"
+                )
+        return row
+
+
+class CommandSender:
+    """Plays targets on a robot; nothing else in a run sends commands.
+
+    A ``CommandFormer`` makes commands of targets. They are handed to ``execute`` (a runner's
+    ``_execute_actions``), which sends each and waits with ``rate.sleep()``; at that tick
+    ``on_sent`` is called with the command.
+
+    Args:
+        execute: called with ``(N, D)`` commands and the rate.
+        rate: its ``on_tick`` is taken over.
+        limiter: started before anything is played.
+        latch: while it is tripped only ``brake``, ``stay`` and ``lead`` send.
+        filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
+        on_sent: called at each tick with what was sent, None for a tick without a command.
+        speed: tells, before each command, the share of the velocity limits that it may use, in
+            (0, 1]: a robot that a person slowed down. None where there is no such thing.
+    """
+
+    def __init__(
+        self,
+        execute: Execute,
+        rate: Rate,
+        limiter: CommandLimiter,
+        latch: Latch,
+        filters: Sequence[Filter] = (),
+        on_sent: Callable[[Sent | None], None] | None = None,
+        speed: Callable[[], float] | None = None,
+    ) -> None:
+        self.rate = rate
+        self.limiter = limiter
+        self.latch = latch
+        self._execute = execute
+        self._former = CommandFormer(limiter, filters)
+        self._on_sent = on_sent or (lambda sent: None)
+        self._speed = speed
+        self._rows: deque[Sent] = deque()
+        # When the arm had the command that ``on_sent`` gets, at the latest; of those that a loop
+        # with ticks of its own plays, when the first was.
+        self.sent_at = 0.0
+        # Commands of a call that were sent, the one that is being sent among them.
+        self._played = 0
+        rate.on_tick = self._tick
+
+    def play(self, targets: npt.ArrayLike, filtered: bool = True, most: float = 1.0) -> None:
+        """Send one command for each row of ``(N, D)`` targets.
+
+        Args:
+            targets: where to go.
+            filtered: through the filters.
+            most: share of the velocity limits, in (0, 1], that no command goes beyond, however much
+                the robot allows.
+
+        Raises:
+            SafetyStop: the latch is tripped, or a target is not finite or of another shape.
+        """
+        self.latch.check()
+        wanted = np.asarray(targets, dtype=np.float64)
+        shaped = self._former.filtered(wanted) if filtered else wanted
+        if self._speed is None:
+            self._play(wanted, shaped, most)
+            return
+        for row in range(len(wanted)):
+            share = min(self._speed(), most)
+            self._play(wanted[row : row + 1], shaped[row : row + 1], share)
+
+    def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
+        before = self.limiter.snapshot()
+        self._played = 0
+        try:
+            commands, clamps = self._former.limited(shaped, speed)
+            self._send(wanted, commands, clamps)
+        finally:
+            self._rows.clear()
+            if self._played < len(shaped):
+                self.limiter.restore(before)
+                self.limiter.run(shaped[: self._played], speed)
+
+    def move_along(self, way: Array, most: float) -> None:
+        """Move along ``(N, D)`` targets, past the filters, and arrive at the last of them.
+
+        Args:
+            way: within the position limits; of ``ramp``.
+            most: share of the velocity limits, in (0, 1], that no command goes beyond.
+
+        Raises:
+            SafetyStop: the latch is tripped.
+        """
+        self.play(way, filtered=False, most=most)
+        # An arm that a person slowed down is not there yet; let go, it does not make up for it.
+        while len(way) and np.abs(self.limiter.last - way[-1]).max() > _THERE:
+            self.play(way[-1:], filtered=False, most=most)
+
+    def hold(self) -> None:
+        """Send one command of the shortest stop, or the last command again when at rest."""
+        self.latch.check()
+        self._send_brake()
+
+    def brake(self) -> None:
+        """Come to rest; also while the latch is tripped."""
+        for _ in range(self.limiter.longest_stop):
+            if self.limiter.at_rest:
+                return
+            self._send_brake()
+
+    def stay(self) -> None:
+        """Send one command as ``hold`` does; also while the latch is tripped."""
+        self._send_brake()
+
+    def lead(self, goal: Array, most: int) -> None:
+        """Come to rest at the ``(D,)`` goal, or where the limits let it; also while tripped.
+
+        Args:
+            goal: where to.
+            most: commands after which the arm brakes, wherever it is.
+        """
+        reachable = np.clip(goal, self.limiter.lower, self.limiter.upper)
+        share = 1.0 if self._speed is None else self._speed()
+        for _ in range(most):
+            if self.limiter.at_rest and bool((self.limiter.last == reachable).all()):
+                return
+            command = self.limiter.settle(reachable, share)
+            self._send(reachable[None], command[None], [[]], held=True)
+        self.brake()
+
+    def _send_brake(self) -> None:
+        before = self.limiter.last
+        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
+
+    def _send(
+        self,
+        wanted: Array,
+        commands: Array,
+        clamps: Sequence[Sequence[Clamp]],
+        held: bool = False,
+    ) -> None:
+        rows = zip(wanted, commands, clamps, strict=True)
+        self._rows = deque(Sent(t, c, tuple(found), held) for t, c, found in rows)
+        handed = commands.copy()
+        handed.flags.writeable = False
+        ticks, self.sent_at = self.rate.ticks, self.rate.clock.now()
+        self._played = 1
+        self._execute(handed, self.rate)
+        if self.rate.ticks == ticks:
+            # A loop with ticks of its own: what it was given, it has played.
+            self._played = len(commands)
+            while self._rows:
+                self._on_sent(self._rows.popleft())
+        self._played = len(commands) - len(self._rows)
+
+    def _tick(self) -> None:
+        self.sent_at = self.rate.clock.now()
+        self._on_sent(self._rows.popleft() if self._rows else None)
+        self._played += 1
+
+
+def come_to_rest(
+    sender: CommandSender,
+    tracking: TrackingWatch,
+    state: Callable[[], Array | None],
+    blocked: bool,
+    patience_s: float,
+) -> None:
+    """Brake, and hold each joint that was kept from following where it is; also while tripped.
+
+    A joint that does not obey is not braked, which would push on whatever blocks it: its command
+    halts at once and goes back from there to where the joint is.
+
+    Args:
+        sender: of the motion, which has begun.
+        tracking: knows which joints follow.
+        state: reads where the arm is, ``(state_dim,)``; None where that is not known.
+        blocked: whether joints that are too far from their commands do not obey.
+        patience_s: how long a joint that lags may take to come to its last command by itself.
+    """
+    limiter = sender.limiter
+    most = int(_LEAD_S / limiter.period)
+    found = state()
+    found = tracking.seen if found is None else found
+    if not blocked or found is None:
+        sender.brake()
+    else:
+        off = ~tracking.follows(limiter.last, found)
+        limiter.halt(off)
+        sender.lead(np.where(off, tracking.positions(found), limiter.rest()), most)
+    for _ in range(int(patience_s / limiter.period)):
+        found = state()
+        if found is None or tracking.stayed(limiter.last, found).all():
+            return
+        sender.stay()
+    found = state()
+    if found is not None:
+        stayed = tracking.stayed(limiter.last, found)
+        sender.lead(np.where(stayed, limiter.last, tracking.positions(found)), most)
+
+
+def ramp(limiter: CommandLimiter, pose: npt.ArrayLike, speed: float) -> Array:
+    """Targets from where the limiter is to ``pose``: all joints set off and arrive together.
+
+    The way is a straight line in joint space, so that it is the same every time. The share of it
+    that is done is driven like a joint of its own, from 0 to 1, with the speed and acceleration
+    that the joint with the longest way allows; every joint then keeps its limits.
+
+    Args:
+        limiter: started and at rest; it is not changed.
+        pose: ``(D,)`` within the position limits.
+        speed: share of the velocity limits, in (0, 1].
+
+    Returns:
+        ``(N, D)`` targets, the last one ``pose``; ``N`` is 0 when the arm is there.
+
+    Raises:
+        ConfigError: the pose has another shape, is not finite, or is beyond a position limit.
+    """
+    target = check_pose(pose, limiter.embodiment)
+    start = limiter.last
+    way = target - start
+    moving = way != 0.0
+    if not moving.any():
+        return np.empty((0, len(way)))
+    distance = np.abs(way[moving])
+    pace = float(np.min(limiter.velocity[moving] * speed / distance))
+    push = float(np.min(limiter.acceleration[moving] / distance))
+    share = Joint("share", "normalized", 0.0, 1.0, pace, push)
+    driver = CommandLimiter(
+        EmbodimentSpec("way", (share,), (), 1.0 / limiter.period), limiter.period
+    )
+    driver.start([0.0])
+    rows = []
+    done = 0.0
+    while done < 1.0:
+        done = float(driver.step([1.0])[0][0])
+        rows.append(target if done == 1.0 else start + way * done)
+    return np.array(rows)
+
+
+def check_pose(pose: npt.ArrayLike, embodiment: EmbodimentSpec) -> Array:
+    """``pose`` as ``(dim,)`` float64.
+
+    Raises:
+        ConfigError: another shape, not finite, or beyond a position limit.
+    """
+    target = np.asarray(pose, dtype=np.float64)
+    names = embodiment.joint_names
+    if target.shape != (len(names),):
+        raise ConfigError(
+            f"prepare_pose has {target.size} values, {embodiment.name} has {len(names)} joints: "
+            f"{', '.join(names)}"
+        )
+    for joint, value in zip(embodiment.joints, target, strict=True):
+        if not joint.lower <= value <= joint.upper:
+            raise ConfigError(
+                f"prepare_pose puts {joint.name} at {value:g}, outside its limits "
+                f"[{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}"
+            )
+    return target

@@ -1,0 +1,378 @@
+"""One episode on a robot: to the start pose, the control loop, to rest.
+
+Whatever happens in it, it ends in a safe stop: the arm brakes within its limits where it still
+obeys, and the operator's own ``stop`` is called where something went wrong.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.policy import Policy
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.errors import FluxError, RunFailed
+from fluxvla_core.robot.clock import Rate
+from fluxvla_core.robot.commands import CommandSender, Execute, Sent, come_to_rest, ramp
+from fluxvla_core.robot.control_loop import ControlLoop
+from fluxvla_core.robot.delays import MACHINE
+from fluxvla_core.robot.events import (
+    EpisodeEnded,
+    EpisodeObserver,
+    EpisodePrepared,
+    EpisodeStarted,
+    Event,
+    Phase,
+    Stopped,
+    StoppedWhileHeld,
+)
+from fluxvla_core.robot.interrupt import Interrupted, Interrupts
+from fluxvla_core.robot.joining import ChunkJoiner
+from fluxvla_core.robot.limits import CommandLimiter
+from fluxvla_core.robot.observation import Look, ObservationReader
+from fluxvla_core.robot.policy_calls import PolicyCaller, PolicyThread
+from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.safety_settings import SafetySettings
+from fluxvla_core.robot.stops import Latch, Rule, rule_of
+from fluxvla_core.robot.supervision import Supervisor
+from fluxvla_core.robot.tasks import Task
+from fluxvla_core.robot.tracking import TrackingWatch, action_columns
+
+Array = npt.NDArray[np.float64]
+# How long before its deadline a command is made ready, in seconds and as a share of the period.
+_LEAD_S, _LEAD_SHARE = 0.004, 0.2
+# A pause this many times ``max_age_s`` ago, or later, may have made a stream old.
+_RECENT = 2.0
+# After these nobody knows whether commands still arrive: the robot stops by its own means.
+_NOT_BRAKED = (Rule.OPERATOR, Rule.EXECUTE)
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """How an episode is driven.
+
+    Args:
+        cameras: names of those that the policy looks at.
+        rate_hz: commands a second.
+        safety: thresholds of the safety rules.
+        start_pose: ``(D,)``, where the arm goes first; None stays.
+        keyframes: how many of a chunk's keyframes are played; None plays all.
+        latency_s: how long, in a simulation whose time stands still, an answer takes.
+        max_steps: commands after which the episode ends.
+        ready_s: how long the robot may take to give its first reading.
+    """
+
+    cameras: tuple[str, ...]
+    rate_hz: float
+    safety: SafetySettings
+    start_pose: Sequence[float] | None
+    keyframes: int | None
+    latency_s: float
+    max_steps: int
+    ready_s: float
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """What a run drives a robot with, in all of its episodes.
+
+    Args:
+        robot, policy: connected, loaded, and fitting each other.
+        look: makes observations.
+        filters: the config's ``action_filters``.
+        joiner: how chunks become one motion.
+        execute: sends commands: ``(N, D)`` and the rate.
+        latch: an episode does not begin while it is tripped.
+        interrupts: signals that ask the run to end.
+        thread: where the policy thinks.
+        reporter: where progress goes.
+        observers: of every event.
+    """
+
+    robot: Robot
+    policy: Policy
+    look: Look
+    filters: Sequence[ActionFilter]
+    joiner: ChunkJoiner
+    execute: Execute
+    latch: Latch
+    interrupts: Interrupts
+    thread: PolicyThread
+    reporter: Reporter
+    observers: Sequence[EpisodeObserver]
+
+
+class Episode:
+    """Runs once; its observers see what happens.
+
+    Args:
+        equipment: what to run with.
+        settings: how.
+        task: what to do.
+        number: how many episodes the run had before.
+        seed: of the policy.
+        before: ``(D,)`` the last command of the run, None before any.
+        held: whether the arm was held by it since, without a stop.
+
+    Raises:
+        RunFailed: an observer cannot take anything, for example write to its folder.
+        BadFrame: the state does not tell where a commanded joint is.
+    """
+
+    def __init__(
+        self,
+        equipment: Equipment,
+        settings: EpisodeSettings,
+        task: Task,
+        number: int,
+        seed: int,
+        before: Array | None = None,
+        held: bool = False,
+    ) -> None:
+        robot, safety = equipment.robot, settings.safety
+        self._equipment, self._settings = equipment, settings
+        self._robot, self._latch, self._interrupts = robot, equipment.latch, equipment.interrupts
+        self._task, self._number = task, number
+        self._before, self._held = before, held
+        lead_s = min(_LEAD_S, _LEAD_SHARE / settings.rate_hz)
+        self._rate = Rate(settings.rate_hz, robot.clock, lead_s=lead_s)
+        self._limiter = CommandLimiter(
+            robot.embodiment, self._rate.period, safety.velocity_scale, safety.acceleration_scale
+        )
+        self._sender = CommandSender(
+            self._execute, self._rate, self._limiter, equipment.latch, equipment.filters,
+            self._after_tick, robot.speed,
+        )  # fmt: skip
+        self._tracking = TrackingWatch(robot.embodiment, safety)
+        self._supervisor = Supervisor(
+            robot, self._tracking, equipment.interrupts, settings.max_steps, equipment.reporter,
+            self._emit,
+        )  # fmt: skip
+        self._reader = ObservationReader(
+            robot, equipment.look, task.instruction, settings.cameras, safety, settings.ready_s,
+            self._tracking, equipment.thread, equipment.interrupts, self._emit,
+        )  # fmt: skip
+        self._policy = PolicyCaller(equipment.policy, robot.embodiment, safety, robot.delays, seed)
+        self._columns = action_columns(robot.embodiment)
+        self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
+        self._trips = len(equipment.latch.trips)
+        self._executing = False
+        self.stop_failure: str | None = None
+        self._emit(EpisodePrepared(robot.clock.now(), task, seed, settings.rate_hz))
+
+    def run(self) -> None:
+        """The whole episode.
+
+        Raises:
+            Exception: what ended it before its time; the robot is stopped by then.
+            Interrupted: a signal ended it, and the robot is stopped by then; or one came while
+                its record was finished.
+        """
+        interrupts = self._interrupts
+        outcome, problem = "failed", None
+        interrupts.deferred = True
+        try:
+            self._latch.check()
+            self._emit(EpisodeStarted(self._robot.clock.now(), self._task))
+            self._begin()
+            outcome = self._control_loop().run()
+            self._supervisor.phase = Phase.HOLD
+            self._sender.brake()
+            # Signals that come now wait until the record is complete, however many.
+            interrupts.stopping = True
+        except Interrupted as error:
+            outcome, problem = "interrupted", f"stopped by {error.name}"
+            self._stop(Rule.INTERRUPT, problem)
+            raise
+        except BaseException as error:
+            self._note_stall(error)
+            outcome, problem = "failed", _what(error)
+            self._stop(self._rule(error), problem)
+            if isinstance(error, SystemExit):
+                # A hook, a filter or the runner itself: the command would end without a word.
+                raise RunFailed(
+                    f"something in the episode ended the program ({problem}); the robot was stopped"
+                ) from error
+            raise
+        finally:
+            self._end(outcome, problem)
+            self._supervisor.phase = Phase.OVER
+            interrupts.deferred = False
+        interrupts.resume()
+
+    def hold(self) -> None:
+        """Send the last command once more, at the next tick: after an episode that ended well.
+
+        What goes wrong meanwhile trips the latch, and the robot is stopped; it is noted beside the
+        record, which is complete.
+
+        Raises:
+            SafetyStop: the latch was tripped, or the arm does not stay.
+            OperatorError: the robot does not take it, or a stream fell silent.
+        """
+        ticks = self._rate.ticks
+        try:
+            self._sender.hold()
+        except FluxError as error:
+            self._note_stall(error)
+            self._stop_held(error)
+            raise
+        if self._rate.ticks == ticks:
+            # A runner's own sending that has no tick of the rate's.
+            time.sleep(self._rate.period)
+
+    @property
+    def commanded(self) -> Array | None:
+        """``(D,)`` the last command of the run, None before any."""
+        return self._limiter.last if self._limiter.started else self._before
+
+    def _begin(self) -> None:
+        """Read where the arm is, and bring it to the start pose."""
+        settings = self._settings
+        self._robot.begin(self._task.instruction, self._number)
+        reading = self._reader.first()
+        self._limiter.start(self._where(reading.state))
+        self._policy.reset()
+        if settings.start_pose is not None:
+            self._supervisor.phase = Phase.RAMP
+            most = settings.safety.ramp_scale
+            way = ramp(self._limiter, settings.start_pose, most)
+            seconds = len(way) / settings.rate_hz
+            self._equipment.reporter.info(f"moving to the start pose, {seconds:.1f} s")
+            self._sender.move_along(way, most)
+        for each in self._equipment.filters:
+            each.reset(self._limiter.last)
+        self._rate.reset()
+        self._tracking.reset()
+        self._supervisor.phase = Phase.READY
+
+    def _control_loop(self) -> ControlLoop:
+        equipment, settings, policy = self._equipment, self._settings, self._equipment.policy
+        return ControlLoop(
+            robot=self._robot,
+            reader=self._reader,
+            policy=self._policy,
+            joiner=equipment.joiner,
+            sender=self._sender,
+            supervisor=self._supervisor,
+            safety=settings.safety,
+            thread=equipment.thread,
+            interrupts=self._interrupts,
+            emit=self._emit,
+            keyframe_hz=policy.action_rate_hz,
+            horizon=policy.horizon,
+            keyframes=settings.keyframes,
+            latency_s=settings.latency_s,
+            holds=(settings.start_pose is not None or self._held) and not self._robot.lockstep,
+        )
+
+    def _where(self, state: Array) -> Array:
+        """``(D,)`` the command to go on from: the one that holds the arm, else where it is.
+
+        An arm droops; to begin where it droops to would be a jump of its command. A joint that is
+        far from its command was moved, or nobody knows what its stop commanded: that one begins
+        where it is. A gripper is always far, because of what it holds.
+        """
+        measured = self._robot.state()
+        if measured is not None:
+            state = measured.state
+        commanded = self._robot.commanded(self._before)
+        if commanded is None:
+            return state[self._columns]
+        kept = self._grippers
+        if self._held:
+            kept = kept | self._tracking.follows(commanded, state)
+        elif self._robot.tells_hold:
+            kept = kept | self._tracking.stayed(commanded, state)
+        return np.where(kept, commanded, state[self._columns])
+
+    def _execute(self, actions: Array, rate: Rate) -> None:
+        self._executing = True
+        self._equipment.execute(actions, rate)
+        self._executing = False
+
+    def _after_tick(self, sent: Sent | None) -> None:
+        self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
+
+    def _emit(self, event: Event) -> None:
+        for observer in self._equipment.observers:
+            observer.on_event(event)
+
+    def _note_stall(self, error: BaseException) -> None:
+        """Streams look old to a process that stood still: then that is said of them."""
+        if not isinstance(error, FluxError) or self._rule(error) != Rule.FRESHNESS:
+            return
+        recent = time.monotonic() - _RECENT * self._settings.safety.max_age_s
+        seconds = self._robot.delays.stood_still(recent)
+        if seconds > 0.0:
+            error.what += f"; {MACHINE.name} let the program stand still for {seconds:.2f} s"
+            error.cause, error.next = MACHINE.cause, MACHINE.next
+
+    def _rule(self, error: BaseException) -> str:
+        return rule_of(error, Rule.EXECUTE if self._executing else Rule.RUN)
+
+    def _stop(self, rule: str, problem: str) -> None:
+        """The safe stop: brake where the arm still obeys, then the operator's own stop."""
+        robot = self._robot
+        self._interrupts.stopping = True
+        began = robot.clock.now()
+        self._supervisor.phase = Phase.STOP
+        if rule != Rule.INTERRUPT:
+            self._latch.trip(rule, problem)
+        if self._limiter.started and (rule not in _NOT_BRAKED or not robot.can_stop):
+            try:
+                come_to_rest(
+                    self._sender,
+                    self._tracking,
+                    self._state,
+                    blocked=rule == Rule.TRACKING,
+                    patience_s=self._settings.safety.tracking_time_s,
+                )
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the robot's own stop is next
+                self._equipment.reporter.warn(f"braking failed: {_what(error)}")
+        failure = self._stop_robot()
+        now = robot.clock.now()
+        self._emit(Stopped(now, rule, problem, now - began, failure))
+
+    def _state(self) -> Array | None:
+        """Where the robot is now; None where it does not tell, or only plays a recording."""
+        try:
+            measured = self._robot.state() if self._robot.follows else None
+        except FluxError:
+            # A stream that fell silent, or says nonsense, keeps no arm from coming to rest.
+            return None
+        return None if measured is None else measured.state
+
+    def _stop_robot(self) -> str | None:
+        """The operator's own stop; what went wrong with it."""
+        self.stop_failure = failure = self._robot.stop()
+        if failure:
+            self._equipment.reporter.warn(failure)
+        return failure
+
+    def _stop_held(self, error: FluxError) -> None:
+        latch = self._latch
+        if latch.tripped is None:
+            latch.trip(self._rule(error), error)
+        failure = self._stop_robot()
+        self._emit(StoppedWhileHeld(self._robot.clock.now(), latch.trips[-1], failure))
+
+    def _end(self, outcome: str, problem: str | None) -> None:
+        success: bool | None
+        try:
+            success = self._robot.success()
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - why it ended matters more
+            self._equipment.reporter.warn(f"task_success failed: {_what(error)}")
+            success = None
+        trips = tuple(self._latch.trips[self._trips :])
+        now, skipped = self._robot.clock.now(), self._rate.skipped
+        self._emit(EpisodeEnded(now, outcome, success, problem, skipped, trips))
+
+
+def _what(error: BaseException) -> str:
+    return error.what if isinstance(error, FluxError) else f"{type(error).__name__}: {error}"

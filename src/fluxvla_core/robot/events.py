@@ -1,0 +1,191 @@
+"""What happens in an episode, as typed events, and who observes them.
+
+The episode engine emits events and knows nothing of files or plugins: an observer writes the
+record, another calls the plugins' hooks. Observers are called in order, in the thread that emits;
+what one raises ends the episode as any other error does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.hooks import HookCaller
+from fluxvla_core.robot.commands import Sent
+from fluxvla_core.robot.stops import Trip
+from fluxvla_core.robot.tasks import Task
+
+Array = npt.NDArray[np.float64]
+
+
+class Phase(StrEnum):
+    """Where an episode is, as its record has it."""
+
+    START = "start"
+    RAMP = "ramp"
+    READY = "ready"
+    RUN = "run"
+    HOLD = "hold"
+    STOP = "stop"
+    OVER = "over"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was seen at one moment, on the robot's clock.
+
+    Args:
+        observation: as the operator gave it, with the instruction.
+        frame: what it is of, where the operator has frames.
+        state: ``(state_dim,)``.
+        measured: when the state came.
+        at: when the oldest of its streams came.
+        seconds: what it took, by stage.
+    """
+
+    observation: dict[str, Any]
+    frame: Frame | None
+    state: Array
+    measured: float
+    at: float
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Event:
+    """``at``: seconds on the robot's clock."""
+
+    at: float
+
+
+@dataclass(frozen=True)
+class EpisodePrepared(Event):
+    """An episode is about to begin, nothing moves yet; if an observer raises, it does not begin."""
+
+    task: Task
+    seed: int
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class EpisodeStarted(Event):
+    """From here on whatever goes wrong stops the robot."""
+
+    task: Task
+
+
+@dataclass(frozen=True)
+class Observed(Event):
+    """A reading of the robot that passed its checks."""
+
+    reading: Reading
+
+
+@dataclass(frozen=True)
+class Refused(Event):
+    """A ``reading`` or a ``chunk`` (``what``) did not pass its checks; any values."""
+
+    what: str
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ChunkAccepted(Event):
+    """The policy's answer to a reading: ``(T, D)`` keyframes, read-only; and seconds by stage."""
+
+    reading: Reading
+    keyframes: Array
+    stages: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class CommandSent(Event):
+    """One command, with the ``(state_dim,)`` state if it was read at this tick.
+
+    ``send_s`` is what sending took, if it is known, ``late_s`` how late it was.
+    """
+
+    sent: Sent
+    phase: Phase
+    state: Array | None
+    send_s: float | None
+    late_s: float
+
+
+@dataclass(frozen=True)
+class Stopped(Event):
+    """A safe stop took place: why, how long it took, and what went wrong with it."""
+
+    rule: str
+    problem: str
+    seconds: float
+    failure: str | None
+
+
+@dataclass(frozen=True)
+class StoppedWhileHeld(Event):
+    """A stop after the episode, while its last command held the arm; its record is complete."""
+
+    trip: Trip
+    failure: str | None
+
+
+@dataclass(frozen=True)
+class EpisodeEnded(Event):
+    """How it ended. ``problem`` is what ended it before its time; ``skipped`` ticks were missed."""
+
+    outcome: str
+    success: bool | None
+    problem: str | None
+    skipped: int
+    trips: Sequence[Trip]
+
+
+class EpisodeObserver:
+    """Something that is called with every event of an episode."""
+
+    def on_event(self, event: Event) -> None:
+        """Take note of an event; arrays are not to be changed."""
+
+
+class HookObserver(EpisodeObserver):
+    """Calls the plugins' hooks.
+
+    Args:
+        hooks: of the run.
+    """
+
+    def __init__(self, hooks: HookCaller) -> None:
+        self._hooks = hooks
+
+    def on_event(self, event: Event) -> None:
+        if not self._hooks:
+            return
+        match event:
+            case EpisodeStarted():
+                self._hooks.call("episode_started", task=event.task.instruction)
+            case ChunkAccepted():
+                self._hooks.call("observed", observation=_frozen(event.reading.observation))
+                latency = event.stages["policy"]
+                self._hooks.call("inferred", chunk=event.keyframes, latency_s=latency)
+            case CommandSent():
+                action = event.sent.command.copy()
+                action.flags.writeable = False
+                self._hooks.call("action_sent", action=action, stamp=event.at)
+            case EpisodeEnded():
+                self._hooks.call("episode_finished", reason=event.problem or event.outcome)
+
+
+def _frozen(observation: dict[str, Any]) -> dict[str, Any]:
+    """The observation with its arrays read-only: hooks look, they do not touch."""
+    images = {name: image.view() for name, image in observation["images"].items()}
+    shown = {**observation, "qpos": np.asarray(observation["qpos"]).view(), "images": images}
+    for array in (shown["qpos"], *images.values()):
+        array.flags.writeable = False
+    return shown

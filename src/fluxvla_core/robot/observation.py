@@ -1,0 +1,245 @@
+"""Observations of a robot for its policy: complete, fresh, and as the embodiment describes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import wait
+from typing import Any
+
+import numpy as np
+
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.errors import FluxError, NotReady, SpecMismatch
+from fluxvla_core.robot.checks import FreshnessGate, check_frame
+from fluxvla_core.robot.events import Event, Observed, Reading, Refused
+from fluxvla_core.robot.interrupt import Interrupts
+from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.safety_settings import SafetySettings
+from fluxvla_core.robot.stops import BadFrame, BadTiming
+from fluxvla_core.robot.tracking import TrackingWatch
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+_LOOK_S = 0.5  # that a reading may take
+_LONG_S = 0.1  # a reading that takes longer makes its own streams old
+
+
+Look = Callable[[], tuple[dict[str, Any], Frame | None]]
+"""A runner's: makes an observation of the robot's newest frame and, if it can, gives the frame."""
+
+
+class ObservationReader:
+    """Reads what a policy is asked with, and lets nothing through that a policy must not act on.
+
+    Args:
+        robot: connected.
+        look: see ``Look``.
+        instruction: of the task.
+        cameras: names of those that the policy looks at.
+        safety: how old readings may be, and how far their streams may be apart.
+        ready_s: how long the robot may take to give its first reading.
+        tracking: of the episode; each reading is held against the robot's commands.
+        thread: where a robot is read: cameras may be bound to one.
+        interrupts: looked at while waiting.
+        emit: takes the events ``Observed`` and ``Refused``.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        look: Look,
+        instruction: str,
+        cameras: tuple[str, ...],
+        safety: SafetySettings,
+        ready_s: float,
+        tracking: TrackingWatch,
+        thread: PolicyThread,
+        interrupts: Interrupts,
+        emit: Callable[[Event], None],
+    ) -> None:
+        self._robot = robot
+        self._look = look
+        self._instruction = instruction
+        self._cameras = cameras
+        self._ready_s = ready_s
+        self._tracking = tracking
+        self._thread = thread
+        self._interrupts = interrupts
+        self._emit = emit
+        self._gate = FreshnessGate(safety.max_age_s, safety.max_skew_s)
+
+    def first(self) -> Reading:
+        """The first one, for which the robot has ``ready_s``.
+
+        Raises:
+            NotReady: it gave none that is complete and fresh.
+            BadFrame: it is not what the embodiment describes.
+            Interrupted: a signal came meanwhile.
+        """
+        until = time.monotonic() + self._ready_s
+        while True:
+            self._interrupts.check()
+            try:
+                reading = self._checked(*self._first_frame(until), {})
+                break
+            except (NotReady, BadTiming) as error:
+                if time.monotonic() > until:
+                    raise NotReady(
+                        f"the robot gave no complete reading within {self._ready_s:g} s: "
+                        f"{error.what}",
+                        cause=error.cause,
+                        next=error.next,
+                    ) from error
+                time.sleep(0.02)
+        self._emit(Observed(self._robot.clock.now(), reading))
+        return reading
+
+    def read(self) -> Reading:
+        """One more; in the thread that asks the policy.
+
+        Raises:
+            BadFrame: it is not what the embodiment describes, or a stream is gone.
+            BadTiming: it is too old, its streams are too far apart, or one ran backwards.
+            NotFollowing: the arm is not where it is commanded to be.
+        """
+        reading = self._read()
+        if self._robot.follows:
+            self._tracking.check(reading.state, reading.measured)
+        self._emit(Observed(self._robot.clock.now(), reading))
+        return reading
+
+    def _read(self) -> Reading:
+        began = time.perf_counter()
+        observation, frame = self._frame()
+        seconds = {"sync": time.perf_counter() - began}
+        try:
+            return self._checked(observation, frame, seconds)
+        except NotReady as error:
+            raise BadFrame(error.what, cause="a stream that was there is gone") from error
+        except BadTiming as error:
+            if frame is not None and seconds["sync"] > _LONG_S:
+                last = max(frame.stamps, key=frame.stamps.__getitem__)
+                error.cause = (
+                    f"{self._robot.reading.name} took {seconds['sync']:.2f} s; "
+                    f"{last} came last in it"
+                )
+            raise
+
+    def _first_frame(self, until: float) -> tuple[dict[str, Any], Frame | None]:
+        if self._robot.lockstep:
+            return self._frame()
+        # One that is begun shortly before the end is given its time, too.
+        until = max(until, time.monotonic() + _LOOK_S)
+        future = self._thread.submit(self._frame)
+        while not future.done() and time.monotonic() < until:
+            self._interrupts.check()
+            wait((future,), timeout=0.02)
+        if not future.done():
+            raise NotReady(f"{self._robot.name}.get_frame does not return")
+        return future.result()
+
+    def _frame(self) -> tuple[dict[str, Any], Frame | None]:
+        """What the runner makes of the robot's newest frame.
+
+        Raises:
+            BadFrame: it is no observation, or something was raised that is no error of a robot's.
+        """
+        robot = self._robot
+        try:
+            with robot.delays.of(robot.reading):
+                observation, frame = self._look()
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BadFrame(
+                f"{robot.reading.name}, or what the runner makes of it, "
+                f"raised {type(error).__name__}: {error}"
+            ) from error
+        if not isinstance(observation, Mapping) or not isinstance(
+            observation.get("images"), Mapping
+        ):
+            raise BadFrame(
+                f"the runner's update_observation_window() gave {_shown(observation)}; "
+                "an observation has qpos and a dict of images"
+            )
+        return observation, frame
+
+    def _checked(
+        self, observation: dict[str, Any], frame: Frame | None, seconds: dict[str, float]
+    ) -> Reading:
+        _check_complete(observation, self._cameras)
+        measured = at = now = self._robot.clock.now()
+        state, images, stamps = observation["qpos"], observation["images"], dict[str, float]()
+        if frame is not None:
+            age = max(self._gate.check(frame.stamps, self._cameras, now), 0.0)
+            state, stamps = frame.state, dict(frame.stamps)
+            measured, at = stamps[STATE], now - age
+            seconds = {"receipt": age, **seconds}
+        seen = Frame(state=state, images=images, stamps=stamps)
+        try:
+            check_frame(seen, self._robot.embodiment, self._cameras)
+        except BadFrame:
+            values = {"state": state, "images": images}
+            self._emit(Refused(self._robot.clock.now(), "reading", values))
+            raise
+        state = np.asarray(state, dtype=np.float64)
+        asked = {**observation, "task_description": self._instruction}
+        return Reading(asked, frame, state, measured, at, seconds)
+
+
+def _shown(window: object) -> str:
+    return f"the keys {sorted(map(str, window))}" if isinstance(window, Mapping) else repr(window)
+
+
+def _check_complete(window: dict[str, Any], cameras: Sequence[str]) -> None:
+    """A stream that has not come yet is None in an operator of the specification's shape."""
+    if _is_nothing(window.get("qpos")):
+        raise NotReady("there are no joint states yet")
+    missing = [name for name in cameras if window["images"].get(name) is None]
+    if missing:
+        raise NotReady(f"there is no picture of {', '.join(missing)} yet")
+
+
+def _is_nothing(state: Any) -> bool:
+    """Whether there is no state: None, or the one NaN that ``np.array(None, dtype=float)`` is."""
+    if isinstance(state, np.ndarray) and state.ndim == 0 and state.dtype.kind == "f":
+        return bool(np.isnan(state))
+    return state is None
+
+
+def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:
+    """Whether a robot's cameras show what the policy was trained on.
+
+    A camera may have more pixels than in training; it may not show another view.
+
+    Args:
+        trained, here: the embodiments of the policy and of the robot.
+        names: the cameras that the policy looks at.
+
+    Returns:
+        What is to be said of pictures that are scaled.
+
+    Raises:
+        SpecMismatch: a camera's pictures have another aspect.
+    """
+    cameras = {camera.name: camera for camera in here.cameras}
+    said = []
+    for then in trained.cameras:
+        now = cameras.get(then.name)
+        if then.name not in names or now is None:
+            continue
+        if (now.height, now.width) == (then.height, then.width):
+            continue
+        sizes = (
+            f"camera {then.name} gives {now.height} x {now.width} pictures; the policy was "
+            f"trained on {then.height} x {then.width}"
+        )
+        difference = abs(now.width * then.height - then.width * now.height)
+        if difference > 0.01 * now.height * then.width:
+            raise SpecMismatch(
+                f"{sizes}: another view",
+                next="set the camera to the size, or at least the aspect, of the recordings",
+            )
+        said.append(f"{sizes}; they are scaled")
+    return said

@@ -1,0 +1,1 @@
+"""Recordings of episodes: writing, reading back, replaying, turning into a dataset."""

@@ -1,0 +1,157 @@
+"""The format of an episode's log: its events, and the summary that is counted from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fluxvla_core.bounds import Finite
+from fluxvla_core.errors import DataError
+from fluxvla_core.untrusted import parse_json
+
+
+class Timings:
+    """Stage -> durations. Stages appear in the report in the order they were first seen."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, list[float]] = {}
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Note one duration."""
+        self._seconds.setdefault(stage, []).append(seconds)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """stage -> ``count`` and ``p50_ms``, ``p95_ms``, ``p99_ms``, ``max_ms``."""
+        report = {}
+        for stage, values in self._seconds.items():
+            p50, p95, p99 = np.percentile(values, [50, 95, 99]) * 1e3
+            report[stage] = {
+                "count": len(values),
+                "p50_ms": round(float(p50), 3),
+                "p95_ms": round(float(p95), 3),
+                "p99_ms": round(float(p99), 3),
+                "max_ms": round(max(values) * 1e3, 3),
+            }
+        return report
+
+
+FORMAT = "fluxvla-episode-1"
+HELD = "held.jsonl"
+"""What went wrong after an episode, while the arm was held: the episode's record is complete."""
+START, OBSERVATION, CHUNK, REFUSED = "start", "observation", "chunk", "refused"
+COMMAND, STOP, END = "command", "stop", "end"
+"""Values of an event's ``event``.
+
+``start``: what runs on what (the first event); ``observation``: a reading that was looked at;
+``chunk``: a policy's answer that was admitted; ``refused``: a reading or an answer that was not;
+``command``: what was sent; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on
+the loop's clock.
+"""
+
+
+@dataclass(frozen=True)
+class _Clamp:
+    joint: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Event:
+    """The types of what is read of events; which of them has what is in the text above."""
+
+    event: str
+    t: Finite
+    state: list[float] | None = None
+    command: list[float] | None = None
+    stamps: dict[str, float] | None = None
+    phase: str | None = None
+    ms: dict[str, float | None] | None = None
+    clamps: list[_Clamp] | None = None
+    keyframes: list[list[float]] | None = None
+    embodiment: dict[str, Any] | None = None
+    instruction: str | None = None
+    native: bool | None = None
+    success: bool | None = None
+
+
+def parse_event(text: bytes | str, where: str) -> dict[str, Any]:
+    """One event of a record that somebody else may have written.
+
+    Raises:
+        DataError: it is none, or a value is of another type.
+    """
+    event = parse_json(text, dict[str, Any], DataError, where)
+    parse_json(text, _Event, DataError, where)
+    return event
+
+
+class EpisodeSummary:
+    """Counts an episode's events; ``to_dict`` is what ``episode.json`` holds."""
+
+    def __init__(self) -> None:
+        self._start: Mapping[str, Any] = {}
+        self._end: Mapping[str, Any] = {}
+        self._timings = Timings()
+        self._clamps: dict[str, dict[str, int]] = {}
+        self._chunks = 0
+        self._steps = 0
+        self._held = 0
+
+    def add(self, event: Mapping[str, Any]) -> None:
+        """Count one event."""
+        kind = event.get("event")
+        if kind == START:
+            self._start = event
+        elif kind == END:
+            self._end = event
+        elif kind == CHUNK:
+            self._chunks += 1
+        elif kind == COMMAND:
+            self._steps += event.get("phase") == "run"
+            self._held += event.get("phase") == "run" and bool(event.get("held"))
+            self._count_clamps(event.get("clamps") or ())
+        for stage, value in (event.get("ms") or {}).items():
+            if value is not None:
+                self._timings.add(stage, value / 1e3)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values; without an ``end`` event the outcome is ``cut short``."""
+        start, end = self._start, self._end
+        embodiment = start.get("embodiment") or {}
+        return {
+            "format": FORMAT,
+            "task": start.get("task"),
+            "instruction": start.get("instruction"),
+            "outcome": end.get("outcome", "cut short"),
+            "success": end.get("success"),
+            "problem": end.get("problem") if end else "the record ends without an end",
+            "steps": self._steps,
+            "chunks": self._chunks,
+            "seed": start.get("seed"),
+            "robot": start.get("robot"),
+            "embodiment": embodiment.get("name"),
+            "joints": [joint.get("name") for joint in embodiment.get("joints", ())],
+            "rate_hz": start.get("rate_hz"),
+            "lockstep": start.get("lockstep"),
+            "skipped_beats": end.get("skipped_beats"),
+            "held_beats": self._held,
+            "clamps": self._clamps,
+            "trips": end.get("trips", []),
+            "timings": self._timings.summary(),
+        }
+
+    def _count_clamps(self, clamps: Iterable[Mapping[str, Any]]) -> None:
+        for clamp in clamps:
+            counts = self._clamps.setdefault(clamp["joint"], {})
+            counts[clamp["reason"]] = counts.get(clamp["reason"], 0) + 1
+
+
+def summarise(events: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """The summary of recorded events."""
+    summary = EpisodeSummary()
+    for event in events:
+        summary.add(event)
+    return summary.to_dict()

@@ -1,0 +1,224 @@
+"""``ReplayOperator``: a recorded robot, which does again what it did, whatever is sent to it.
+
+The same config runs in simulation, on a recording or on the robot by changing ``operator``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.contracts.frame import STATE
+from fluxvla_core.contracts.robot import Clock, Operator
+from fluxvla_core.errors import DataError, NotReady
+from fluxvla_core.robot.clock import MonotonicClock, SimulatedClock
+from fluxvla_core.robot.recording import episode_log
+from fluxvla_core.robot.recording.recorded import Event, Recorded, age_at, open_recording
+from fluxvla_core.robot.recording.ros_messages import BASE
+from fluxvla_core.ros2.actions import checked_action
+from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2.streams import depth_stream
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Array = npt.NDArray[np.float64]
+# Times in a recording are rounded to nanoseconds.
+_ROUNDING_S = 1e-6
+
+
+class ReplayOperator(Operator):
+    """Shows what was recorded, and takes commands without following them.
+
+    As fast as possible by default: it has a clock of its own, on which each command takes a
+    control period, as in a simulation. A policy that answers as it did gives the same episode.
+
+    Args:
+        recording: an episode's folder or MCAP file, of ``fluxvla run --record``.
+        realtime: at the pace at which it was recorded.
+        context: what the run knows (injected): its reporter learns when the recording ends.
+    """
+
+    api: ClassVar[str] = "1.0"
+    # Its tracking error is the difference between two policies, not a fault.
+    follows_commands: ClassVar[bool] = False
+
+    def __init__(
+        self, recording: str, realtime: bool = False, context: RunContext | None = None
+    ) -> None:
+        self.recording = recording
+        self.realtime = realtime
+        self._reporter = (context or RunContext()).reporter
+        self._connected = False
+        self._ended = False
+        self._began = 0.0
+
+    @cached_property
+    def recorded(self) -> Recorded:
+        """The recording, read when it is first needed.
+
+        Raises:
+            DataError: it cannot be read, or has nothing to show.
+        """
+        found = open_recording(self.recording)
+        if found.embodiment.cameras and not found.pictures:
+            raise DataError(
+                "this episode has no pictures: its robot cannot be replayed",
+                where=str(found.path),
+                cause="it was run without --record",
+                next="ReplayPolicy can replay its actions; record anew with --record DIR",
+            )
+        return found
+
+    @cached_property
+    def embodiment(self) -> EmbodimentSpec:
+        """The recorded robot, with those of its cameras that were recorded."""
+        spec = self.recorded.embodiment
+        seen = tuple(c for c in spec.cameras if c.name in self.recorded.pictures)
+        return replace(spec, cameras=seen)
+
+    @cached_property
+    def clock(self) -> Clock:
+        """Real time, or a clock that begins when the recording did."""
+        return MonotonicClock() if self.realtime else SimulatedClock(self._first)
+
+    def connect(self) -> None:
+        """Go to the beginning."""
+        self._connected = True
+        self._rewind()
+
+    def begin_episode(self, instruction: str, episode: int) -> None:
+        """Go to the beginning, and say so if another task was recorded."""
+        self._rewind()
+        if instruction != self.recorded.instruction:
+            self._reporter.warn(
+                f"the recording {self.recorded.path} is of {self.recorded.instruction!r}, "
+                f"not of {instruction!r}"
+            )
+
+    def get_frame(self) -> RobotFrame:
+        """What belongs together now; pictures in fresh arrays, depth and base where recorded.
+
+        Streams are as late, and as far apart, as they were when the robot was looked at last. No
+        stream runs backwards: the recorded looks bound what is shown between them.
+
+        Raises:
+            NotReady: not connected.
+        """
+        now = self._now()
+        look = max(0, _newest(self._looked, now))
+        arrived = {stream: self._arrived(stream, look, now) for stream in self._arrivals}
+        cameras, depths = self.recorded.pictures, self.recorded.depths
+        images = {name: found.shown(arrived[name]) for name, found in cameras.items()}
+        metres = {name: found.shown(arrived[depth_stream(name)]) for name, found in depths.items()}
+        base = self._observations[look].get(BASE)
+        # One shift for all: differences of two clock readings would let a stream run backwards.
+        shift = self._began - self._first
+        return RobotFrame(
+            self._state(arrived[STATE]),
+            images,
+            {stream: stamp + shift for stream, stamp in arrived.items()},
+            metres,
+            None if base is None else np.array(base, dtype=np.float64),
+        )
+
+    def get_state(self) -> Array:
+        """``(state_dim,)``, the newest of now.
+
+        Raises:
+            NotReady: not connected.
+        """
+        return self._state(self._now())
+
+    def send_action(self, action: npt.ArrayLike) -> None:
+        """Take a ``(dim,)`` command; without ``realtime`` a control period passes.
+
+        Raises:
+            NotReady: not connected.
+            Rejected: wrong shape, not finite, or outside the limits.
+        """
+        self._now()
+        checked_action(self.embodiment, action)
+        if isinstance(self.clock, SimulatedClock):
+            self.clock.advance(1.0 / self.embodiment.rate_hz)
+
+    def task_done(self) -> bool:
+        """Whether the recording is over; said once."""
+        over = self._now() >= self._last - _ROUNDING_S
+        if over and not self._ended:
+            self._ended = True
+            cut = "" if self.recorded.whole else ", where it was cut short"
+            self._reporter.info(f"the recording {self.recorded.path} ends here{cut}")
+        return over
+
+    def stop(self) -> None:
+        """Nothing moves."""
+
+    def close(self) -> None:
+        """Forget the connection; any number of times."""
+        self._connected = False
+
+    def _rewind(self) -> None:
+        self._began, self._ended = self.clock.now(), False
+
+    def _now(self) -> float:
+        """Seconds on the recorded loop's clock."""
+        if not self._connected:
+            raise NotReady("the recording is not connected", next="call connect() first")
+        return self._first + (self.clock.now() - self._began)
+
+    @cached_property
+    def _first(self) -> float:
+        return float(self._observations[0]["t"])
+
+    @cached_property
+    def _last(self) -> float:
+        """When the last command of the task was done; how the arm came to rest is no part of it."""
+        times, _ = self.recorded.commands("run")
+        return float(times[-1]) if len(times) else float(self._observations[-1]["t"])
+
+    @cached_property
+    def _observations(self) -> list[Event]:
+        found = self.recorded.of(episode_log.OBSERVATION)
+        if not found:
+            raise DataError(
+                "the recording holds no reading of the robot", where=str(self.recorded.path)
+            )
+        return found
+
+    @cached_property
+    def _looked(self) -> Array:
+        """``(N,)`` when the robot was looked at."""
+        return np.array([event["t"] for event in self._observations], dtype=np.float64)
+
+    @cached_property
+    def _arrivals(self) -> dict[str, Array]:
+        """Stream -> ``(N,)`` when what each look saw of it had arrived."""
+        recorded = self.recorded
+        streams = [STATE, *recorded.pictures, *map(depth_stream, recorded.depths)]
+        ages = {s: np.array([age_at(e, s) for e in self._observations]) for s in streams}
+        # The loop checks the streams that its policy looks at; the others may have run backwards.
+        return {s: np.maximum.accumulate(self._looked - age) for s, age in ages.items()}
+
+    def _arrived(self, stream: str, look: int, now: float) -> float:
+        """When what is shown ``now`` of a stream had arrived: ``look`` is the last one before."""
+        arrivals = self._arrivals[stream]
+        age = self._looked[look] - arrivals[look]
+        latest = arrivals[look + 1] if look + 1 < len(arrivals) else np.inf
+        return float(np.clip(now - age, arrivals[look], latest))
+
+    @cached_property
+    def _states(self) -> tuple[Array, Array]:
+        return self.recorded.states()
+
+    def _state(self, time: float) -> Array:
+        times, states = self._states
+        return np.array(states[max(0, _newest(times, time))])
+
+
+def _newest(times: Array, now: float) -> int:
+    """Index of the last of ascending ``times`` that is not after ``now``; -1 if there is none."""
+    return int(np.searchsorted(times, now + _ROUNDING_S, side="right")) - 1

@@ -1,0 +1,318 @@
+"""A robot as a runner uses it, whether its operator has the full contract or only some of it.
+
+The specification's operators have ``get_frame`` and commands of their own (``servoj``,
+``movegrip``), no specs, and open their connection in the constructor. One like that is accepted
+when the config gives the ``embodiment`` that it lacks; the runner's ``_execute_actions`` sends.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.check import check_operator, missing_operator_methods
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
+from fluxvla_core.robot.checks import as_action, as_frame, as_number, as_state
+from fluxvla_core.robot.clock import clock_of, in_lockstep
+from fluxvla_core.robot.delays import DelayMonitor, robot_call
+from fluxvla_core.robot.stops import BadFrame
+from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
+
+# How long a safe stop may take before a person is told to use the emergency stop.
+STOP_S = 5.0
+_LEAST_SPEED = 0.01
+
+
+@dataclass(frozen=True)
+class Measured:
+    """``(state_dim,)`` where the robot was, and when that arrived, on its clock."""
+
+    state: npt.NDArray[np.float64]
+    at: float
+
+
+class Robot:
+    """An operator, its embodiment and its clock.
+
+    Args:
+        operator: an object; not connected yet if it has ``connect``.
+        embodiment: what the config says about it; None when it has its own.
+        sends: whether the runner has an ``_execute_actions`` of its own, and so needs no
+            ``send_action``.
+
+    Raises:
+        LoadFailed: the operator lacks something that nothing makes up for.
+        SpecMismatch: the config's embodiment and the operator's own differ, or a joint is a speed.
+    """
+
+    def __init__(
+        self,
+        operator: Any,
+        embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
+        sends: bool = False,
+    ) -> None:
+        self._operator = Operator.adapt(operator)
+        self.name = type(operator).__name__
+        check_operator(operator)
+        self.embodiment = self._embodiment(embodiment)
+        moving = speeds(self.embodiment)
+        if moving:
+            raise SpecMismatch(
+                f"{self.embodiment.name} has joints that are speeds by their names: "
+                f"{', '.join(moving)}; {NO_SPEEDS}",
+                next="leave them out of the embodiment and drive the base by a method of the "
+                "operator's own, as AlohaOperator.drive does; a joint that is commanded by its "
+                "position needs another name",
+            )
+        lacks = missing_operator_methods(operator)
+        self.complete = not lacks
+        if not sends and "send_action()" in lacks:
+            raise LoadFailed(
+                f"{self.name} has no send_action(); no command could be sent to it",
+                next="see docs/writing-a-plugin.md for what an operator has, or give the runner "
+                "an _execute_actions of its own",
+            )
+        self.sent_s: float | None = None
+        self._reads_state, self._stamps_state = self._has("get_state"), self._has("state_stamp")
+        # A recorded robot goes its own way; that it does is no fault of its.
+        self.follows = bool(self._operator.follows_commands)
+        self.clock = clock_of(self._operator)
+        self.lockstep = in_lockstep(self.clock)
+        self.delays = DelayMonitor()
+        self.reading = robot_call(f"{self.name}.get_frame()")
+        self._sending = robot_call(f"{self.name}.send_action()")
+        self._measuring = robot_call(f"{self.name}.get_state()")
+
+    def connect(self) -> None:
+        """Open the connection, where there is a ``connect``; the constructor did it otherwise.
+
+        Raises:
+            OperatorError: what the operator raised.
+        """
+        self._call("connect", self._operator.connect)
+
+    def send(self, action: npt.NDArray[np.float64]) -> None:
+        """Send one ``(D,)`` command; ``sent_s`` is how long the last one took.
+
+        Raises:
+            OperatorError: what the operator raised; anything that is none becomes ``Faulted``.
+        """
+        began = time.perf_counter()
+        with self.delays.of(self._sending):
+            self._call("send_action", self._operator.send_action, action)
+        self.sent_s = time.perf_counter() - began
+
+    def frame(self) -> Frame:
+        """The newest frame of an operator that has frames.
+
+        Raises:
+            BadFrame: it is none, or something was raised that is no error of a robot's.
+            OperatorError: what the operator raised.
+        """
+        return as_frame(self._ask("get_frame", self._operator.get_frame), self.reading.name)
+
+    def state(self) -> Measured | None:
+        """The state alone, from an operator that has ``get_state``; else None.
+
+        It is read after each command, on a real robot while another thread may read frames.
+
+        Raises:
+            BadFrame: it is not what the embodiment describes, or its stamp is none; or something
+                was raised that is no error of a robot's.
+            OperatorError: what the operator raised.
+        """
+        if not self._reads_state:
+            return None
+        at = None
+        with self.delays.of(self._measuring):
+            if self._stamps_state:
+                # Before the state: what arrives in between is newer than it says, which does no
+                # harm.
+                stamp = self._ask("state_stamp", self._operator.state_stamp)
+                at = as_number(stamp, f"{self.name}.state_stamp()")
+            found = self._ask("get_state", self._operator.get_state)
+            state = as_state(found, self.embodiment, self._measuring.name)
+        return Measured(state, self.clock.now() if at is None else at)
+
+    @property
+    def speed(self) -> Callable[[], float] | None:
+        """Tells the share of its speed that a person lets it have (``speed_scaling``), or None."""
+        operator = self._operator
+        if not self._has("speed_scaling"):
+            return None
+        # An arm that is paused takes no command, and says so when it is given one.
+        name = f"{self.name}.speed_scaling"
+        return lambda: min(max(as_number(operator.speed_scaling, name), _LEAST_SPEED), 1.0)
+
+    def commanded(self, before: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64] | None:
+        """``(D,)`` what the arm was told last, None if nothing, or nothing that still counts.
+
+        Args:
+            before: the last command of this run, for operators that do not tell (``last_action``).
+        """
+        if self._has("last_action"):
+            last = self._operator.last_action
+            name = f"{self.name}.last_action"
+            return None if last is None else as_action(last, self.embodiment, name)
+        # Who begins episodes may put the arm elsewhere.
+        return None if self._has("begin_episode") else before
+
+    @property
+    def pictures_after(self) -> Callable[..., Any] | None:
+        """What the operator keeps of its pictures (``Operator.pictures_after``), or None."""
+        return self._operator.pictures_after if self._has("pictures_after") else None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the operator puts the scene in place itself (``begin_episode``)."""
+        return self._has("begin_episode")
+
+    @property
+    def tells_hold(self) -> bool:
+        """Whether ``commanded`` holds after a stop too: without ``last_action`` an operator's own
+        ``stop`` may have commanded anything."""
+        return self._has("last_action") or not self.can_stop
+
+    def success(self) -> bool | None:
+        """Whether the task is done as of now, where the operator can tell (``task_success``)."""
+        found = self._operator.task_success()
+        return None if found is None else bool(found)
+
+    def done(self) -> bool:
+        """Whether the episode can end here, where the operator can tell (``task_done``).
+
+        Raises:
+            BadFrame: it says something else, or raises.
+        """
+        found = self._ask("task_done", self._operator.task_done)
+        if not isinstance(found, (bool, np.bool_)):
+            raise BadFrame(f"{self.name}.task_done() gave {found!r}, neither True nor False")
+        return bool(found)
+
+    def begin(self, instruction: str, episode: int) -> None:
+        """Tell an operator that wants to know (``begin_episode``) that an episode begins.
+
+        Simulations put their objects in place then; ``episode`` counts from 0.
+        """
+        self._call("begin_episode", self._operator.begin_episode, instruction, episode)
+
+    @property
+    def can_stop(self) -> bool:
+        """Whether the operator itself knows how to stop.
+
+        Only one of the specification's shape may not: its runner sends, and what stops it is that
+        the runner's commands brake, and that the last of them holds it.
+        """
+        return self._has("stop")
+
+    def stop(self) -> str | None:
+        """Bring the robot to a safe stop; None, or what went wrong. Never raises, never hangs."""
+        return self._bounded("stop", self._operator.stop) if self.can_stop else None
+
+    def close(self) -> str | None:
+        """Give the connection back; None, or what went wrong. Never raises, never hangs."""
+        return self._bounded("close", self._operator.close) if self._has("close") else None
+
+    def _has(self, ability: str) -> bool:
+        return implements(self._operator, Operator, ability)
+
+    def _ask(self, method: str, function: Callable[[], object]) -> Any:
+        """What the operator says; where that goes wrong, its commands still arrive."""
+        try:
+            return function()
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BadFrame(
+                f"{self.name}.{method}() raised {type(error).__name__}: {error}"
+            ) from error
+
+    def _call(self, method: str, function: Callable[..., object], *arguments: Any) -> None:
+        try:
+            function(*arguments)
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise Faulted(f"{self.name}.{method} raised {type(error).__name__}: {error}") from error
+
+    def _bounded(self, method: str, function: Callable[[], object]) -> str | None:
+        problem: list[str] = []
+        if self.lockstep:
+            # Simulations are bound to one thread (renderers are), and cannot hurt anybody.
+            return self._reported(method, function)
+
+        def call() -> None:
+            problem.extend(filter(None, [self._reported(method, function)]))
+
+        thread = threading.Thread(target=call, name=f"fluxvla-{method}", daemon=True)
+        thread.start()
+        thread.join(STOP_S)
+        if thread.is_alive():
+            return (
+                f"{self.name}.{method} did not return within {STOP_S:g} s: "
+                "use the robot's emergency stop"
+            )
+        return problem[0] if problem else None
+
+    def _reported(self, method: str, function: Callable[[], object]) -> str | None:
+        try:
+            function()
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - told; the rest of the stop goes on
+            return f"{self.name}.{method} raised {type(error).__name__}: {error}"
+        return None
+
+    def _embodiment(self, given: EmbodimentSpec | Mapping[str, Any] | None) -> EmbodimentSpec:
+        if given is not None and not isinstance(given, (EmbodimentSpec, Mapping)):
+            raise ConfigError(f"embodiment must be a table, got {given!r}")
+        said = EmbodimentSpec.from_dict(given) if isinstance(given, Mapping) else given
+        own = getattr(self._operator, "embodiment", None)
+        if own is None and said is None:
+            raise LoadFailed(
+                f"{self.name} has no embodiment: which joints it moves and within which limits is "
+                "not known, so nothing may be sent to it",
+                cause="an operator of the specification's shape describes no robot",
+                next="give the section embodiment = dict(name=…, joints=[…], cameras=[…], "
+                "rate_hz=…), or the operator an attribute embodiment",
+            )
+        if own is None:
+            assert said is not None
+            return said
+        if not isinstance(own, EmbodimentSpec):
+            raise LoadFailed(
+                f"{self.name}.embodiment is a {type(own).__name__}, not an EmbodimentSpec"
+            )
+        if said is not None:
+            check_match(said, own, "the config's embodiment", self.name)
+            _check_tighter(said, own)
+            return said
+        return own
+
+
+def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
+    """A config may narrow a robot's limits; it cannot widen them."""
+    for ours, theirs in zip(said.joints, own.joints, strict=True):
+        wider = {
+            "lower": ours.lower < theirs.lower,
+            "upper": ours.upper > theirs.upper,
+            "velocity": ours.velocity > theirs.velocity,
+            "acceleration": ours.acceleration > theirs.acceleration,
+            "jerk": (ours.jerk or math.inf) > (theirs.jerk or math.inf),
+        }
+        for name, is_wider in wider.items():
+            if is_wider:
+                given = getattr(ours, name)
+                given = math.inf if given is None else given
+                raise SpecMismatch(
+                    f"the config's embodiment widens {name} of {ours.name} to {given:g}; "
+                    f"the robot's own limit is {getattr(theirs, name):g}"
+                )

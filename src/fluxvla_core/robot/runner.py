@@ -1,0 +1,431 @@
+"""``BaseInferenceRunner``: a policy drives a robot, one task after the other, within limits.
+
+A robot whose operator has the full contract needs no runner of its own. One of the
+specification's shape overrides ``get_ros_observation``, ``update_observation_window`` and
+``_execute_actions``; what the latter is given has passed the safety already.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import (
+    RunContext,
+    build_action_filter_from_cfg,
+    build_operator_from_cfg,
+    build_policy_from_cfg,
+    takes,
+)
+from fluxvla_core.contracts.check import check_policy
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.policy import Policy
+from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.hooks import build_hooks
+from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.robot import priority
+from fluxvla_core.robot.commands import check_pose
+from fluxvla_core.robot.episode import EpisodeSettings, Equipment
+from fluxvla_core.robot.events import HookObserver
+from fluxvla_core.robot.filters import SnapGripper, bind_filters
+from fluxvla_core.robot.interrupt import Interrupted, Interrupts
+from fluxvla_core.robot.joiners import make_joiner
+from fluxvla_core.robot.joining import ChunkJoiner
+from fluxvla_core.robot.observation import scaled_views
+from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.recording.recorder import EpisodeRecorder
+from fluxvla_core.robot.recording.ros_messages import typestore
+from fluxvla_core.robot.recording.trace import next_folder
+from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.safety_settings import SafetySettings
+from fluxvla_core.robot.session import RobotSession, RunHistory
+from fluxvla_core.robot.stops import Latch
+from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+
+Array = npt.NDArray[np.float64]
+FOLDER = "inference"
+
+
+class BaseInferenceRunner(Runner):
+    """Runs a policy on a robot: ``run_setup()``, then ``run()``.
+
+    Args:
+        cfg: the whole config (injected).
+        context: what the run knows (injected): work dir, task, reporter.
+        seed: of the policy's noise; episode ``n`` uses ``seed + n``. Also of a simulated operator
+            whose table says no other.
+        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
+        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
+        policy: table or object of the Policy contract, instead of a checkpoint.
+        task_descriptions: id -> instruction; what ``--task`` may name, by either.
+        free_tasks: allow instructions that are none of ``task_descriptions``, as ``--free-task``
+            does; the policy may do anything then.
+        task_topic: ROS 2 topic (``std_msgs/String``) that tasks come from if the command line
+            names none; by default a person at the terminal is asked.
+        state_dim: checked against the robot's state, if given.
+        action_chunk: how many of a chunk's actions may be used; all by default.
+        publish_rate: commands a second; the embodiment's rate by default.
+        max_publish_step: commands after which an episode ends.
+        camera_names: the cameras that are observed; those that the policy looks at by default.
+        operator: table or object.
+        prepare_pose: where the arm goes before an episode, in the embodiment's units.
+        embodiment: of an operator that has none, or narrower limits for one that has.
+        execute_horizon: how many actions of a chunk are executed before the next is asked for.
+            By default all of them; while chunks are joined in motion, as few as the policy is
+            quick enough for (one, in a simulation whose time stands still meanwhile).
+        async_execution: think while moving: short for ``chunk_joining="latest_only"``.
+        chunk_joining: how chunks become one motion: a name of ``robot.joiners.METHODS``, or a
+            table with ``method = '<name>'`` and its parameters. ``synchronous`` by default.
+        simulated_latency: seconds from an observation to its chunk, in a simulation whose time
+            stands still while the policy thinks: how the same policy would do on a slower computer.
+        gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
+            that it presses on what it holds; in the gripper's unit. None leaves them as they are.
+        action_filters: tables or callables that may alter an action, in order, before the limits.
+        safety: thresholds, see ``SafetySettings``.
+        mixed_precision_dtype: ``float32`` or ``bf16``.
+        device: of torch.
+        record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
+            and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
+            work dir.
+        record_fps: frames a second of the recorded videos, and of a simulation's recorded
+            pictures; None records none.
+        ready_timeout: seconds that the robot may take to give its first reading.
+
+    Raises:
+        ConfigError, PluginError: the operator cannot be built, or the values do not fit it.
+    """
+
+    api: ClassVar[str] = "1.0"
+
+    def __init__(
+        self,
+        cfg: Mapping[str, Any] | None = None,
+        context: RunContext | None = None,
+        seed: int = 7,
+        ckpt_path: str | None = None,
+        dataset: Any = None,
+        denormalize_action: Any = None,
+        policy: Any = None,
+        task_descriptions: Mapping[str, str] | None = None,
+        task_topic: str | None = None,
+        state_dim: int | None = None,
+        action_chunk: int | None = None,
+        publish_rate: float | None = None,
+        max_publish_step: int = 10000,
+        camera_names: Sequence[str] | None = None,
+        operator: Any = None,
+        prepare_pose: Sequence[float] | None = None,
+        embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
+        execute_horizon: int | None = None,
+        async_execution: bool = False,
+        chunk_joining: str | Mapping[str, Any] | None = None,
+        simulated_latency: float = 0.0,
+        gripper_threshold: float | None = None,
+        action_filters: Sequence[Any] = (),
+        safety: Mapping[str, Any] | None = None,
+        mixed_precision_dtype: str = "float32",
+        device: str = "cpu",
+        record: str | None = None,
+        record_fps: float | None = 10.0,
+        ready_timeout: float = 10.0,
+        free_tasks: bool = False,
+    ) -> None:
+        self.cfg = cfg
+        self.context = context or RunContext(config=cfg or {})
+        self.seed = seed
+        self.ckpt_path = ckpt_path
+        self.dataset = dataset
+        self.denormalize_action = denormalize_action
+        self.policy: Any = build_policy_from_cfg(policy, context)
+        self.task_descriptions = check_descriptions(task_descriptions)
+        self.free_tasks = free_tasks or self.context.free_task
+        self.task_topic = task_topic
+        self.action_chunk = action_chunk
+        self.execute_horizon = execute_horizon
+        self.max_publish_step = max_publish_step
+        self.camera_names = None if camera_names is None else tuple(camera_names)
+        self.prepare_pose = prepare_pose
+        self.async_execution = async_execution
+        self.chunk_joining = self._checked_joining(chunk_joining)
+        self.simulated_latency = simulated_latency
+        self.gripper_threshold = gripper_threshold
+        self.mixed_precision_dtype = mixed_precision_dtype
+        self.device = device
+        self.record = record
+        self.record_fps = record_fps
+        self.ready_timeout = ready_timeout
+        self.safety = SafetySettings.of(safety)
+        if operator is None:
+            raise ConfigError(
+                f"{type(self).__name__} has no operator: which robot is it to drive?",
+                where=self.context.where(self.context.section),
+                next="set operator = dict(type='...') in this section",
+            )
+        counts = {
+            "action_chunk": action_chunk,
+            "execute_horizon": execute_horizon,
+            "max_publish_step": max_publish_step,
+        }
+        for name, value in counts.items():
+            if value is not None and value < 1:
+                raise self._wrong(name, f"must be at least 1, got {value}")
+        # A robot does not begin from a seed: configs that are for both leave it out of its table.
+        scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
+        self.ros_operator = build_operator_from_cfg(operator, context, **scene)
+        own_sending = type(self)._execute_actions is not BaseInferenceRunner._execute_actions
+        self.robot = Robot(self.ros_operator, embodiment, sends=own_sending)
+        self.embodiment = self.robot.embodiment
+        self.publish_rate = self._checked_rate(publish_rate)
+        if state_dim is not None and state_dim != self.embodiment.state_dim:
+            raise self._wrong(
+                "state_dim",
+                f"is {state_dim}; {self.embodiment.name} has "
+                f"{self.embodiment.state_dim} state values",
+            )
+        if not 0.0 <= simulated_latency < math.inf:
+            raise self._wrong("simulated_latency", f"must be 0 or more, got {simulated_latency}")
+        if simulated_latency and not self.robot.lockstep:
+            raise self._wrong("simulated_latency", "is for simulations; this robot has its own")
+        built = [build_action_filter_from_cfg(each, context) for each in action_filters]
+        self.action_filters = [ActionFilter.adapt(each) for each in built]
+        if gripper_threshold is not None:
+            # After the config's own filters, right before the limits.
+            self.action_filters.append(SnapGripper(gripper_threshold))
+        bind_filters(self.action_filters, self.embodiment)
+        self.latch = Latch(self.robot.clock.now)
+        self._frame: Frame | None = None
+        self._history = RunHistory()
+
+    def run_setup(self) -> None:
+        """Load the policy and check that it, the robot, the poses and the task fit together.
+
+        Raises:
+            CheckpointError: there is no policy to load.
+            LoadFailed: the policy does not say what a robot has to know of it.
+            SpecMismatch: the policy is for another robot, or for other views.
+            ConfigError, UsageError: a pose, a camera or the task does not fit.
+        """
+        if self.record is not None:
+            typestore()  # before anything moves: what recording needs is installed
+        if self.context.task is not None or self.context.task_file is not None:
+            self._task_source()
+        if self.policy is None:
+            from fluxvla_core.robot.local_policy import find_checkpoint, load_policy
+
+            place = find_checkpoint(self.ckpt_path, self.context.work_dir)
+            self.context.reporter.info(f"policy: {place}")
+            self.policy = load_policy(
+                place,
+                self.device,
+                self.dataset,
+                self.denormalize_action,
+                self.mixed_precision_dtype,
+            )
+        check_policy(self.policy)
+        self.policy = Policy.adapt(self.policy)
+        if self._joiner().continues and not self.policy.continues:
+            raise self._wrong(
+                "chunk_joining",
+                f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot go on from a "
+                "chunk: neither it nor its model takes what is left of the last one",
+            )
+        looks_at = tuple(self.policy.cameras)
+        self._cameras = self.camera_names or looks_at
+        check_match(self.policy.embodiment, self.embodiment, "the policy", "the robot", looks_at)
+        known = self.embodiment.camera_names
+        for name in (*self._cameras, *looks_at):
+            if name not in known:
+                raise self._wrong("camera_names", f"{name!r} is none of {', '.join(known)}")
+            if name not in self._cameras:
+                raise self._wrong("camera_names", f"the policy looks at {name!r} too")
+        for warning in scaled_views(self.policy.embodiment, self.embodiment, looks_at):
+            self.context.reporter.warn(warning)
+        if self.prepare_pose is not None:
+            check_pose(self.prepare_pose, self.embodiment)
+        if not self.robot.can_stop:
+            self.context.reporter.warn(
+                f"{self.robot.name} has no stop(): it is stopped by commands that brake, and held "
+                "by the last of them; a robot that does not hold its last command needs a stop()"
+            )
+
+    def run(self) -> dict[str, Any]:
+        """Connect, do the tasks of the command line, of a person or of a topic, and stop.
+
+        Returns:
+            The last episode's task, outcome, success and steps, and how many there were.
+
+        Raises:
+            UsageError: there is no task, and nobody to ask for one; nothing was connected.
+            KeyboardInterrupt: Ctrl-C; the robot was stopped.
+            RunFailed: SIGTERM; the robot was stopped.
+            Exception: what ended the run; the robot was stopped.
+        """
+        hooks = build_hooks(self.context)
+        thread = PolicyThread("fluxvla-policy")
+        ended, source = "failed", self._task_source()
+        watched = self.robot.delays.watched(self.context.reporter.warn, self.safety.starvation_s)
+        with Interrupts() as interrupts, watched:
+            self._observers = (HookObserver(hooks),)
+            self._session = session = RobotSession(
+                source,
+                self.task_descriptions,
+                self.free_tasks,
+                self.seed,
+                self._history,
+                self.latch,
+                interrupts,
+                thread,
+            )
+            try:
+                hooks.call("run_started")
+                source.open()
+                self.robot.connect()
+                with nullcontext() if self.robot.lockstep else priority.first():
+                    result = session.run(self._run_episode)
+                ended = "ok"
+            except Interrupted as signal:
+                ended = "interrupted"
+                raise signal.final() from None
+            finally:
+                interrupts.stopping = True
+                self._shut_down(session)
+                source.close()
+                hooks.call("run_finished", outcome=ended)
+        return result
+
+    def get_ros_observation(self) -> tuple[Any, ...]:
+        """The newest reading: one picture for each of ``camera_names``, then the state.
+
+        A subclass returns whatever its ``update_observation_window`` makes use of.
+        """
+        frame = self.robot.frame()
+        self._frame = frame
+        return (*(frame.images.get(name) for name in self._cameras), frame.state)
+
+    def update_observation_window(self) -> dict[str, Any]:
+        """What the policy is asked with, but for the instruction.
+
+        Returns:
+            ``qpos``: ``(state_dim,)`` float32, and ``images``: camera -> ``(H, W, 3)`` uint8 RGB. A
+            stream that has not come yet is None.
+        """
+        *images, state = self.get_ros_observation()
+        return {
+            "qpos": None if state is None else np.asarray(state, dtype=np.float32),
+            "images": dict(zip(self._cameras, images, strict=True)),
+        }
+
+    def _execute_actions(self, actions: Array, rate: Any) -> None:
+        """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
+        for action in actions:
+            rate.wait()
+            self.robot.send(action)
+            rate.sleep()
+
+    def _run_episode(self, task: Task) -> dict[str, Any]:
+        """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""
+        assert self.policy is not None, "run_setup() comes before run()"
+        reporter, session, joiner = self.context.reporter, self._session, self._joiner()
+        root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
+        recorder = EpisodeRecorder(
+            next_folder(root, task.name), self.robot, self.policy, self._cameras, self.record_fps,
+            self.record is not None, reporter,
+        )  # fmt: skip
+        reporter.info(f"task: {task.instruction}")
+        # Played in motion, a chunk is left when the next is there, not before.
+        horizon = None if joiner.streamed else self.execute_horizon
+        used = () if self.policy.whole_motion else (self.action_chunk, horizon)
+        horizons = [n for n in used if n is not None]
+        settings = EpisodeSettings(
+            cameras=self._cameras,
+            rate_hz=self.publish_rate,
+            safety=self.safety,
+            start_pose=self.prepare_pose,
+            keyframes=min(horizons) if horizons else None,
+            latency_s=self.simulated_latency,
+            max_steps=self.max_publish_step,
+            ready_s=self.ready_timeout,
+        )
+        equipment = Equipment(
+            robot=self.robot,
+            policy=self.policy,
+            look=self._look,
+            filters=self.action_filters,
+            joiner=joiner,
+            execute=self._execute_actions,
+            latch=self.latch,
+            interrupts=session.interrupts,
+            thread=session.thread,
+            reporter=reporter,
+            observers=(recorder, *self._observers),
+        )
+        session.play(equipment, settings, task)
+        return recorder.summary
+
+    def _look(self) -> tuple[dict[str, Any], Frame | None]:
+        self._frame = None
+        window = self.update_observation_window()
+        return window, self._frame
+
+    def _shut_down(self, session: RobotSession) -> None:
+        reporter = self.context.reporter
+        for problem in (self.robot.stop(), self.robot.close()):
+            # A stop that failed at the episode's end fails here again.
+            if problem and problem != session.stop_failure:
+                reporter.warn(problem)
+        if not session.thread.close(1.0):
+            hung = " and ".join(self.robot.delays.under_way()) or "the policy's thread"
+            reporter.warn(f"{hung} still hangs; its thread ends with the program")
+
+    def _task_source(self) -> TaskSource:
+        domain_id = getattr(self.ros_operator, "domain_id", None)
+        return task_source(
+            self.context, self.task_descriptions, self.task_topic, domain_id, self.free_tasks
+        )
+
+    def _checked_joining(self, value: Any) -> Any:
+        if value is None:
+            return "latest_only" if self.async_execution else "synchronous"
+        try:
+            joiner = make_joiner(value)
+        except ConfigError as error:
+            raise self._wrong("chunk_joining", error.what) from error
+        if self.async_execution and not joiner.streamed:
+            raise self._wrong("chunk_joining", f"is {value!r}, and async_execution is set")
+        return value
+
+    def _joiner(self) -> ChunkJoiner:
+        """A fresh one, that asks as often as ``execute_horizon`` says."""
+        assert self.policy is not None, "run_setup() comes before run()"
+        least = self.execute_horizon or (1 if self.robot.lockstep else 0)
+        return make_joiner(self.chunk_joining, least / self.policy.action_rate_hz)
+
+    def _checked_rate(self, publish_rate: float | None) -> float:
+        most = self.embodiment.rate_hz
+        if publish_rate is None:
+            return most
+        if not 0 < publish_rate <= most:
+            raise self._wrong(
+                "publish_rate",
+                f"is {publish_rate:g} Hz; {self.embodiment.name} takes up to "
+                f"{most:g} commands a second",
+            )
+        if self.robot.lockstep and publish_rate != most:
+            raise self._wrong(
+                "publish_rate",
+                f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
+            )
+        return float(publish_rate)
+
+    def _wrong(self, key: str, what: str) -> ConfigError:
+        section = self.context.section
+        return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))

@@ -1,0 +1,176 @@
+"""The episodes of one run, one after the other, and what happens in between.
+
+Between two episodes the arm holds: its last command is sent again at every tick, so that drivers
+which stop an arm that they hear nothing for keep it where it is, and what goes wrong while nobody
+moves it stops it as in an episode. After a stop nothing is sent and no task is taken, until whoever
+gives the tasks says ``rearm``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import FluxError, NotReady, SafetyStop
+from fluxvla_core.robot.episode import Episode, EpisodeSettings, Equipment
+from fluxvla_core.robot.interrupt import Interrupts
+from fluxvla_core.robot.policy_calls import PolicyFailed, PolicyThread
+from fluxvla_core.robot.stops import Latch
+from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
+
+_LOOK_S = 0.02
+_KEPT = ("task", "outcome", "success", "steps")
+
+
+@dataclass
+class RunHistory:
+    """What a runner keeps from one ``run()`` to the next, as an arm keeps its pose.
+
+    Args:
+        episodes: how many there were.
+        commanded: ``(D,)`` the last command; None before any.
+    """
+
+    episodes: int = 0
+    commanded: npt.NDArray[np.float64] | None = None
+
+
+class RobotSession:
+    """Runs the tasks of a source, and keeps what goes from one episode to the next.
+
+    Args:
+        source: open.
+        known: id -> instruction.
+        free: whether other instructions than those are allowed.
+        seed: of the first episode's policy; each later one adds 1.
+        history: of the runner; it goes on from there.
+        latch, interrupts, thread: of the run.
+
+    ``stop_failure`` is what went wrong with the last stop.
+    """
+
+    def __init__(
+        self,
+        source: TaskSource,
+        known: Mapping[str, str],
+        free: bool,
+        seed: int,
+        history: RunHistory,
+        latch: Latch,
+        interrupts: Interrupts,
+        thread: PolicyThread,
+    ) -> None:
+        self.latch, self.interrupts, self.thread = latch, interrupts, thread
+        self.stop_failure: str | None = None
+        self._source = source
+        self._known = known
+        self._free = free
+        self._seed = seed
+        self._history = history
+        # The one that ended last keeps the arm where it is; None where nothing but the arm's own
+        # controller does.
+        self._holding: Episode | None = None
+        self._failure: FluxError | None = None
+
+    def run(self, run_episode: Callable[[Task], Mapping[str, Any]]) -> dict[str, Any]:
+        """Until the source has no task left.
+
+        Args:
+            run_episode: does one task, by way of ``play``; its summary.
+
+        Returns:
+            The last episode's task, outcome, success and steps, and how many there were.
+
+        Raises:
+            SafetyStop, PolicyFailed, NotReady: what ended an episode, if nobody said ``rearm``.
+            Interrupted: a signal came.
+            Exception: what else ended an episode or the hold between two.
+        """
+        result: dict[str, Any] = {"episodes": 0}
+        for task in tasks(self._source, self._known, self._idle, self._heard, self._free):
+            try:
+                summary = run_episode(task)
+            except (SafetyStop, PolicyFailed, NotReady) as error:
+                self._source.report(f"{task.name}: failed")
+                self._stopped(error)
+                continue
+            except BaseException as error:
+                self._source.report(f"{task.name}: failed: {error}")
+                raise
+            if self._source.waits:
+                self._source.announce(_outcome(task, summary))
+            result = {"episodes": result["episodes"] + 1, **{key: summary[key] for key in _KEPT}}
+        trip = self.latch.tripped
+        if self._failure is not None and trip:
+            # What stopped it was reported then.
+            raise SafetyStop(
+                f"the run ended while the robot was stopped by rule {trip.rule}",
+                next=f"say {REARM!r} before it ends, once the cause is removed",
+            )
+        return result
+
+    def play(self, equipment: Equipment, settings: EpisodeSettings, task: Task) -> None:
+        """Run the next episode.
+
+        Raises:
+            Exception: what ended it before its time; the robot is stopped by then.
+        """
+        number, before = self._history.episodes, self._history.commanded
+        held = self._holding is not None
+        episode = Episode(equipment, settings, task, number, self._seed + number, before, held)
+        try:
+            episode.run()
+        finally:
+            self._history.commanded = episode.commanded
+            self.stop_failure = episode.stop_failure
+        self._history.episodes += 1
+        if not equipment.robot.lockstep:
+            self._holding = episode
+
+    def _stopped(self, error: FluxError) -> None:
+        """Go on, without motion, where somebody can say ``rearm``; else raise ``error``."""
+        self._holding = None
+        # A policy that still thinks cannot be asked again.
+        if not self._source.waits or self.thread.busy:
+            self._source.report(str(error))
+            raise error
+        self._failure = error
+        self.interrupts.resume()
+        self._source.announce(f"{error}\nstopped; {REARM!r} allows motion again")
+
+    def _idle(self) -> None:
+        self.interrupts.deferred = True
+        self.interrupts.check()
+        if self._holding is None:
+            time.sleep(_LOOK_S)
+            return
+        try:
+            self._holding.hold()
+        except (SafetyStop, NotReady) as error:
+            self._stopped(error)
+
+    def _heard(self, line: str) -> bool:
+        trip = self.latch.tripped
+        if not self._source.waits:
+            self.latch.check()
+        if line.casefold() != REARM:
+            if trip is not None:
+                self._source.announce(
+                    f"still stopped by rule {trip.rule}: {trip.what}\n"
+                    f"look at the robot, remove the cause, then say {REARM!r}"
+                )
+            return trip is not None
+        self.latch.rearm()
+        self._source.announce("nothing was stopped" if trip is None else "motion is allowed again")
+        return True
+
+
+def _outcome(task: Task, summary: Mapping[str, Any]) -> str:
+    """How a task ended, in a line."""
+    verdict = {True: ", success", False: ", no success", None: ""}[summary.get("success")]
+    return f"{task.name}: {summary['outcome']}{verdict}, {summary['steps']} commands"

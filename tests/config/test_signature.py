@@ -1,0 +1,599 @@
+"""What constructors take, read from source, across modules and base classes."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from fluxvla_core.build import parameters
+from fluxvla_core.config.inspection import inspect_signature, misfits
+from fluxvla_core.config.signature import Signature, argument_texts, read_signature
+from fluxvla_core.config.source import Opaque, Source, find, linearize
+from fluxvla_core.plugins._metadata import Plugin
+from tests.conftest import Install
+
+Read = Callable[..., Signature | None]
+
+
+@pytest.fixture
+def read(install: Install) -> Read:
+    """``read("Class", a="module text", …)``: the signature of ``a:Class``; modules are toy_<x>."""
+
+    def run(name: str, **modules: str) -> Signature | None:
+        install("fluxvla-toy", files={f"toy_{m}.py": text for m, text in modules.items()})
+        module = f"toy_{next(iter(modules))}"
+        return read_signature(
+            Plugin("fluxvla.runners", name, f"{module}:{name}", "fluxvla-toy", "1")
+        )
+
+    return run
+
+
+def required(signature: Signature | None) -> dict[str, bool]:
+    assert signature is not None
+    return {p.name: p.required for p in signature.parameters}
+
+
+def test_names_defaults_places_and_documentation(read: Read) -> None:
+    signature = read(
+        "R",
+        a='''class R:
+    """Runs.
+
+    More.
+    """
+
+    api = "1.0"
+
+    def __init__(self, lr: float, epochs: int = 3, *, seed=None, key):
+        pass
+
+    def run_setup(self, n_train_examples): ...
+''',
+    )
+    assert required(signature) == {"lr": True, "epochs": False, "seed": False, "key": True}
+    assert signature is not None
+    assert signature.place == "toy_a.py:1"
+    assert signature.parameters[1].place == "toy_a.py:9"
+    assert [p.text for p in signature.parameters] == [": float", ": int = 3", " = None", ""]
+    assert (signature.doc, signature.api, signature.open) == ("Runs.", "1.0", False)
+    assert signature.trains
+    assert not [m for m in sys.modules if m.startswith("toy_")]
+
+
+def test_a_class_without_a_constructor_takes_nothing(read: Read) -> None:
+    assert required(read("R", a="class R: pass\n")) == {}
+
+
+def test_kwargs_are_followed_into_bases_of_other_modules(read: Read) -> None:
+    signature = read(
+        "R",
+        a="""
+import toy_b as b
+class R(b.Middle):
+    def __init__(self, mine=1, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.mine = mine
+""",
+        b="""
+from toy_c import Base as _Base
+Middle0 = _Base
+class Middle(Middle0):
+    api = "1.0"
+    def __init__(self, rate=30, **kwargs):
+        super().__init__("first", rate=rate, fixed=2, **kwargs)
+""",
+        c="""
+class Base:
+    def __init__(self, cfg, rate, fixed, learning_rate, epochs=1): ...
+    def run_setup(self): ...
+""",
+    )
+    assert required(signature) == {
+        "mine": False,
+        "rate": False,
+        "learning_rate": True,
+        "epochs": False,
+    }
+    assert signature is not None
+    assert signature.api == "1.0"
+    assert not signature.open
+    assert not signature.trains
+    assert next(p for p in signature.parameters if p.name == "epochs").place == "toy_c.py:3"
+
+
+def test_kwargs_that_are_filled_popped_or_swallowed(read: Read) -> None:
+    base = "class Base:\n    def __init__(self, camera_names, operator, prepare): ...\n"
+    signature = read(
+        "R",
+        a="""
+from toy_b import Base
+class R(Base):
+    def __init__(self, **kwargs):
+        if kwargs.get('camera_names') is None:
+            kwargs['camera_names'] = ['front']
+        kwargs.setdefault('operator', {})
+        self.x = kwargs.pop('x', 1)
+        self.y = kwargs.pop('y')
+        Base.__init__(self, **kwargs)
+class Open(Base):
+    def __init__(self, seed, **kwargs):
+        self.rest = kwargs
+        other.__init__(1)
+""",
+        b=base,
+    )
+    assert required(signature) == {
+        "x": False,
+        "y": True,
+        "camera_names": False,
+        "operator": False,
+        "prepare": True,
+    }
+    source = Plugin("fluxvla.runners", "Open", "toy_a:Open", "fluxvla-toy", "1")
+    swallowing = read_signature(source)
+    assert swallowing is not None
+    assert swallowing.open
+    assert required(swallowing) == {"seed": True}
+
+
+def test_mixins_follow_the_method_resolution_order(read: Read) -> None:
+    signature = read(
+        "R",
+        a="""
+from typing import Generic, TypeVar, Protocol
+from abc import ABC
+import torch.nn as nn
+T = TypeVar('T')
+class Root(ABC):
+    def __init__(self, root): ...
+class Left(Root, Generic[T]):
+    def __init__(self, left, **kw): super().__init__(**kw)
+class Right(Root, Protocol):
+    def __init__(self, right, **kw): super().__init__(**kw)
+class R(Left[int], Right): ...
+class Net(nn.Module):
+    def __init__(self, width, **kw): super().__init__(**kw)
+""",
+    )
+    assert list(required(signature)) == ["left", "right", "root"]
+    net = read_signature(Plugin("fluxvla.vlas", "Net", "toy_a:Net", "fluxvla-toy", "1"))
+    assert required(net) == {"width": True}
+    assert net is not None
+    assert not net.open
+
+
+def test_a_base_that_cannot_be_read_leaves_the_signature_open(read: Read) -> None:
+    signature = read(
+        "R",
+        a="""
+from nowhere_installed import Base
+class R(Base):
+    def __init__(self, x, **kwargs): super().__init__(**kwargs)
+class Bare(Base): ...
+class Own(Base):
+    def __init__(self, x): super().__init__()
+class Made(make_base()):
+    pass
+""",
+    )
+    assert signature is not None
+    assert signature.open
+    for name, is_open in {"Bare": True, "Own": False, "Made": True}.items():
+        found = read_signature(Plugin("g", name, f"toy_a:{name}", "fluxvla-toy", "1"))
+        assert found is not None
+        assert found.open is is_open, name
+
+
+def test_dataclasses(read: Read) -> None:
+    signature = read(
+        "T",
+        a="""
+import dataclasses
+from dataclasses import dataclass, field, KW_ONLY
+from typing import ClassVar
+@dataclasses.dataclass
+class Base:
+    height: int
+    needs_rng: ClassVar[bool] = True
+@dataclass(frozen=True)
+class T(Base):
+    width: int = 3
+    _: KW_ONLY
+    keys: list = field(default_factory=list)
+    cache: dict = field(init=False)
+    must: str = field(repr=False)
+    def method(self): ...
+    plain = 3
+""",
+    )
+    assert required(signature) == {"height": True, "width": False, "keys": False, "must": True}
+
+
+def test_fields_of_a_dataclass_are_described_where_they_stand(read: Read) -> None:
+    signature = read(
+        "T",
+        a='''
+from dataclasses import dataclass, field
+@dataclass
+class Base:
+    """A base.
+
+    Args:
+        height: of the picture
+        width: of the base
+    """
+    height: int = 1
+    width: int = 2
+@dataclass
+class T(Base):
+    width: int = 3
+    """Of the picture,
+    in pixels."""
+    names: tuple[str, ...] = field(default=())
+    rates: dict[str, float] = field(default_factory=dict)
+    height: int = 4
+''',
+    )
+    assert signature is not None
+    assert signature.meanings == {"height": "of the picture", "width": "Of the picture, in pixels."}
+    assert {p.name: p.text for p in signature.parameters} == {
+        "height": ": int = 4",
+        "width": ": int = 3",
+        "names": ": tuple[str, ...] = ()",
+        "rates": ": dict[str, float] = dict()",
+    }
+
+
+OPTIONS = '''
+from typing import ClassVar
+from toy_b import options as _options
+from toy_b.options import Base
+class Runner:
+    """A runner.
+
+    Args:
+        cfg: the config
+        rate: as this runner takes it
+    """
+    Options: ClassVar[type[Base]] = _options.Base
+    def __init__(self, cfg, *, seed=0, **options):
+        self.extra = options.pop("extra", None)
+        self.options = self.Options(**options)
+class Derived(Runner):
+    Options = _options.More
+    def __init__(self, mine=1, **kwargs):
+        kwargs.setdefault("must", 3)
+        super().__init__(rate=5, **kwargs)
+class Bare(Derived): ...
+class Nested(Runner):
+    @_options.dataclass
+    class Options(Runner.Options):
+        inner: int = 1
+class Other(Runner):
+    def __init__(self, **kwargs):
+        self.kwargs = kwargs
+class Plain(Runner):
+    Options = dict
+'''
+
+
+def test_options_that_a_dataclass_states(read: Read) -> None:
+    def signature(name: str) -> Signature:
+        found = read_signature(Plugin("fluxvla.runners", name, f"toy_a:{name}", "fluxvla-toy", "1"))
+        assert found is not None
+        return found
+
+    options = """
+from dataclasses import dataclass
+@dataclass(frozen=True)
+class Base:
+    must: int
+    rate: float = 30.0
+    "Commands a second."
+    steps: int = 1
+    "Steps."
+@dataclass(frozen=True, kw_only=True)
+class More(Base):
+    shards: int = 2
+    "Shards."
+"""
+    read("Runner", a=OPTIONS, **{"b/__init__": "", "b/options": options})
+    runner = signature("Runner")
+    assert required(runner) == {
+        "cfg": True,
+        "seed": False,
+        "extra": False,
+        "must": True,
+        "rate": False,
+        "steps": False,
+    }
+    assert not runner.open
+    assert runner.meanings == {
+        "cfg": "the config",
+        "rate": "as this runner takes it",
+        "steps": "Steps.",
+    }
+    places = {p.name: p.place for p in runner.parameters}
+    assert places["steps"] == "toy_b/options.py:8"
+    derived = required(signature("Derived"))
+    assert derived == {
+        "mine": False,
+        "cfg": True,
+        "seed": False,
+        "extra": False,
+        "must": False,  # filled in
+        "steps": False,
+        "shards": False,  # of its own Options; not rate, which it passes itself
+    }
+    assert required(signature("Bare")) == derived
+    assert signature("Bare").meanings["shards"] == "Shards."
+    assert {"inner", "steps"} <= required(signature("Nested")).keys()
+    for name in ("Other", "Plain"):  # another keyword's name, and no dataclass
+        assert signature(name).open
+        assert "steps" not in required(signature(name))
+
+
+def test_re_exports_aliases_stars_and_lazy_tables(install: Install) -> None:
+    install(
+        "fluxvla-toy",
+        files={
+            "toy_pkg/__init__.py": (
+                "from __future__ import annotations\n"
+                "import importlib\n"
+                "from .sub import *\n"
+                "from . import deep as d\n"
+                "_EXPORTS: dict[str, str] = {'Lazy': 'toy_pkg.lazy', 'Other': 'toy_pkg.lazy'}\n"
+                "Alias = d.Deep\n"
+                "if True:\n    from .tried import Tried\n"
+                "else:\n    Tried = None\n"
+                "try:\n    from .tried import Again\nexcept ImportError:\n    class Again: pass\n"
+            ),
+            "toy_pkg/sub.py": "class Star:\n    class Inner: ...\n",
+            "toy_pkg/deep.py": "class Deep: ...\n",
+            "toy_pkg/lazy.py": "class Lazy: ...\n",
+            "toy_pkg/tried.py": "class Tried: ...\nclass Again: ...\n",
+            "toy_user.py": (
+                "import toy_pkg\nimport toy_pkg.deep\nfrom toy_pkg import deep\n"
+                "class A(toy_pkg.Lazy): ...\n"
+                "class B(toy_pkg.deep.Deep): ...\n"
+                "class C(deep.Deep): ...\n"
+            ),
+        },
+    )
+    for dotted in ("Star", "Star.Inner", "Lazy", "Alias", "Tried", "Again", "sub.Star"):
+        found = find("toy_pkg", dotted)
+        assert isinstance(found, Source), dotted
+    assert find("toy_pkg", "Gone") == Opaque("toy_pkg.Gone")
+    assert find("toy_pkg", "Star.Gone") == Opaque("toy_pkg.Star.Gone")
+    assert find("toy_gone", "X") == Opaque("toy_gone.X")
+    for name in "ABC":
+        cls = find("toy_user", name)
+        assert isinstance(cls, Source)
+        assert len(linearize(cls)) == 2
+        assert isinstance(linearize(cls)[1], Source)
+    assert not [m for m in sys.modules if m.startswith("toy_")]
+
+
+def test_the_cores_own_lazy_names_are_followed() -> None:
+    found = find("fluxvla_core", "RunContext")
+    assert isinstance(found, Source)
+    assert found.place.startswith("fluxvla_core/build.py:")
+
+
+def test_relative_imports_over_several_levels(install: Install) -> None:
+    install(
+        "fluxvla-toy",
+        files={
+            "toy_deep/__init__.py": "from ._base import Base\n",
+            "toy_deep/_base.py": "class Base: ...\n",
+            "toy_deep/a/__init__.py": "",
+            "toy_deep/a/b.py": (
+                "from ... import toy_none\nfrom .. import _base\nfrom .._base import Base\n"
+                "class A(Base): ...\nclass B(_base.Base): ...\n"
+            ),
+        },
+    )
+    for name in "AB":
+        cls = find("toy_deep.a.b", name)
+        assert isinstance(cls, Source)
+        assert isinstance(linearize(cls)[1], Source)
+
+
+def test_bases_that_python_would_refuse_are_still_listed(install: Install) -> None:
+    text = "class A: ...\nclass B(A): ...\nclass C(A, B): ...\n"
+    install("fluxvla-toy", files={"toy_bad.py": text})
+    cls = find("toy_bad", "C")
+    assert isinstance(cls, Source)
+    assert len(linearize(cls)) == 3
+
+
+def test_circular_imports_end(install: Install) -> None:
+    install(
+        "fluxvla-toy",
+        files={"toy_a.py": "from toy_b import X\n", "toy_b.py": "from toy_a import X\n"},
+    )
+    assert isinstance(find("toy_a", "X"), Opaque)
+
+
+def test_a_source_that_does_not_parse_gives_no_signature(read: Read) -> None:
+    assert read("R", a="class R(:\n") is None
+
+
+def test_a_function_behind_an_entry_point(read: Read) -> None:
+    signature = read("make", a='def make(a, b=1, **kw):\n    """Makes."""\n')
+    assert required(signature) == {"a": True, "b": False}
+    assert signature is not None
+    assert (signature.open, signature.doc) == (True, "Makes.")
+
+
+def test_linearize_matches_python(install: Install) -> None:
+    text = (
+        "class O: ...\nclass A(O): ...\nclass B(O): ...\nclass C(O): ...\n"
+        "class D(A, B): ...\nclass E(B, C): ...\nclass F(D, E): ...\n"
+    )
+    install("fluxvla-toy", files={"toy_mro.py": text})
+    space: dict[str, Any] = {}
+    exec(text, space)
+    cls = find("toy_mro", "F")
+    assert isinstance(cls, Source)
+    names = [s.node.name for s in linearize(cls) if isinstance(s, Source)]
+    assert names == [c.__name__ for c in space["F"].__mro__[:-1]]
+
+
+# -- classes that this process registered ----------------------------------------------------
+
+
+class Base:
+    """Registered here.
+
+    Second line.
+    """
+
+    api = "1.0"
+
+    def __init__(self, cfg: dict[str, int], rate: int = 30) -> None: ...
+
+    def run_setup(self, n_train_examples: int) -> None: ...
+
+
+class Sub(Base):
+    def __init__(self, mine: int, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("cfg", {})
+        super().__init__(*args, **kwargs)
+
+
+class Swallows(Base):
+    def __init__(self, mine: int, **kwargs: Any) -> None:
+        self.kwargs = kwargs
+
+
+@dataclasses.dataclass
+class Data:
+    a: int
+    b: int = 2
+
+
+def test_a_class_of_this_process() -> None:
+    signature = inspect_signature(Sub)
+    assert required(signature) == {"mine": True, "cfg": False, "rate": False}
+    assert not signature.open
+    assert signature.trains
+    assert signature.api == "1.0"
+    assert signature.place.endswith(f"test_signature.py:{_line('class Sub')}")
+    assert inspect_signature(Base).doc == "Registered here."
+    assert inspect_signature(Swallows).open
+    assert required(inspect_signature(Data)) == {"a": True, "b": False}
+    assert required(inspect_signature(type("Made", (), {}))) == {}
+    assert inspect_signature(type("Made", (ValueError,), {})).open
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings.
+
+    Args:
+        rate: commands a second
+    """
+
+    must: int
+    rate: float = 30.0
+    steps: int = 1
+    """Steps."""
+    left_out: int = dataclasses.field(default=0, init=False)
+
+
+class Configured:
+    Options = Settings
+
+    def __init__(self, cfg: dict[str, int], **options: Any) -> None:
+        self.options = self.Options(**options)
+
+
+def test_options_of_a_class_of_this_process() -> None:
+    signature = inspect_signature(Configured)
+    assert required(signature) == {"cfg": True, "must": True, "rate": False, "steps": False}
+    assert not signature.open
+    assert signature.meanings == {"rate": "commands a second", "steps": "Steps."}
+    assert signature.parameters[2].text == ": 'float' = 30.0"
+    place = signature.parameters[1].place
+    assert place.endswith(f"test_signature.py:{_line('class Settings') - 1}")
+    assert parameters(Configured) == {"cfg", "must", "rate", "steps"}
+    assert [str(one) for one in misfits(Configured, {"rate": "fast"})] == [
+        "'rate' must be float, got 'fast'"
+    ]
+
+
+def test_a_class_without_readable_source_is_taken_to_pass_its_kwargs_on() -> None:
+    space: dict[str, Any] = {"Base": Base}
+    exec(
+        "class Cell(Base):\n  def __init__(self, x, **kw): super().__init__(**kw)\n",
+        space,
+    )
+    signature = inspect_signature(space["Cell"])
+    assert required(signature) == {"x": True, "cfg": True, "rate": False}
+
+
+def test_a_torch_module_takes_no_parameters_of_its_own() -> None:
+    nn = pytest.importorskip("torch.nn")
+
+    class Net(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self, width: int, **kwargs: Any) -> None:
+            super().__init__(**kwargs)
+
+    signature = inspect_signature(Net)
+    assert required(signature) == {"width": True}
+    assert not signature.open
+
+
+def test_what_is_no_class() -> None:
+    with pytest.raises(TypeError, match="is not a class"):
+        inspect_signature(print)
+
+
+def _line(text: str) -> int:
+    import inspect
+
+    source = inspect.getsource(sys.modules[__name__])
+    node = next(
+        n
+        for n in ast.parse(source).body
+        if isinstance(n, ast.ClassDef) and text == f"class {n.name}"
+    )
+    return node.lineno
+
+
+# -- docstrings -----------------------------------------------------------------------------
+
+DOCSTRING = """A class.
+
+    Args:
+        height, width: of the pictures,
+            in pixels: both.
+
+        rate (float): commands a second.
+        **options: whatever
+            the driver takes.
+
+    Raises:
+        ValueError: no argument.
+    """
+
+
+def test_the_arguments_of_a_docstring() -> None:
+    assert argument_texts(DOCSTRING) == {
+        "height": "of the pictures, in pixels: both.",
+        "width": "of the pictures, in pixels: both.",
+        "rate": "commands a second.",
+        "options": "whatever the driver takes.",
+    }
+
+
+@pytest.mark.parametrize("text", [None, "", "A class.", "Args:", "Args:\n\nnothing: at all"])
+def test_a_docstring_without_any(text: str | None) -> None:
+    assert argument_texts(text) == {}

@@ -26,12 +26,12 @@ HEIGHT, WIDTH = 480, 640
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The evaluation engine: workers, episode log, records."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluate.episode_log import EpisodeKey, open_episode_log
-    from fluxvla_core.evaluate.episodes import run_in_pool
-    from fluxvla_core.evaluate.policies import Source
-    from fluxvla_core.evaluate.pool import WorkerPool
-    from fluxvla_core.evaluate.rollout import RolloutSettings
-    from fluxvla_core.evaluate.worker import Settings
+    from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
+    from fluxvla_core.evaluation.episodes import run_in_pool
+    from fluxvla_core.evaluation.policies import Source
+    from fluxvla_core.evaluation.pool import WorkerPool
+    from fluxvla_core.evaluation.rollout import RolloutSettings
+    from fluxvla_core.evaluation.worker import Settings
     from fluxvla_core.plugins.files import load_plugin_files
 
     load_plugin_files([__file__])
@@ -65,7 +65,7 @@ class _Worker:
         self.settings = settings
 
     def __call__(self) -> Any:
-        from fluxvla_core.evaluate.worker import EpisodeWorker
+        from fluxvla_core.evaluation.worker import EpisodeWorker
 
         work, ended = EpisodeWorker(self.settings), time.process_time()
 

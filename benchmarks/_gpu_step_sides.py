@@ -20,9 +20,9 @@ from benchmarks._pi05_model import SIZES, BenchPi05
 from fluxvla_core import RunContext, build_runner_from_cfg
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.train import memory
-from fluxvla_core.train.batches import StepPlan, StepSampler
-from fluxvla_core.train.model import checkpoint_activations, compile_units, units_of
+from fluxvla_core.training import memory
+from fluxvla_core.training.batches import StepPlan, StepSampler
+from fluxvla_core.training.model import checkpoint_activations, compile_units, units_of
 
 OURS, HAND = "runner", "by hand"
 KEYS = ("images", "lang_tokens", "lang_masks", "actions", "noise", "time")
@@ -113,9 +113,9 @@ def our_config(setup: Setup) -> dict[str, Any]:
 
 def by_runner(setup: Setup, work_dir: Path) -> tuple[Callable[[int], float], Any]:
     """What does so many steps and gives the last loss, and the runner; nothing is saved."""
-    from fluxvla_core.train.state import Progress
-    from fluxvla_core.train.stop import StopRequest
-    from fluxvla_core.train.trainer import Trainer
+    from fluxvla_core.training.state import Progress
+    from fluxvla_core.training.stop import StopRequest
+    from fluxvla_core.training.trainer import Trainer
 
     config = our_config(setup)
     context = RunContext(config=config, section="runner", work_dir=work_dir)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from benchmarks import _results
 from fluxvla_core import RUNNERS, VLAS, BaseTrainRunner, RunContext, build_runner_from_cfg
 from fluxvla_core.testing.training import TinyDataset
-from fluxvla_core.train.saving import Saver
+from fluxvla_core.training.saving import Saver
 
 MOST_RATIO = 0.10
 WIDTH = 4096

@@ -38,13 +38,13 @@ from fluxvla_sim.expert import SimExpert
 
 from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.evaluate.collect import demonstrate
-from fluxvla_core.evaluate.episode_log import EpisodeKey, open_episode_log
-from fluxvla_core.evaluate.episodes import run_in_pool
-from fluxvla_core.evaluate.policies import Source
-from fluxvla_core.evaluate.pool import WorkerPool
-from fluxvla_core.evaluate.rollout import RolloutSettings, find_task, run_episode
-from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
+from fluxvla_core.evaluation.collect import demonstrate
+from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
+from fluxvla_core.evaluation.episodes import run_in_pool
+from fluxvla_core.evaluation.policies import Source
+from fluxvla_core.evaluation.pool import WorkerPool
+from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera
 
 CAMERA = Camera("top", 144, 192)

@@ -61,7 +61,7 @@ def measure(python: Path | str, words: Mapping[str, Any], variables: Mapping[str
 def placements(checkpoint: str, workers: int, episodes: int) -> dict[str, float]:
     """Control steps a second of a checkpoint's policy: in each worker, or one for all of them."""
     from fluxvla_core.build import RunContext
-    from fluxvla_core.evaluate.runner import EvalRunner
+    from fluxvla_core.evaluation.runner import EvalRunner
 
     found = {}
     for serve in (False, True):

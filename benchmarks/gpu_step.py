@@ -34,7 +34,7 @@ from benchmarks import _results
 from benchmarks._gpu_step_sides import HAND, OURS, Setup, measure
 from benchmarks._pi05_model import ATTENTION, SIZES, BenchPi05
 from fluxvla_core.testing.training import run_ranks
-from fluxvla_core.train import memory
+from fluxvla_core.training import memory
 
 RATE_GOAL, MFU_GOAL = 25.0, 0.35
 LONGEST_S = 3600.0

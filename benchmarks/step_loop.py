@@ -164,9 +164,9 @@ def by_hand(kind: str, name: str) -> Callable[[int], None]:
 
 def by_runner(kind: str, name: str, work_dir: Path) -> Callable[[int], None]:
     """A function that lets the runner's loop do so many steps; checkpoints are not written."""
-    from fluxvla_core.train.state import Progress
-    from fluxvla_core.train.stop import StopRequest
-    from fluxvla_core.train.trainer import Trainer
+    from fluxvla_core.training.state import Progress
+    from fluxvla_core.training.stop import StopRequest
+    from fluxvla_core.training.trainer import Trainer
 
     config = {
         "model": {"type": name},

@@ -37,10 +37,10 @@ from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
-from fluxvla_core.train.lora import LoraOptions
-from fluxvla_core.train.optim import SavedOptimizer
-from fluxvla_core.train.state import Progress, SavedTrainer
-from fluxvla_core.train.weights import SavedWeights
+from fluxvla_core.training.lora import LoraOptions
+from fluxvla_core.training.optim import SavedOptimizer
+from fluxvla_core.training.state import Progress, SavedTrainer
+from fluxvla_core.training.weights import SavedWeights
 
 CASES = 60
 MANY = 3000

@@ -157,8 +157,8 @@ def test_only_public_names_are_imported(path):
 
 
 def test_a_private_import_is_found():
-    planted = "def f():\n    from fluxvla_core.train.optim import trainable\n"
-    assert private(planted) == ["fluxvla_core.train.optim: trainable"]
+    planted = "def f():\n    from fluxvla_core.training.optim import trainable\n"
+    assert private(planted) == ["fluxvla_core.training.optim: trainable"]
     assert private("from fluxvla_core.training import _NEED") == ["fluxvla_core.training: _NEED"]
 
 
@@ -187,7 +187,7 @@ def test_every_module_is_public_or_protected():
 def test_the_linter_refuses_a_plugin_that_imports_what_is_not_public(tmp_path):
     for name, line in {
         "fluxvla_good": "from fluxvla_core.training import BaseTrainRunner",
-        "fluxvla_bad": "from fluxvla_core.train.base_runner import BaseTrainRunner",
+        "fluxvla_bad": "from fluxvla_core.training.base_runner import BaseTrainRunner",
     }.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text(line + "\n")
@@ -207,4 +207,4 @@ def test_the_linter_refuses_a_plugin_that_imports_what_is_not_public(tmp_path):
             check=False,
         )
         assert done.returncode == code, done.stdout + done.stderr
-        assert ("fluxvla_bad -> fluxvla_core.train.base_runner" in done.stdout) == bool(code)
+        assert ("fluxvla_bad -> fluxvla_core.training.base_runner" in done.stdout) == bool(code)

@@ -18,7 +18,7 @@ _EXPORTS: dict[str, str] = {
     "ActionFilter": "fluxvla_core.contracts.robot",
     "Actor": "fluxvla_core.contracts.policy",
     "BaseInferenceRunner": "fluxvla_core.robot.runner",
-    "BaseTrainRunner": "fluxvla_core.train.base_runner",
+    "BaseTrainRunner": "fluxvla_core.training.base_runner",
     "Camera": "fluxvla_core.spec.embodiment",
     "Collator": "fluxvla_core.contracts.training",
     "Command": "fluxvla_core.contracts.runner",

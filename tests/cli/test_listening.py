@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.testing.ros2 import ros_domain
-from tests.evaluate.conftest import WALKING
+from tests.evaluation.conftest import WALKING
 
 from .jobs import linux, outside, seen_outside
 

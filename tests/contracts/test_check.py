@@ -19,7 +19,7 @@ from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import REGISTRIES
-from fluxvla_core.train.metrics import VLAMetric
+from fluxvla_core.training.metrics import VLAMetric
 
 
 class Train:

@@ -20,10 +20,10 @@ HEAVY = {
 }
 # Rooms that are about a heavy package may import it at the top of a module.
 AT_HOME = {
-    "torch": {"checkpoints", "train", "data", "testing"},
+    "torch": {"checkpoints", "training", "data", "testing"},
     "numpy": {
-        *("data", "robot", "evaluate", "testing"),
-        *("train", "metrics", "ros2"),
+        *("data", "robot", "evaluation", "testing"),
+        *("training", "ros2"),
     },
     "av": {"data", "robot"},
     "pyarrow": {"data"},
@@ -61,7 +61,7 @@ def test_checking_a_config_imports_nothing_heavy(config: Path) -> None:
     assert loaded & HEAVY == set()
 
 
-@pytest.mark.parametrize("module", ["train.trainer", "checkpoints.tensors"])
+@pytest.mark.parametrize("module", ["training.trainer", "checkpoints.tensors"])
 def test_one_process_does_without_what_only_splits_tensors(module: str) -> None:
     """``torch.distributed.tensor`` takes a second; a run in one process has none of its tensors."""
     loaded = all_modules_after(f"import fluxvla_core.{module}")

@@ -10,7 +10,7 @@ import pytest
 from fluxvla_core.plugins.files import load_plugin_files
 from fluxvla_core.plugins.registry import ENVIRONMENTS
 from fluxvla_core.testing import EnvironmentConformance
-from tests.evaluate.conftest import WALKING
+from tests.evaluation.conftest import WALKING
 
 
 @pytest.fixture(autouse=True)

@@ -14,10 +14,10 @@ from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
-from fluxvla_core.train import distributed
-from fluxvla_core.train.state import Progress
-from fluxvla_core.train.stop import StopRequest
-from fluxvla_core.train.trainer import Trainer
+from fluxvla_core.training import distributed
+from fluxvla_core.training.state import Progress
+from fluxvla_core.training.stop import StopRequest
+from fluxvla_core.training.trainer import Trainer
 
 
 def two_ranks(work_dir):

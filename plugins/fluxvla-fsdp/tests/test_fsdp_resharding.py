@@ -15,9 +15,9 @@ from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.checkpoints.tensors import read_tensors
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config, train
-from fluxvla_core.train import distributed
-from fluxvla_core.train.stop import StopRequest
-from fluxvla_core.train.trainer import Trainer
+from fluxvla_core.training import distributed
+from fluxvla_core.training.stop import StopRequest
+from fluxvla_core.training.trainer import Trainer
 
 TOGETHER = 12
 """Samples of a step, over all processes."""

@@ -16,8 +16,8 @@ from fluxvla_libero.inference_runner import LiberoInferenceRunner
 from fluxvla_libero.suites import init_states, suite_tasks
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch, UsageError
-from fluxvla_core.evaluate.collect import demonstrate
 from fluxvla_core.evaluation import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera, RunContext
 
 SALAD = "pick_up_the_salad_dressing_and_place_it_in_the_basket"

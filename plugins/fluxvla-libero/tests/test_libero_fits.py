@@ -21,8 +21,6 @@ from fluxvla_libero.embodiment import (
 
 from fluxvla_core import build_environment_from_cfg
 from fluxvla_core.errors import FluxError, SpecMismatch
-from fluxvla_core.evaluate import worker
-from fluxvla_core.evaluate.worker import EpisodeWorker, Settings
 from fluxvla_core.evaluation import (
     EnvironmentSpec,
     RolloutSettings,
@@ -30,7 +28,9 @@ from fluxvla_core.evaluation import (
     TaskSpec,
     fit,
     make_policy,
+    worker,
 )
+from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
 from fluxvla_core.operators import Camera, EmbodimentSpec
 
 

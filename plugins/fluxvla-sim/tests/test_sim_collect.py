@@ -14,8 +14,8 @@ from fluxvla_sim.expert import SimExpert
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
-from fluxvla_core.evaluate.collect import demonstrate
 from fluxvla_core.evaluation import find_task
+from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera
 
 CAMERA = Camera("top", 48, 64)

@@ -15,7 +15,7 @@ from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
-    from fluxvla_core.evaluate.collect import Collection
+    from fluxvla_core.evaluation.collect import Collection
 
 DIR = "a LeRobot dataset: the folder that holds meta/"
 
@@ -206,7 +206,7 @@ class Collect:
         parser.once("--log-format", choices=("text", "json"), default="text", help="of progress")
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.evaluate.collect import Collection
+        from fluxvla_core.evaluation.collect import Collection
         from fluxvla_core.plugins.files import load_plugin_files
 
         load_plugin_files(args.plugin_files)
@@ -222,14 +222,14 @@ class Collect:
             width=args.width,
             failures=args.failures,
         )
-        record(collection, args)
+        collect_demonstrations(collection, args)
         return 0
 
 
-def record(collection: Collection, args: argparse.Namespace) -> None:
+def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> None:
     """Collect demonstrations as ``args`` says (out, workers, resume, log_format), with progress."""
     from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
-    from fluxvla_core.evaluate.collect import collect
+    from fluxvla_core.evaluation.collect import collect
 
     reporter = KeepAliveReporter(make_reporter(args.log_format))
     try:
@@ -261,7 +261,7 @@ def arguments(env: str, policy: str, settings: Sequence[str]) -> dict[str, Any]:
     from fluxvla_core.config.check import examine
     from fluxvla_core.config.overrides import parse_value
     from fluxvla_core.config.tree import Config
-    from fluxvla_core.evaluate.policies import EXPERT, resolve_name
+    from fluxvla_core.evaluation.policies import EXPERT, resolve_name
 
     tables: dict[str, Any] = {"environment": {"type": env}, "policy": {"type": policy}}
     origins = {"environment": f"--env {env}", "policy": f"--policy {policy}"}

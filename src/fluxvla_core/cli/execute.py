@@ -108,7 +108,7 @@ def _run_section(
         ranks.mark_started(plan.work_dir)
         return runner.run(dataset), TrainRunner.adapt(runner).late_stop
     except (RuntimeError, MemoryError, OSError) as error:
-        from fluxvla_core.train.memory import explain
+        from fluxvla_core.training.memory import explain
 
         known = explain(error)
         if known is None:

@@ -28,7 +28,7 @@ class Compare:
         parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.evaluate.compare import compare, describe, read
+        from fluxvla_core.evaluation.compare import compare, describe, read
 
         found = compare(read(args.a, args.group_a), read(args.b, args.group_b), args.common)
         say(json_text(found, indent=1) if args.json else "\n".join(describe(found)))
@@ -49,7 +49,7 @@ class Export:
         parser.add_argument("folder", metavar="DIR", help="the folder to make")
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.train.export import export
+        from fluxvla_core.training.export import export
 
         path = export(args.checkpoint, args.folder)
         size = (path / "model.safetensors").stat().st_size

@@ -352,7 +352,7 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
 
 
 def _model(config: Mapping[str, Any], checkpoint: Checkpoint, device: str) -> Any:
-    from fluxvla_core.train.weights import load_for_inference
+    from fluxvla_core.training.weights import load_for_inference
 
     if "model" not in config:
         raise CheckpointError(

@@ -33,9 +33,9 @@ from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
-from fluxvla_core.train import stop
-from fluxvla_core.train.base_runner import BaseTrainRunner
-from fluxvla_core.train.metrics import WALL_CLOCK
+from fluxvla_core.training import stop
+from fluxvla_core.training.base_runner import BaseTrainRunner
+from fluxvla_core.training.metrics import WALL_CLOCK
 
 __all__ = [
     "ACTIONS",
@@ -57,7 +57,11 @@ STATES, HORIZON, ACTIONS = 6, 2, 3
 SCALARS = ("trained", "frozen")
 """Kinds of parameters without dimensions that a ``TinyVLA`` can have."""
 KEYS = ("states", "actions", "noise", "sample_ids")
-PRELOAD = ("fluxvla_core.testing.training", "fluxvla_core.train.trainer", "torch.distributed.fsdp")
+PRELOAD = (
+    "fluxvla_core.testing.training",
+    "fluxvla_core.training.trainer",
+    "torch.distributed.fsdp",
+)
 
 
 class Block(nn.Module):

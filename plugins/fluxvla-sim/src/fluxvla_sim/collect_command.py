@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 
 class CollectCommand:
-    """The command's arguments; the work is in ``fluxvla_core.evaluate.collect``."""
+    """The command's arguments; the work is in ``fluxvla_core.evaluation.collect``."""
 
     api: ClassVar[str] = "1.0"
     help: ClassVar[str] = "Record demonstrations of a scripted expert as a LeRobot v3.0 dataset."
@@ -48,8 +48,9 @@ class CollectCommand:
         )
 
     def run(self, args: Any) -> int:
+        from fluxvla_core.commands import collect_demonstrations
         from fluxvla_core.errors import UsageError
-        from fluxvla_core.evaluation import Collection, record
+        from fluxvla_core.evaluation import Collection
         from fluxvla_sim.environment import ENVIRONMENTS
 
         if args.workers < 1:
@@ -67,5 +68,5 @@ class CollectCommand:
             height=args.height,
             width=args.width,
         )
-        record(collection, args)
+        collect_demonstrations(collection, args)
         return 0

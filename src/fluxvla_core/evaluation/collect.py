@@ -1,0 +1,445 @@
+"""Demonstrations of a policy, a scripted expert as a rule, in any environment.
+
+Episode ``k`` is acted out with seed ``seed + k``; where the expert fails, or the simulation
+diverges, with the next of that episode's own spare seeds. What it shows follows from ``k`` alone,
+so the dataset is the same for any number of workers, and a collection that was interrupted can go
+on.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.build import build_environment_from_cfg, build_policy_from_cfg
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
+from fluxvla_core.evaluation.divergence import Diverged, check_step
+from fluxvla_core.evaluation.policies import fit, resolve_name
+from fluxvla_core.evaluation.pool import Outcome, run_jobs
+from fluxvla_core.evaluation.rollout import ChunkCommands, shaped
+from fluxvla_core.evaluation.worker import choose_tasks
+from fluxvla_core.robot.checks import not_finite
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.untrusted import checked, read_json
+
+META, SETTINGS = "meta", "collection.json"
+_GO_ON = "run the same command with --resume"
+
+
+SPARE_SEEDS = 6
+SPARE_STRIDE = 500_000_000
+"""Spare seeds lie this far apart: no other episode uses them, and all are below 2**32."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What a dataset follows from.
+
+    Args:
+        environment: the table of a registered environment.
+        policy: the table of a registered policy, ``expert`` for the environment's own, or
+            ``random``.
+        episodes: how many demonstrations; tasks take turns, or follow each other where going from
+            one to another takes long.
+        tasks: names; all of the environment's by default.
+        seed: of the first episode.
+        cameras: names; all of the environment's by default.
+        height, width: of all pictures; each camera's own by default.
+        failures: also keep episodes in which the task was not done.
+
+    Raises:
+        ConfigError: a value is impossible.
+    """
+
+    environment: Mapping[str, Any]
+    episodes: int
+    policy: str | Mapping[str, Any] = "expert"
+    tasks: tuple[str, ...] | None = None
+    seed: int = 10_000
+    cameras: tuple[str, ...] | None = None
+    height: int | None = None
+    width: int | None = None
+    failures: bool = False
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ConfigError(f"nothing to collect: {self.episodes} episodes")
+        if not 0 <= self.seed <= SPARE_STRIDE - self.episodes:
+            raise ConfigError(f"seed must be from 0 to {SPARE_STRIDE - self.episodes}")
+        for name, value in (("height", self.height), ("width", self.width)):
+            if value is not None and value < 16:
+                raise ConfigError(f"{name}: pictures of {value} pixels are too small")
+
+
+def collect(
+    out: str | Path,
+    collection: Collection,
+    workers: int = 2,
+    resume: bool = False,
+    reporter: Reporter | None = None,
+) -> dict[str, Any]:
+    """Collect demonstrations into the LeRobot v3.0 dataset ``out``; see ``collect_episodes``.
+
+    Raises:
+        ConfigError, PluginError, SpecMismatch: environment, policy, tasks or cameras do not fit.
+        DataError: there is a dataset already.
+        UsageError: there is an interrupted collection, or it had other settings.
+        RunFailed: the expert fails too often, workers cannot be started, or the disk is full.
+    """
+    environment = Environment.adapt(build_environment_from_cfg(collection.environment))
+    spec: EnvironmentSpec = environment.spec
+    actor = _actor(collection, environment)
+    environment.close()
+    choose_tasks(spec.tasks, collection.tasks)
+    fit(actor, spec)
+    cameras = _cameras(collection, spec)
+    fps = spec.embodiment.rate_hz / frame_stride(actor, spec)
+    return collect_episodes(
+        Path(out),
+        fps,
+        replace(spec.embodiment, cameras=cameras),
+        partial(Demonstrator, collection),
+        collection.episodes,
+        {**asdict(collection), "details": dict(spec.details)},
+        workers,
+        resume,
+        reporter or SilentReporter(),
+    )
+
+
+class Demonstrator:
+    """A worker: acts out the episode of a number, with spare seeds where the expert fails."""
+
+    def __init__(self, collection: Collection) -> None:
+        self._collection = collection
+        self._environment = Environment.adapt(build_environment_from_cfg(collection.environment))
+        self._spec = self._environment.spec
+        self._actor = _actor(collection, self._environment)
+        self._tasks = choose_tasks(self._spec.tasks, collection.tasks)
+        self._cameras = _cameras(collection, self._spec)
+
+    def __call__(self, episode: int) -> Demonstration:
+        """The episode.
+
+        Raises:
+            RunFailed: the expert failed with every seed.
+        """
+        collection = self._collection
+        task = task_of(episode, collection.episodes, self._tasks, self._spec.keep_together)
+        first, diverged = collection.seed + episode, ""
+        for spare in range(SPARE_SEEDS):
+            seed = first + spare * SPARE_STRIDE
+            try:
+                found, success = demonstrate(
+                    self._environment, self._actor, task, seed, self._cameras
+                )
+            except Diverged as error:  # teaches nothing, not even how to fail
+                diverged = f"; the last simulation that diverged: {error.what}"
+                continue
+            if success or collection.failures:
+                return replace(found, retried=spare)
+        raise RunFailed(
+            f"the expert failed {task.name} with {SPARE_SEEDS} seeds in a row, from {first} on"
+            f"{diverged}",
+            cause="noise is too much for it, or the task is",
+            next="collect with less noise, or other tasks",
+        )
+
+
+def demonstrate(
+    environment: Environment, actor: Actor, task: TaskSpec, seed: int, cameras: Sequence[Camera]
+) -> tuple[Demonstration, bool]:
+    """Act out ``task`` and record its first ``record_steps`` steps.
+
+    A frame is what is seen before its steps; its action is what the actor wants to have reached at
+    the next frame: the first action of its chunk. What is executed on the way there is the actor's
+    ``executed``, or leads straight to it. So noise can be in what is done and not in what is
+    taught, which leads back (Laskey et al., "DART", CoRL 2017).
+
+    Returns:
+        The episode, and whether the task was done, judged over all of it.
+
+    Raises:
+        SpecMismatch: the actor's chunk is of another shape.
+        RunFailed: it is not finite.
+        Diverged: the simulation is not what it was.
+    """
+    environment, actor = Environment.adapt(environment), Actor.adapt(actor)
+    spec = environment.spec
+    environment.reset(seed, task.name)
+    actor.enter(environment)
+    actor.reset(seed)
+    commands = ChunkCommands(spec, actor.action_rate_hz)
+    commands.start(environment.state)
+    images: dict[str, list[npt.NDArray[np.uint8]]] = {camera.name: [] for camera in cameras}
+    states, actions = [], []
+    recorded = task.max_steps if task.record_steps is None else task.record_steps
+    steps, success, ended, instruction = 0, False, False, task.instruction
+    while not ended and steps < task.max_steps:
+        teaches = steps < recorded
+        observation = environment.observe(cameras if teaches else ())
+        chunk = _checked(actor.predict_action(observation), spec)
+        if teaches:
+            for name, pictures in images.items():
+                pictures.append(observation["images"][name])
+            instruction = observation["task_description"]
+            states.append(np.array(environment.state))
+            actions.append(chunk[0].copy())
+        own = actor.executed
+        targets = commands.targets(chunk[:1]) if own is None else _checked(own, spec)
+        for target in targets:
+            found = environment.step(commands.command(target))
+            steps += 1
+            check_step(environment, steps)
+            success, ended = bool(found.success), bool(found.ended)
+            if ended or steps >= task.max_steps:
+                break
+    stacked = {name: np.stack(pictures) for name, pictures in images.items()}
+    return Demonstration(stacked, np.stack(states), np.stack(actions), instruction), success
+
+
+def frame_stride(actor: Actor, spec: EnvironmentSpec) -> int:
+    """Control steps from frame to frame: a frame is an action of the actor.
+
+    Raises:
+        ConfigError: the actor's rate does not divide the environment's.
+    """
+    own = actor.action_rate_hz
+    rate = float(spec.embodiment.rate_hz if own is None else own)
+    stride = round(spec.embodiment.rate_hz / rate) if rate > 0 else 0
+    if stride < 1 or abs(stride * rate - spec.embodiment.rate_hz) > 1e-9 * rate:
+        raise ConfigError(
+            f"the policy's {rate:g} actions a second do not divide {spec.name}'s "
+            f"{spec.embodiment.rate_hz:g} steps"
+        )
+    return stride
+
+
+def task_of(episode: int, episodes: int, tasks: Sequence[TaskSpec], together: bool) -> TaskSpec:
+    """The task of an episode: they take turns, or follow each other."""
+    if together:
+        return tasks[episode * len(tasks) // episodes]
+    return tasks[episode % len(tasks)]
+
+
+def _checked(chunk: Any, spec: EnvironmentSpec) -> npt.NDArray[np.float64]:
+    """Nothing can be learned from a chunk that is not finite."""
+    array = shaped(chunk, spec.embodiment.dim)
+    problem = not_finite(array, spec.embodiment.joint_names)
+    if problem is not None:
+        raise RunFailed(problem)
+    return array
+
+
+def _actor(collection: Collection, environment: Environment) -> Actor:
+    what = resolve_name(collection.policy, environment)
+    if isinstance(what, str):
+        raise ConfigError(
+            f"policy {what!r} demonstrates nothing: its actions are what was learned",
+            next="evaluate it: fluxvla run --section eval",
+        )
+    return Actor.adapt(build_policy_from_cfg(what))
+
+
+def _cameras(collection: Collection, spec: EnvironmentSpec) -> tuple[Camera, ...]:
+    known = {camera.name: camera for camera in spec.embodiment.cameras}
+    names = tuple(known) if collection.cameras is None else collection.cameras
+    for name in names:
+        if name not in known:
+            raise ConfigError(
+                f"{spec.name} has no camera {name!r}; it has {', '.join(known) or 'none'}"
+            )
+    return tuple(
+        replace(
+            known[name],
+            height=collection.height or known[name].height,
+            width=collection.width or known[name].width,
+        )
+        for name in names
+    )
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode.
+
+    Args:
+        images: camera name -> ``(N, H, W, 3)`` uint8.
+        states: ``(N, S)``; actions: ``(N, D)``, in the embodiment's units.
+        instruction: what was done.
+        retried: how many attempts failed before.
+    """
+
+    images: Mapping[str, npt.NDArray[np.uint8]]
+    states: npt.NDArray[np.float64]
+    actions: npt.NDArray[np.float64]
+    instruction: str
+    retried: int = 0
+
+
+def collect_episodes(
+    out: Path,
+    fps: float,
+    embodiment: EmbodimentSpec,
+    factory: Callable[[], Callable[[int], Demonstration]],
+    episodes: int,
+    settings: Mapping[str, Any],
+    workers: int,
+    resume: bool,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Collect ``episodes`` episodes into the dataset ``out``.
+
+    Args:
+        out: the dataset's folder; it must not exist yet.
+        fps: frames a second.
+        factory: makes, in a worker process, a function from an episode's number to the episode.
+        settings: what the dataset follows from, as JSON values; going on with other ones is
+            refused.
+        workers: processes that act, beside this one, which writes.
+        resume: go on with a collection into ``out`` that was interrupted.
+
+    Returns:
+        JSON values: ``episodes``; ``collected``, ``frames`` and ``retried`` of this call;
+        ``seconds``, ``frames_per_s``, ``workers``.
+
+    Raises:
+        DataError: there is a dataset already.
+        UsageError: there is an interrupted collection, or it had other settings.
+        RunFailed: an episode fails, workers cannot be started, or the disk is full.
+    """
+    from fluxvla_core.data.files import explain_disk, staging_of, write_json
+    from fluxvla_core.data.writer import LeRobotWriter
+
+    note = staging_of(out) / SETTINGS
+    if resume:
+        _check_same(note, settings)
+    elif note.parent.exists():
+        raise UsageError(
+            f"a collection into {out} was interrupted, or is under way",
+            next=f"add --resume to go on with it, or delete {note.parent}",
+        )
+    began, retried, frames = time.monotonic(), 0, 0
+    with LeRobotWriter(out, fps, embodiment, recover=resume, go_on=_GO_ON) as writer:
+        try:
+            write_json(note, dict(settings))
+        except OSError as error:
+            next = f"make room, then {_GO_ON}"
+            raise explain_disk(error, out, "no episode was lost", next) from error
+        kept = writer.episodes
+        jobs = range(kept, episodes)
+        with closing(run_jobs(factory, jobs, workers)) as outcomes:
+            for number, found in _in_order(outcomes, jobs):
+                for frame in range(len(found.states)):
+                    pictures = {name: stack[frame] for name, stack in found.images.items()}
+                    writer.add_frame(
+                        pictures, found.states[frame], found.actions[frame], found.instruction
+                    )
+                writer.save_episode(key=number)
+                retried += found.retried
+                frames += len(found.states)
+                pace = (number + 1 - kept) / (time.monotonic() - began)
+                reporter.progress("demonstrations", number + 1, episodes, per_s=round(pace, 2))
+    # Where it stays: whoever evaluates what was trained on it knows which seeds it has seen.
+    write_json(out / META / SETTINGS, dict(settings))
+    seconds = time.monotonic() - began
+    result = {
+        "episodes": episodes,
+        "collected": episodes - kept,
+        "frames": frames,
+        "retried": retried,
+        "seconds": seconds,
+        "frames_per_s": frames / max(seconds, 1e-9),
+        "workers": workers,
+    }
+    reporter.event("collected", **result)
+    reporter.artifact("dataset", out)
+    return result
+
+
+def _in_order(
+    outcomes: Iterator[Outcome], jobs: Sequence[int]
+) -> Iterator[tuple[int, Demonstration]]:
+    """Episodes in the order of their numbers; early ones wait."""
+    early: dict[int, Demonstration] = {}
+    following = 0
+    for outcome in outcomes:
+        if outcome.error is not None:
+            raise RunFailed(f"episode {jobs[outcome.index]} failed: {outcome.error}")
+        early[outcome.index] = outcome.result
+        while following in early:
+            yield jobs[following], early.pop(following)
+            following += 1
+
+
+def _check_same(note: Path, settings: Mapping[str, Any]) -> None:
+    if not note.exists():
+        return
+    before = read_json(note, dict[str, Any], DataError)
+    now = json.loads(json.dumps(dict(settings)))
+    other = [f"{k}: {before.get(k)} / {now[k]}" for k in now if before.get(k) != now[k]]
+    if other:
+        raise UsageError(
+            f"the interrupted collection had other settings: {'; '.join(other)}",
+            next=f"use the same settings, or delete {note.parent} and begin anew",
+        )
+
+
+def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | None:
+    """Whether none of ``seeds`` was among those that demonstrations were collected with.
+
+    Args:
+        tables: of a checkpoint's config, from which its datasets are found.
+        environment: the ``type`` of what is evaluated; seeds of another one mean something else.
+
+    Returns:
+        None where a dataset does not say how it was collected.
+    """
+    roots = list(_roots(tables))
+    collections = [_collection(Path(root)) for root in roots]
+    if not roots or None in collections:
+        return None
+    for collection in collections:
+        assert collection is not None
+        if collection["environment"].get("type") != environment:
+            continue
+        first, count = collection["seed"], collection["episodes"]
+        if any((seed - first) % SPARE_STRIDE < count for seed in seeds):
+            return False
+    return True
+
+
+def _roots(table: Any) -> Iterator[str]:
+    """Every ``data_root_path`` below ``table``."""
+    if isinstance(table, Mapping):
+        roots = table.get("data_root_path")
+        for root in roots if isinstance(roots, (list, tuple)) else [roots]:
+            if isinstance(root, str):
+                yield root
+        table = list(table.values())
+    if isinstance(table, (list, tuple)):
+        for value in table:
+            yield from _roots(value)
+
+
+def _collection(root: Path) -> dict[str, Any] | None:
+    try:
+        found = read_json(root / META / SETTINGS, dict[str, Any], DataError)
+        whole = {"environment": dict[str, Any], "seed": int, "episodes": int}
+        return {
+            name: checked(found.get(name), kind, DataError, name) for name, kind in whole.items()
+        }
+    except DataError:
+        return None

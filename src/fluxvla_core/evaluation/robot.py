@@ -1,0 +1,322 @@
+"""``RobotEvalRunner``: a policy's success rate on a robot, one episode after the other.
+
+What drives the robot is the config's inference section as it stands: its runner, its operator, all
+of its safety, in real time. A simulated robot begins every episode from a seed and tells whether
+the task was done; with a real one a person puts things in place and says so. Episodes that ended
+are kept, so an evaluation that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.errors import ConfigError, FluxError, RunFailed
+from fluxvla_core.evaluation import results
+from fluxvla_core.evaluation.episode_log import (
+    DONE,
+    ERROR,
+    EpisodeKey,
+    EpisodeLog,
+    open_episode_log,
+)
+from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
+from fluxvla_core.evaluation.provenance import Code, code_of, provenance
+from fluxvla_core.evaluation.results import choose_episodes
+from fluxvla_core.evaluation.statistics import problems, summarise
+from fluxvla_core.robot.runner import FOLDER as EPISODES
+
+FOLDER = "eval_robot"
+GROUP = "policy"
+POLICYS_FAULT = ("chunk", "policy", "starvation", "tracking")
+"""Rules of a safety stop that the policy is to blame for: the episode counts as a failure. After
+any other stop it counts as an error, which says nothing about the policy."""
+
+
+class RobotEvalRunner(Runner):
+    """Runs an inference section ``episodes`` times for each task: ``run_setup()``, then ``run()``.
+
+    Writes ``<work_dir>/eval_robot/``: ``results.json`` and ``episodes.jsonl``; each episode's own
+    record is in ``<work_dir>/inference/``.
+
+    Args:
+        cfg: the whole config (injected).
+        context: what the run knows (injected): work dir, reporter.
+        section: of the inference runner.
+        tasks: ids of the section's ``task_descriptions``, or name -> id, where results are to be
+            compared with others that have names of their own; all of them by default.
+        episodes: for each task.
+        seed: of each task's first episode, for the policy and, where the section's operator takes
+            one, for the scene; the others count up from it.
+        go_on: after a safety stop, go on with the next episode. Only for robots that can hurt
+            nobody: else somebody must look first, and start the same command again.
+        record_videos: how many episodes the results show: failures first, then successes.
+        answer: reads a person's line; stdin by default.
+        reuse: also count episodes that other code ran; without it that is asked.
+
+    Raises:
+        ConfigError: there is no such section, it has no such task, or a value is impossible.
+    """
+
+    api: ClassVar[str] = "1.0"
+    keeps_config: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        cfg: Mapping[str, Any] | None = None,
+        context: RunContext | None = None,
+        section: str = "inference",
+        tasks: Sequence[str] | Mapping[str, str] | None = None,
+        episodes: int = 20,
+        seed: int = 500,
+        go_on: bool = False,
+        record_videos: int = 4,
+        answer: Callable[[str], str] | None = None,
+        reuse: bool = False,
+    ) -> None:
+        self.context = context or RunContext(config=cfg or {})
+        self.section = section
+        self.episodes = episodes
+        self.seed = seed
+        self.go_on = go_on
+        self.record_videos = record_videos
+        self.folder = Path(self.context.work_dir) / FOLDER
+        self.reuse = reuse
+        self._answer = answer
+        table = self.context.config.get(section)
+        if not isinstance(table, Mapping):
+            raise self._wrong("section", f"{section!r} is none of the config's")
+        self._table = dict(table)
+        known = {str(key): text for key, text in table.get("task_descriptions", {}).items()}
+        self.tasks = _named(tasks, known)
+        for task in self.tasks.values():
+            if task not in known:
+                there = ", ".join(known) or "none"
+                raise self._wrong("tasks", f"{task!r} is no task of {section}; there are {there}")
+        if not self.tasks:
+            raise self._wrong("tasks", f"{section} has no task_descriptions to evaluate")
+        if episodes < 1:
+            raise self._wrong("episodes", f"must be at least 1, got {episodes}")
+        self._policy: Any = None
+        self._checkpoint: dict[str, Any] | None = None
+
+    def run_setup(self) -> None:
+        """Load the policy, and see that the section can run each of the tasks.
+
+        Raises:
+            FluxError: what the section's runner refuses.
+        """
+        if self._table.get("policy") is None:
+            work_dir = Path(self.context.work_dir)
+            self._checkpoint = chosen_checkpoint(self._table.get("ckpt_path"), work_dir)
+        for name in self.tasks:
+            self._policy = self._runner(EpisodeKey(GROUP, name, self.seed)).policy
+
+    def run(self) -> dict[str, Any]:
+        """Run the episodes that are not there yet, write ``results.json``, return what is in it.
+
+        Raises:
+            RunFailed: nobody can tell whether a task was done; an episode gave no result (the
+                results of the others are written).
+            UsageError: there are episodes that other code ran, and ``reuse`` is not set.
+            SafetyStop, OperatorError: what ended an episode, unless ``go_on``.
+        """
+        reporter, keys, about = self.context.reporter, self._keys(), self._about()
+        code = self._code()
+        path = self.folder / "episodes.jsonl"
+        log = open_episode_log(path, about, reporter, code=code.to_dict(), reuse=self.reuse)
+        missing = [key for key in keys if key not in log]
+        errors: dict[EpisodeKey, dict[str, Any]] = {}
+        began = time.monotonic()
+        if 0 < len(missing) < len(keys):
+            left = len(keys) - len(missing)
+            reporter.info(f"{left} of {len(keys)} episodes are there already; going on")
+        for key in missing:
+            record = self._episode(key, log)
+            if record["status"] == ERROR:
+                errors[key] = record
+            succeeded = sum(bool(r["success"]) for r in log.records(keys))
+            done = len(log.records(keys)) + len(errors)
+            reporter.progress("episodes", done, len(keys), successes=succeeded)
+        records = [errors[key] if key in errors else log.records([key])[0] for key in keys]
+        results.check_any_done(records, log.path)
+        found = {
+            "format": results.FORMAT,
+            "policy": "checkpoint" if self._checkpoint else type(self._policy).__name__,
+            "mode": "robot",
+            "groups": summarise(records),
+            "problems": problems(records),
+            "checkpoint": self._checkpoint,
+            "settings": {**about["settings"], **_kept_time(records)},
+            "provenance": {
+                **provenance(code),
+                "seeds": results.seeds(records),
+                "reused": {"episodes": len(log.reused), "changed": log.changed},
+            },
+            "videos": self._videos(records),
+            "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
+        }
+        path = self.folder / "results.json"
+        results.write_results(path, found)
+        results.keep_config(self.folder, self.context)
+        reporter.artifact("evaluation", path)
+        results.report_results(reporter, found, self.folder)
+        results.check_all_done(records, log.path)
+        return found
+
+    def _keys(self) -> list[EpisodeKey]:
+        seeds = range(self.seed, self.seed + self.episodes)
+        return [EpisodeKey(GROUP, name, seed) for seed in seeds for name in self.tasks]
+
+    def _about(self) -> dict[str, Any]:
+        """What outcomes follow from, as far as a config says."""
+        table = {k: v for k, v in self._table.items() if k not in ("seed", "ckpt_path")}
+        settings = {"section": self.section, **_flat(json.loads(json.dumps(table, default=str)))}
+        return {
+            "checkpoint": None if self._checkpoint is None else self._checkpoint["sha256"],
+            "settings": settings,
+        }
+
+    def _code(self) -> Code:
+        tables: list[Any] = [self._table]
+        if self._checkpoint is not None:
+            tables += policy_tables(self._checkpoint["path"])
+        return code_of(tables, (), () if self._checkpoint is None else ("torch",))
+
+    def _runner(self, key: EpisodeKey) -> Any:
+        """The section's runner for one episode: its policy is loaded once and handed on."""
+        table = {**self._table, "seed": key.seed}
+        if isinstance(table.get("operator"), Mapping) and "seed" in table["operator"]:
+            table["operator"] = {**table["operator"], "seed": key.seed}
+        if self._policy is not None:
+            table["policy"] = self._policy
+        context = replace(self.context, section=self.section, task=self.tasks[key.task])
+        runner = build_runner_from_cfg(table, context)
+        runner.run_setup()
+        return runner
+
+    def _episode(self, key: EpisodeKey, log: EpisodeLog) -> dict[str, Any]:
+        runner = self._runner(key)
+        simulated = runner.robot.simulated
+        if not simulated:
+            self._ask(f"{key.task}, episode {key.seed}: put things in place, then press Enter: ")
+        before, began, failure = set(self._folders()), time.monotonic(), None
+        try:
+            runner.run()
+        except FluxError as error:
+            failure = error
+        made = sorted(set(self._folders()) - before)
+        summary = _summary(made[-1]) if made else {}
+        if failure is not None and not summary:
+            raise failure
+        record = {**_head(key), "attempts": 1, **_tail(summary, time.monotonic() - began)}
+        record["folder"] = made[-1].relative_to(self.context.work_dir).as_posix()
+        record |= Operator.adapt(runner.ros_operator).episode_facts()
+        rules = [trip["rule"] for trip in summary["trips"]]
+        if failure is None and record["success"] is None:
+            record["success"] = self._judged(key)
+        elif failure is not None and rules[:1] and rules[0] in POLICYS_FAULT:
+            record["success"] = False
+        elif failure is not None:
+            record |= {"status": ERROR, "error": str(failure)}
+        log.add(record)
+        self.context.reporter.event("episode", **record)
+        if failure is not None:
+            if not self.go_on:
+                raise failure
+            self.context.reporter.warn(f"{key.task}, episode {key.seed}: {failure}")
+        return record
+
+    def _judged(self, key: EpisodeKey) -> bool:
+        while True:
+            said = self._ask(f"{key.task}, episode {key.seed}: was the task done? [y/n] ")
+            if said[:1].casefold() in ("y", "n"):
+                return said[:1].casefold() == "y"
+
+    def _ask(self, question: str) -> str:
+        if self._answer is not None:
+            return self._answer(question).strip()
+        if sys.stdin is None or not sys.stdin.isatty():
+            raise RunFailed(
+                "this robot cannot tell whether a task was done, and nobody is there to ask",
+                next="run the evaluation at a terminal, or give the operator a task_success()",
+            )
+        getattr(self.context.reporter, "settle", lambda: None)()
+        return input(question).strip()
+
+    def _folders(self) -> list[Path]:
+        return [p for p in (Path(self.context.work_dir) / EPISODES).glob("*-*") if p.is_dir()]
+
+    def _videos(self, records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        shown = []
+        for record in choose_episodes(records, self.record_videos):
+            folder = Path(self.context.work_dir) / record["folder"]
+            for video in sorted(folder.glob("*.mp4"))[:1]:
+                kept = {key: record[key] for key in ("group", "task", "seed", "success")}
+                shown.append({**kept, "path": f"../{record['folder']}/{video.name}"})
+        return shown
+
+    def _wrong(self, name: str, what: str) -> ConfigError:
+        where = self.context.where(f"{self.context.section}.{name}")
+        return ConfigError(f"{name}: {what}", where=where)
+
+
+def _named(
+    tasks: Sequence[str] | Mapping[str, str] | None, known: Mapping[str, str]
+) -> dict[str, str]:
+    """Name -> id."""
+    if isinstance(tasks, Mapping):
+        return {str(name): str(task) for name, task in tasks.items()}
+    return {str(task): str(task) for task in (known if tasks is None else tasks)}
+
+
+def _head(key: EpisodeKey) -> dict[str, Any]:
+    return {"group": key.group, "task": key.task, "seed": key.seed, "status": DONE}
+
+
+def _tail(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+    """Of an episode's summary what evaluations count, as JSON values."""
+    kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_beats")
+    answers = summary["timings"].get("policy", {"count": 0, "p50_ms": 0.0})
+    return {
+        **{name: summary.get(name) for name in kept},
+        "calls": summary["chunks"],
+        "timing": {
+            "seconds": seconds,
+            # An episode's record keeps percentiles; the mean of answers is near the median.
+            "policy_seconds": answers["count"] * answers["p50_ms"] / 1e3,
+        },
+    }
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    path = folder / "episode.json"
+    if not path.is_file():
+        return {}
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def _kept_time(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The lowest real-time factor that simulators report, if any does."""
+    kept = [r["real_time_kept"] for r in records if r.get("real_time_kept") is not None]
+    return {"least_real_time_kept": min(kept)} if kept else {}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"operator": {"type": …}}`` as ``{"operator.type": …}``: rows for people."""
+    rows: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            rows |= _flat(value, f"{prefix}{key}.")
+        else:
+            rows[f"{prefix}{key}"] = value
+    return rows

@@ -1,0 +1,213 @@
+"""One episode in an environment: observe, predict, execute some of the chunk, observe again.
+
+Time stands still while the policy thinks. In an environment whose actions are joint targets the
+commands are formed by the same path as on a robot: keyframes are joined linearly from the last
+command on and kept within the same limits. Other actions pass the limits unchanged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.errors import SpecMismatch
+from fluxvla_core.evaluation.divergence import check_state, check_step
+from fluxvla_core.robot.checks import not_finite
+from fluxvla_core.robot.commands import CommandFormer
+from fluxvla_core.robot.joining import interpolate
+from fluxvla_core.robot.limits import CommandLimiter, PassThrough
+from fluxvla_core.robot.tracking import action_columns
+from fluxvla_core.spec.embodiment import Camera
+
+Array = npt.NDArray[np.float64]
+Watch = Callable[[Environment, int], None]
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """How an episode is run, beside its environment, policy and key.
+
+    Args:
+        cameras: the pictures that the policy gets.
+        replan_every: how many actions of a chunk are used before the next is asked for; all of
+            them by default.
+        max_steps: instead of the task's.
+        policy_seed: the policy's seed is this more than the episode's.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    replan_every: int | None = None
+    max_steps: int | None = None
+    policy_seed: int = 0
+
+
+class ChunkCommands:
+    """From a policy's chunks to the commands of an environment, formed as a robot's are.
+
+    ``clamped`` of them were changed, or were beyond the limits of an environment that takes no
+    joint targets.
+
+    Args:
+        spec: of the environment.
+        action_rate_hz: keyframes a second; the environment's rate by default.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, action_rate_hz: float | None) -> None:
+        self.clamped = 0
+        body = spec.embodiment
+        self._rate = body.rate_hz
+        self._action_rate = action_rate_hz or self._rate
+        self._columns = action_columns(body) if spec.limited else None
+        self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
+        self._former = CommandFormer(self._limiter or PassThrough(body))
+
+    def start(self, state: Array) -> None:
+        """Begin an episode where the robot is."""
+        self.clamped = 0
+        if self._limiter is not None:
+            self._limiter.start(state[self._columns])
+
+    def targets(self, chunk: Array) -> Array:
+        """``(N, dim)``, one for each control step; limited only when they are taken."""
+        if self._limiter is None:
+            return chunk
+        return interpolate(self._limiter.last, chunk, self._action_rate, self._rate)
+
+    def command(self, target: Array) -> Array:
+        """The ``(dim,)`` command for one target."""
+        commands, clamps = self._former.form(target[None])
+        self.clamped += bool(clamps[0])
+        return np.asarray(commands[0])
+
+
+def run_episode(
+    environment: Environment,
+    actor: Actor,
+    task: TaskSpec,
+    seed: int,
+    course: RolloutSettings,
+    instructed: TaskSpec | None = None,
+    watch: Watch | None = None,
+) -> dict[str, Any]:
+    """Run one episode; its course follows from the arguments alone.
+
+    A chunk that is not finite ends it: the policy has failed, as on a robot, where safety stops
+    it. A simulation that diverges is the environment's affair, and says nothing about the policy.
+
+    Args:
+        seed: of environment and, with ``course.policy_seed``, policy.
+        instructed: the task whose instruction the policy is told instead; the environment is
+            one whose scenes have several tasks (``others``).
+        watch: called with the number of steps before the first and after each, for a video.
+
+    Returns:
+        JSON values: ``success``, ``problem`` (what the policy did wrong, else None),
+        ``behaviours`` (where the environment tells), ``steps``, ``calls`` (of the policy),
+        ``clamped`` (actions beyond the limits), ``return`` (sum of rewards), ``state_hash``,
+        ``instruction``, and ``timing`` in seconds: ``seconds``, ``policy_seconds``,
+        ``step_seconds``, ``observe_seconds``.
+
+    Raises:
+        SpecMismatch: the policy's chunk is of another shape.
+        Diverged: the environment's state is not finite, or its simulation diverged.
+    """
+    began = time.perf_counter()
+    spent = dict.fromkeys(("policy", "step", "observe"), 0.0)
+    environment, actor = Environment.adapt(environment), Actor.adapt(actor)
+    environment.reset(seed, task.name)
+    if instructed is not None:
+        environment.tell(instructed.name)
+    actor.enter(environment)
+    actor.reset(course.policy_seed + seed)
+    spec, limit = environment.spec, course.max_steps or task.max_steps
+    commands = ChunkCommands(spec, actor.action_rate_hz)
+    start = check_step(environment, 0)
+    commands.start(start)
+    own_hash = implements(environment, Environment, "state_hash")
+    digest = hashlib.sha256(start.tobytes())
+    steps = calls = 0
+    total, success, ended = 0.0, False, False
+    behaviours: dict[str, bool] | None = None
+    problem: str | None = None
+    instruction = (
+        instructed or task
+    ).instruction  # the environment may have words for each episode
+    if watch is not None:
+        watch(environment, 0)
+    while not ended and steps < limit:
+        at = time.perf_counter()
+        observation = environment.observe(course.cameras)
+        instruction = observation["task_description"]
+        # Before the policy is asked: what it makes of such a state is not its fault.
+        check_state(observation["qpos"], steps)
+        seen = time.perf_counter()
+        chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
+        answered = time.perf_counter()
+        del observation  # so that the next pictures can have its memory: fresh pages cost more
+        spent["observe"] += seen - at
+        spent["policy"] += answered - seen
+        calls += 1
+        problem = not_finite(chunk, spec.embodiment.joint_names)
+        if problem is not None:
+            success = False
+            break
+        for target in commands.targets(chunk[: course.replan_every]):
+            at = time.perf_counter()
+            found = environment.step(commands.command(target))
+            spent["step"] += time.perf_counter() - at
+            steps += 1
+            total += found.reward
+            # Before anything is made of it: a scene that resets itself may even look like success.
+            state = check_step(environment, steps)
+            success, ended = bool(found.success), bool(found.ended)
+            behaviours = None if found.behaviours is None else dict(found.behaviours)
+            if not own_hash:
+                digest.update(state.tobytes())
+            if watch is not None:
+                watch(environment, steps)
+            if ended or steps >= limit:
+                break
+    return {
+        "success": success,
+        "problem": problem,
+        **({} if behaviours is None else {"behaviours": behaviours}),
+        "steps": steps,
+        "calls": calls,
+        "clamped": commands.clamped,
+        "return": float(total),
+        "state_hash": environment.state_hash() if own_hash else digest.hexdigest()[:16],
+        "instruction": instruction,
+        "timing": {
+            "seconds": time.perf_counter() - began,
+            **{f"{name}_seconds": value for name, value in spent.items()},
+        },
+    }
+
+
+def shaped(chunk: Any, dim: int) -> Array:
+    """A chunk as ``(T, dim)`` float64, T at least 1.
+
+    Raises:
+        SpecMismatch: it is none; the policy is not for this environment, in any episode.
+    """
+    try:
+        array = np.asarray(chunk, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SpecMismatch(f"the policy's chunk is no array of numbers: {error}") from error
+    if array.ndim != 2 or array.shape[1] != dim or not len(array):
+        raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
+    return array
+
+
+def find_task(tasks: Sequence[TaskSpec], name: str) -> TaskSpec:
+    """The task called ``name``, which is one of ``tasks``."""
+    return next(task for task in tasks if task.name == name)

@@ -1,0 +1,272 @@
+"""What an evaluation's worker processes do; imported there, and light until then."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from fluxvla_core.build import build_environment_from_cfg
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.evaluation.episode_log import POLICY, SWAPPED, EpisodeKey
+from fluxvla_core.evaluation.live_settings import Live
+from fluxvla_core.evaluation.policies import Source, fit, make_policy
+from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
+from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
+from fluxvla_core.spec.embodiment import Camera
+
+
+@dataclass(frozen=True)
+class Video:
+    """How videos of episodes look.
+
+    Args:
+        cameras: side by side; sizes as far as the environment can draw them.
+        fps: frames a second of simulated time.
+    """
+
+    cameras: tuple[Camera, ...] = ()
+    fps: float = 10.0
+
+    @classmethod
+    def of(
+        cls,
+        spec: EnvironmentSpec,
+        names: Sequence[str] | None,
+        height: int | None,
+        width: int | None,
+        fps: float,
+    ) -> Video:
+        """Videos of the cameras ``names``, the first one by default, in their own size by default.
+
+        Raises:
+            ConfigError: there is no such camera.
+        """
+        known = {camera.name: camera for camera in spec.embodiment.cameras}
+        for name in names or ():
+            if name not in known:
+                raise ConfigError(f"{name!r} is none of {', '.join(known) or 'none'}")
+        chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
+        sized = (
+            replace(camera, height=height or camera.height, width=width or camera.width)
+            for camera in chosen
+        )
+        return cls(tuple(sized), fps)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode, and where its video goes; no video by default."""
+
+    key: EpisodeKey
+    video: str | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What workers need to know; every outcome follows from it and the episode's key.
+
+    Args:
+        environment: the table of a registered environment.
+        tasks: names of the tasks that are evaluated; a wrong instruction is one of theirs if it
+            can be.
+        sources: where the policy of ``policy`` and that of ``untrained`` come from.
+        course: how episodes are run; its cameras are filled in for each policy.
+        size: height and width of the policy's pictures; as it was trained by default.
+        served: policies that the parent answers for, by group.
+        live: on the wall clock instead of stepped.
+    """
+
+    environment: Mapping[str, Any]
+    tasks: tuple[str, ...]
+    sources: Mapping[str, Source]
+    course: RolloutSettings
+    size: tuple[int, int] | None = None
+    video: Video = field(default_factory=Video)
+    served: Mapping[str, Facts] = field(default_factory=dict)
+    live: Live | None = None
+
+
+class EpisodeWorker:
+    """Runs episodes in one process: a function from a job to the record of its episode.
+
+    Environment and policy are made at once, the untrained twin when it is first needed; all are
+    kept.
+
+    Args:
+        link: to a ``PolicyServer``, where there are served policies.
+
+    Raises:
+        SpecMismatch: the policy is for another robot, or wants cameras that are not there.
+        FluxError: environment or policy cannot be had.
+    """
+
+    def __init__(self, settings: Settings, link: Connection | None = None) -> None:
+        self._settings = settings
+        self._link = link
+        self.environment = Environment.adapt(build_environment_from_cfg(settings.environment))
+        self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
+        # Before the first episode: one that does not fit is refused before a scene is built, and
+        # loading it is no part of an episode's time.
+        self.actor(POLICY)
+
+    def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
+        """The record of an episode: JSON values.
+
+        Raises:
+            SpecMismatch: a policy is for another robot, or wants cameras that are not there.
+            FluxError: a policy cannot be loaded, or answers something impossible.
+        """
+        if isinstance(job, EpisodeKey):
+            job = Job(job)
+        settings, key = self._settings, job.key
+        actor, cameras = self.actor(key.group)
+        tasks = self.environment.spec.tasks
+        if settings.live is not None:
+            return self._live(settings.live, key, actor, cameras)
+        instructed = None
+        if key.group == SWAPPED:
+            instructed = find_task(tasks, swapped_task(self.environment, key.task, settings.tasks))
+        film = None if job.video is None else Film(Path(job.video), settings.video)
+        try:
+            record = run_episode(
+                self.environment,
+                actor,
+                find_task(tasks, key.task),
+                key.seed,
+                replace(settings.course, cameras=cameras),
+                instructed,
+                film,
+            )
+        finally:
+            if film is not None:
+                film.close()
+        return self._completed(record, cameras)
+
+    def _live(
+        self, live: Live, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
+    ) -> dict[str, Any]:
+        from fluxvla_core.evaluation.live import run_live
+
+        task, course = find_task(self.environment.spec.tasks, key.task), self._settings.course
+        record = run_live(
+            f"{key.group}-{key.task}-{key.seed}",
+            self.environment,
+            actor,
+            task,
+            key.seed,
+            course.policy_seed + key.seed,
+            cameras,
+            course.max_steps or task.max_steps,
+            live,
+        )
+        return self._completed(record, cameras)
+
+    def _completed(self, record: dict[str, Any], cameras: tuple[Camera, ...]) -> dict[str, Any]:
+        record["timing"]["memory_mb"] = memory_mb()
+        if cameras:
+            sizes = {camera.name: [camera.height, camera.width] for camera in cameras}
+            record["pictures"] = {"sizes": sizes, "by": self.environment.drawn_by()}
+        return record
+
+    def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:
+        """A group's policy and the cameras that it looks at."""
+        name = group if group in self._settings.sources else POLICY
+        if name not in self._actors:
+            actor: Actor
+            if name in self._settings.served and self._link is not None:
+                actor = ServedPolicy(self._link, name, self._settings.served[name])
+            else:
+                actor = make_policy(self._settings.sources[name])
+            cameras = fit(actor, self.environment.spec, self._settings.size)
+            self._actors[name] = actor, cameras
+        return self._actors[name]
+
+
+class Film:
+    """A video of an episode: call it at every step, then close it."""
+
+    def __init__(self, path: Path, video: Video) -> None:
+        self._path = path
+        self._video = video
+        self._writer: Any = None
+
+    def __call__(self, environment: Environment, steps: int) -> None:
+        import numpy as np
+
+        from fluxvla_core.robot.recording.video import VideoWriter
+
+        rate = environment.spec.embodiment.rate_hz
+        stride = max(1, round(rate / self._video.fps))
+        if steps % stride or not self._video.cameras:
+            return
+        images = environment.observe(self._video.cameras)["images"]
+        pictures = [images[camera.name] for camera in self._video.cameras]
+        lowest = min(picture.shape[0] for picture in pictures)
+        frame = np.hstack([picture[:lowest] for picture in pictures])
+        if self._writer is None:
+            self._writer = VideoWriter(self._path, rate / stride, *frame.shape[:2])
+        self._writer.add(frame)
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> str:
+    """The task to ask for instead of ``task``: the next one, round and round, that could be done
+    in its scene; one of ``wanted`` if there is one.
+
+    Raises:
+        ConfigError: the environment's scenes allow no other task.
+    """
+    names: list[str] = [each.name for each in environment.spec.tasks]
+    others = list(environment.others(task))
+    others = [name for name in others if name in wanted] or others
+    if not others:
+        raise ConfigError(
+            f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
+            f"of {task!r}",
+            next="evaluate without it: --set eval.instruction_swap=false",
+        )
+    here = names.index(task)
+    return min(others, key=lambda name: (names.index(name) <= here, names.index(name)))
+
+
+def memory_mb() -> float:
+    """The most memory that this process ever had (resident), in MiB; 0 where nobody tells."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # Not getrusage: on Linux a new process begins with the peak of the one that started it.
+        lines = status.read_text(encoding="utf-8").splitlines()
+        peaks = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
+        return round(int(peaks[0]) / 1024, 1) if peaks else 0.0
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(most / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
+
+
+def choose_tasks(tasks: Sequence[TaskSpec], names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
+    """The tasks that are meant, in the order of ``names``; all of them for None.
+
+    Raises:
+        ConfigError: there is none of that name, or one is named twice.
+    """
+    if names is None:
+        return tuple(tasks)
+    known = {task.name: task for task in tasks}
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
+    if not names or len(set(names)) != len(names):
+        raise ConfigError(f"tasks must name each task once, got {list(names)}")
+    return tuple(known[name] for name in names)

@@ -1,0 +1,194 @@
+"""What training reads of a model: what it declares of itself, its forward arguments and its loss.
+
+A model may declare, as methods or attributes that need no base class:
+
+- ``fsdp_units() -> list[Module | tuple[Module, ...]]``: the blocks that are sharded, recomputed and
+  compiled one by one. Each module's ``forward`` must be what the model calls, because that is where
+  sharded weights are gathered and released. Modules that are used together, such as layer ``i`` of
+  a vision-language model and layer ``i`` of the action expert that attends to it (a mixture of
+  transformers), stand in a tuple: they are gathered in one operation before the first of them runs
+  and released after the last.
+- ``frozen_source`` of a module: where its frozen weights come from when it is built (a package, a
+  file); they are not saved in checkpoints.
+- ``action_shape``: ``(T, D)`` of a chunk of actions.
+- ``static_graph``: whether every step uses the same parameters in the same order.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.contracts.training import VLA
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.training.batches import IDS
+
+# -- what a model declares -------------------------------------------------------------------
+
+
+def units_of(model: nn.Module) -> list[tuple[nn.Module, ...]]:
+    """The model's units, each as the modules that belong together; none if it names none."""
+    named: Sequence[nn.Module | tuple[nn.Module, ...]] = VLA.adapt(model).fsdp_units()
+    return [unit if isinstance(unit, tuple) else (unit,) for unit in named]
+
+
+def blocks_of(model: nn.Module) -> list[nn.Module]:
+    """All modules of all units, in their order."""
+    return [module for unit in units_of(model) for module in unit]
+
+
+def frozen_sources(model: nn.Module) -> dict[str, str]:
+    """Name of each module that declares a ``frozen_source`` -> that source; ``""`` is the model."""
+    found = ((name, getattr(m, "frozen_source", None)) for name, m in model.named_modules())
+    return {name: str(source) for name, source in found if source is not None}
+
+
+def set_frozen_source(model: nn.Module, source: str | None) -> None:
+    """Declare where all of the model's frozen weights come from; None takes that back."""
+    if source is None:
+        model.__dict__.pop("frozen_source", None)
+    else:
+        model.__dict__["frozen_source"] = source
+
+
+# -- how its blocks and its forward pass compute ---------------------------------------------
+
+
+def checkpoint_activations(model: nn.Module) -> None:
+    """Recompute the model's ``fsdp_units`` in the backward pass instead of keeping their insides.
+
+    Raises:
+        ConfigError: the model names no units.
+    """
+    from torch.utils.checkpoint import checkpoint
+
+    units = blocks_of(model)
+    if not units:
+        raise ConfigError(
+            f"enable_gradient_checkpointing: {type(model).__name__} names no units to recompute",
+            cause="it has no fsdp_units()",
+        )
+    for unit in units:
+        unit.__dict__["forward"] = _recomputed(unit.forward, checkpoint)
+
+
+def compile_units(model: nn.Module) -> None:
+    """Compile each of the model's ``fsdp_units`` by itself; names and state stay as they are.
+
+    Only what is inside a unit's ``forward``: what sharding does before and after it, and drawing
+    noise and time, stay outside.
+
+    Raises:
+        ConfigError: the model names no units.
+    """
+    units = blocks_of(model)
+    if not units:
+        raise ConfigError(
+            f"compile_blocks: {type(model).__name__} names no blocks to compile",
+            cause="it has no fsdp_units()",
+        )
+    for unit in units:
+        unit.__dict__["forward"] = torch.compile(unit.forward)
+
+
+def _recomputed(forward: Any, checkpoint: Any) -> Any:
+    def run(*args: Any, **kwargs: Any) -> Any:
+        return checkpoint(forward, *args, use_reentrant=False, **kwargs)
+
+    return run
+
+
+DTYPES = {"bf16": torch.bfloat16}
+
+
+def compute_dtype(enabled: bool, name: str) -> torch.dtype | None:
+    """The dtype that matrix products are computed in; None for that of the weights.
+
+    Weights, gradients and optimizer state stay fp32: in bf16 a parameter of 1.0 does not move
+    under steps of 5e-5. fp16 is not offered: it needs loss scaling, and where it is fast bf16 is.
+    """
+    return DTYPES[name] if enabled else None
+
+
+def autocast(device: torch.device, dtype: torch.dtype | None) -> AbstractContextManager[object]:
+    """Compute in ``dtype`` inside; inputs, targets and reductions stay fp32."""
+    if dtype is None:
+        return nullcontext()
+    return torch.autocast(device.type, dtype)
+
+
+# -- from a batch to a loss ------------------------------------------------------------------
+
+
+class ForwardArguments:
+    """Chooses, from a batch, the arguments of ``model.forward``.
+
+    Lists (``meta_keys``) and ``sample_ids`` that the model does not take are left out; a tensor
+    that it does not take is an error, because a mask under a wrong name would train silently
+    without it.
+
+    Raises:
+        ConfigError: the model takes no such tensor, or lacks one that it needs.
+    """
+
+    def __init__(self, model: nn.Module, where: str | None = None) -> None:
+        self._where = where
+        parameters = inspect.signature(model.forward).parameters.values()
+        self._model = type(model).__name__
+        self._any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+        named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        self._taken = {p.name for p in named}
+        self._needed = {p.name for p in named if p.default is p.empty}
+
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        if self._any:
+            return dict(batch)
+        if not self._needed <= batch.keys():
+            missing = sorted(self._needed - batch.keys())
+            raise ConfigError(
+                f"{self._model}.forward needs {', '.join(map(repr, missing))}, which the batch "
+                f"does not have; it has {', '.join(sorted(batch))}",
+                where=self._where,
+                next="let a transform of the dataset make it, and list it in the collator's keys",
+            )
+        taken = {key: value for key, value in batch.items() if key in self._taken}
+        if len(taken) == len(batch):
+            return taken
+        extra = sorted(
+            key
+            for key, value in batch.items()
+            if key not in self._taken and key != IDS and isinstance(value, Tensor)
+        )
+        if extra:
+            raise ConfigError(
+                f"{self._model}.forward takes no {', '.join(map(repr, extra))}; "
+                f"it takes {', '.join(sorted(self._taken))}",
+                where=self._where,
+                next="move what only describes from the collator's keys to meta_keys",
+            )
+        return taken
+
+
+def loss_of(output: Any, model: nn.Module) -> Tensor:
+    """The scalar ``output["loss"]``.
+
+    Raises:
+        ConfigError: the model returned something else.
+    """
+    loss = output.get("loss") if isinstance(output, Mapping) else None
+    if not (isinstance(loss, Tensor) and loss.ndim == 0):
+        raise ConfigError(
+            f"{type(model).__name__}.forward must return a mapping with a scalar tensor 'loss'"
+        )
+    return loss
+
+
+def sample_losses_of(output: Any) -> Tensor | None:
+    """``output["sample_losses"]``, ``(B,)``, if the model tells each sample's: for the records."""
+    losses = output.get("sample_losses") if isinstance(output, Mapping) else None
+    return losses.detach() if isinstance(losses, Tensor) else None

@@ -1,0 +1,436 @@
+"""Choosing the checkpoint that a run goes on from, and refusing one that it cannot go on from."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.checkpoints.checkpoint import (
+    EMA,
+    FOLDER,
+    MODEL,
+    OPTIMIZER_META,
+    TRAINER,
+    Checkpoint,
+    folders,
+    newest_whole,
+    step_name,
+)
+from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
+from fluxvla_core.checkpoints.owner import Claim, claim
+from fluxvla_core.contracts.training import Dataset
+from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.training.batches import StepPlan
+from fluxvla_core.training.distributed import World, agree, on_first
+from fluxvla_core.training.lora import LoraOptions, adapter_tensors
+from fluxvla_core.training.optim import SavedOptimizer, ScheduledLR
+from fluxvla_core.training.saving import plain, rng_file
+from fluxvla_core.training.state import (
+    Progress,
+    SavedTrainer,
+    rank_seed,
+    seed_all,
+    seeds_of,
+    set_rng_state,
+)
+from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_tensors
+
+if TYPE_CHECKING:
+    from fluxvla_core.training.base_runner import BaseTrainRunner
+
+
+AUTO = "auto"
+
+
+def take_over(world: World, context: RunContext) -> Claim | None:
+    """Make the work dir's ``checkpoints`` folder, and keep other trainings out; the first rank has
+    the claim.
+
+    Raises:
+        UsageError: it cannot be written, or another training is using it.
+    """
+    claims: list[Claim] = []
+
+    def take() -> str:
+        prepare(context.work_dir)
+        claims.append(claim(context.work_dir, context.reporter.warn))
+        return ""
+
+    on_first(world, take)
+    return claims[0] if claims else None
+
+
+def choose(
+    world: World, context: RunContext, resume: str | None, first: str | None = None
+) -> Checkpoint | None:
+    """The verified checkpoint to go on from, None to start afresh; the same on every rank.
+
+    Also clears what killed saves left in the work dir, which :func:`take_over` made this run's.
+
+    Args:
+        resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
+            path (refused if damaged), or None (refused if there are checkpoints already).
+        first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
+            first save goes on from where the run did.
+
+    Raises:
+        CheckpointError: the one at the path is missing or damaged.
+        UsageError: the work dir has checkpoints of another run.
+    """
+    found = on_first(world, lambda: _choose(context, resume, first))
+    return Checkpoint.open(found) if found else None
+
+
+def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
+    clear_leftovers(context.work_dir)
+    reporter = context.reporter
+    if resume is None:
+        _refuse_existing(context.work_dir)
+        return ""
+    checkpoint = _newest(context) if resume == AUTO else None
+    if checkpoint is None:
+        place = first if resume == AUTO else resume
+        if place is None or place == AUTO:
+            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts afresh")
+            return ""
+        checkpoint = Checkpoint.open(place)
+        checkpoint.verify()
+    if checkpoint.path.resolve().parent.parent == context.work_dir.resolve():
+        for moved in set_aside_later(context.work_dir, checkpoint.step):
+            reporter.warn(f"a later checkpoint is set aside as {moved.name}")
+    else:
+        _refuse_existing(context.work_dir)
+    reporter.info(f"resuming from {checkpoint.path} (step {checkpoint.step})")
+    return str(checkpoint.path)
+
+
+def _newest(context: RunContext) -> Checkpoint | None:
+    checkpoint, refused = newest_whole(context.work_dir)
+    if checkpoint is None and refused:
+        raise refused[0]
+    for error in refused:
+        context.reporter.warn(
+            f"not resuming from a damaged checkpoint: {error.where}: {error.what}"
+        )
+    return checkpoint
+
+
+def _refuse_existing(work_dir: Path) -> None:
+    existing = folders(work_dir)
+    if existing:
+        raise UsageError(
+            f"{work_dir} already has checkpoints, up to {existing[-1].name}",
+            next="go on from there with --resume auto, or name another --work-dir",
+        )
+
+
+def check_same_run(
+    saved: Mapping[str, Any], plan: StepPlan, seeds: Sequence[int | None], where: str
+) -> str | None:
+    """Refuse to go on with other data or another seed; a changed batch or world only is said.
+
+    Args:
+        saved: ``trainer.json``.
+        seeds: what the dataset, and those it is made of, draw by.
+
+    Returns:
+        One line to warn with when steps will use other numbers of samples than before, or None.
+
+    Raises:
+        CheckpointError: another seed or number of samples, under which the order would change.
+    """
+    together = plan.shards and plan.shards.together
+    theirs = saved.get("data_seeds", seeds)
+    for ours, before, what in (
+        (plan.seed, saved.get("seed"), "seed"),
+        (plan.length, saved.get("n_train_examples"), "number of samples in the dataset"),
+        (together, saved.get("shuffle_episodes"), "value of shuffle_episodes"),
+        (_listed(seeds), _listed(theirs), "seed of the dataset"),
+    ):
+        if before != ours:
+            raise CheckpointError(
+                f"the {what} is {ours}, the checkpoint's run had {before}",
+                where=where,
+                cause="the rest of its epoch would be another one's",
+                next="set it back, or start a new run in another --work-dir",
+            )
+    if saved["step_samples"] != plan.step_samples:
+        return (
+            f"steps use {plan.step_samples} samples now and {saved['step_samples']} in the "
+            "checkpoint's run: the order of samples stays, the result will differ"
+        )
+    if saved["world_size"] != plan.world:
+        return (
+            f"the number of processes is {plan.world}, the checkpoint's run had "
+            f"{saved['world_size']}: the order of samples stays, results agree only to rounding"
+        )
+    return None
+
+
+def _listed(seeds: Sequence[int | None]) -> str:
+    return ", ".join(map(str, seeds))
+
+
+def _begin_another(checkpoint: str) -> str:
+    weights = shlex.quote(f"runner.init_from={checkpoint}")
+    return f"begin another run from these weights: --set {weights} --work-dir OTHER"
+
+
+def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
+    """Refuse to go on with another adapter than the checkpoint's, or with one, or without.
+
+    Raises:
+        CheckpointError: says both.
+    """
+    mine, saved = (None if o is None else o.for_peft() for o in (ours, theirs))
+    if mine != saved:
+        raise CheckpointError(
+            f"lora is {_shown(mine)}, the checkpoint's run had {_shown(saved)}",
+            where=where,
+            next=f"set it back; or {_begin_another(where)}",
+        )
+
+
+def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
+    """Refuse to go on without the averages that the checkpoint has, or with ones it has not.
+
+    Raises:
+        CheckpointError: says which.
+    """
+    if (decay is not None) == checkpoint.has(EMA):
+        return
+    if decay is not None:
+        what = "ema_decay is set, and the checkpoint's run kept no averaged weights"
+        back = "resume without ema_decay"
+    else:
+        what = "ema_decay is not set, and the checkpoint's run kept averaged weights, which act"
+        back = "set it back: the checkpoint's config.resolved.json has its value"
+    raise CheckpointError(
+        what,
+        where=str(checkpoint.path),
+        next=f"{back}; or {_begin_another(str(checkpoint.path))}",
+    )
+
+
+def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
+    """Refuse to go on with data that are normalised by other numbers.
+
+    Raises:
+        CheckpointError: names the statistics that differ.
+    """
+    ours = plain(dict(Dataset.adapt(dataset).statistics or {}))
+    changed = changed_statistics(checkpoint.statistics(), ours)
+    if changed:
+        named = ", ".join(changed[:6]) + (", …" if len(changed) > 6 else "")
+        raise CheckpointError(
+            f"the dataset's statistics are not those of the checkpoint's run: {named}",
+            where=str(checkpoint.path),
+            cause="other data, episodes or settings of the dataset: states and actions would now "
+            "mean something else to the model",
+            next=f"set the dataset back; or {_begin_another(str(checkpoint.path))}",
+        )
+
+
+def _warnings(run: BaseTrainRunner, checkpoint: Checkpoint, saved: Mapping[str, Any]) -> list[str]:
+    """What to say of settings that may change, and have."""
+    said = check_same_run(saved, run.plan, seeds_of(run.dataset), str(checkpoint.path))
+    context = run.context
+    changed = changed_settings(checkpoint.config(), context.config, context.section)
+    listed = [f"    {key}: {before} -> {now}" for key, (before, now) in changed.items()]
+    head = "other settings than those of the checkpoint's run:"
+    return (["\n".join([head, *listed])] if listed else []) + ([said] if said else [])
+
+
+def _shown(settings: Mapping[str, Any] | None) -> str:
+    if settings is None:
+        return "not set"
+    named = ("r", "lora_alpha", "lora_dropout", "target_modules", "modules_to_save")
+    return ", ".join(f"{key}={settings[key]}" for key in named)
+
+
+def restore(run: BaseTrainRunner, checkpoint: Checkpoint) -> None:
+    """Put everything but the random generators back to where ``checkpoint`` was saved.
+
+    Raises:
+        CheckpointError: it is of another model, optimizer, dataset, seed or adapter, or one of
+            the two keeps averages.
+    """
+    where = str(checkpoint.path)
+    checkpoint.json(TRAINER, SavedWeights)
+    saved = checkpoint.json(TRAINER, SavedTrainer)
+    check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
+    check_same_averages(run.options.ema_decay, checkpoint)
+    warnings = _warnings(run, checkpoint, saved)
+    check_same_statistics(run.dataset, checkpoint)
+    for warning in warnings if run.world.first else ():
+        run.context.reporter.warn(warning)
+    tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
+    check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
+    run._load_model_state(tensors)
+    optimizer = checkpoint.optimizer_tensors(), checkpoint.json(OPTIMIZER_META, SavedOptimizer)
+    if run.load_optimizer_tensors(*optimizer, where) is False:
+        raise CheckpointError(
+            f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
+        )
+    if run.ema is not None:
+        run.ema.load(checkpoint.tensors(EMA), where)
+    with _state_of("metric", where):
+        run.metric.load_state_dict(saved["metric"])
+    run.progress = Progress.from_dict(saved)
+    with _state_of("scheduler", where):
+        run.lr_scheduler.load_state_dict(_schedule_state(run, saved))
+
+
+@contextmanager
+def _state_of(what: str, where: str) -> Iterator[None]:
+    """Let what a class raises for a state that it did not write be a CheckpointError."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"the saved state of the {what} does not fit: {type(error).__name__}: {error}",
+            where=where,
+            cause="another class wrote it, or the checkpoint was put together by hand",
+        ) from error
+
+
+def _schedule_state(run: BaseTrainRunner, saved: Mapping[str, Any]) -> Any:
+    """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller now.
+
+    The rate follows the part of the run that is done. A count of the old steps would be past the
+    end of fewer, larger ones, and train the rest at a rate of 0.
+    """
+    same = saved["step_samples"] == run.plan.step_samples
+    if same or not isinstance(run.lr_scheduler, ScheduledLR):
+        return saved["scheduler"]
+    plan, progress, length = run.plan, run.progress, (run.max_steps, run.max_epochs)
+    left = plan.run_steps_left(progress.step, progress.cursor, *length)
+    return {"step": plan.total_steps(*length) - left}
+
+
+def forget_missing(
+    progress: Progress, world: World, work_dir: Path, resumed: Checkpoint | None
+) -> None:
+    """Let ``progress`` forget checkpoints that the ``resumed`` one knows and this work dir lacks.
+
+    The best one may have been removed in favour of a better one that was lost since. Of a
+    checkpoint from elsewhere, neither itself nor the best one before it is here.
+    """
+    elsewhere = lost = False
+    if world.first:
+        here = work_dir / FOLDER / step_name(progress.step)
+        elsewhere = resumed is None or resumed.path.resolve() != here.resolve()
+        lost = not name_best(work_dir, -1 if elsewhere else progress.best_step)
+    if agree(world, elsewhere):
+        progress.saved = -1
+    if agree(world, lost):
+        progress.best, progress.best_step = None, -1
+
+
+def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
+    """Give this rank the random states it was saved with, or fresh ones of its own.
+
+    On another number of ranks than before there is none to go on with: each rank then draws from
+    a state that follows from the seed, its rank and the step.
+    """
+    if checkpoint is None:
+        seed_all(rank_seed(seed, world.rank))
+        return
+    seed_all(rank_seed(seed, world.rank, checkpoint.step))
+    if checkpoint.json(TRAINER, SavedTrainer)["world_size"] == world.size:
+        state = checkpoint.tensors(rng_file(world.rank))
+        with _state_of("random generators", str(checkpoint.path)):
+            set_rng_state(state)
+
+
+TABLES = ("model", "train_dataloader", "val_dataloader")
+"""What a run, and its best checkpoint, follow from, besides the section that runs."""
+HARMLESS = frozenset(
+    {
+        # Where things are. A model's frozen weights are compared by their sum, data by statistics.
+        *("init_from", "resume_from", "device"),
+        # How samples are fetched.
+        *("per_device_num_workers", "cache_frames"),
+        # What is told and saved, and how often.
+        *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
+        *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
+        "early_stop_patience",  # how long it goes on
+        # Samples a step: what they come to together is compared on its own.
+        *("per_device_batch_size", "grad_accumulation_steps"),
+    }
+)
+"""Keys that may change without a word."""
+LENGTH = frozenset({"max_epochs", "max_steps"})
+"""And those that may where the learning rate does not follow from them."""
+_UNSET = "not set"
+
+
+def changed_settings(
+    saved: Mapping[str, Any], ours: Mapping[str, Any], section: str
+) -> dict[str, tuple[str, str]]:
+    """Keys of the running ``section`` and of :data:`TABLES` that differ, and both values.
+
+    Args:
+        saved: the checkpoint's config tree.
+        ours: the present one's.
+
+    Returns:
+        Dotted key -> (before, now), as JSON or ``not set``.
+    """
+    steady = all(_steady(tree[section]) for tree in (saved, ours) if section in tree)
+    harmless = HARMLESS | LENGTH if steady else HARMLESS
+    before, now = (
+        {
+            key: value
+            for name in (section, *TABLES)
+            for key, value in _leaves(name, plain(tree.get(name) or {}), harmless)
+        }
+        for tree in (saved, ours)
+    )
+    return {
+        key: (before.get(key, _UNSET), now.get(key, _UNSET))
+        for key in {**before, **now}
+        if before.get(key) != now.get(key)
+    }
+
+
+def _steady(runner: Mapping[str, Any]) -> bool:
+    """Whether the learning rate of a step is the same however long the run is."""
+    constant = runner.get("lr_scheduler_type", "constant") == "constant"
+    return constant and not runner.get("warmup_ratio")
+
+
+def _leaves(name: str, value: Any, harmless: Set[str]) -> Iterator[tuple[str, str]]:
+    """Dotted keys below ``name`` with their values as text; lists of tables count from 0."""
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        value = {str(i): item for i, item in enumerate(value)}
+    if not isinstance(value, Mapping):
+        yield name, json.dumps(value, ensure_ascii=False)
+        return
+    for key, item in value.items():
+        if key not in harmless and not key.endswith("_path"):
+            yield from _leaves(f"{name}.{key}", item, harmless)
+
+
+def changed_statistics(saved: Any, ours: Any, name: str = "") -> list[str]:
+    """Dotted names of statistics that differ by more than another machine's rounding does."""
+    if isinstance(saved, Mapping) and isinstance(ours, Mapping):
+        return [
+            found
+            for key in {**saved, **ours}
+            for found in changed_statistics(
+                saved.get(key), ours.get(key), f"{name}.{key}".strip(".")
+            )
+        ]
+    if isinstance(saved, list) and isinstance(ours, list) and len(saved) == len(ours):
+        pairs = zip(saved, ours, strict=True)
+        return [name] if any(changed_statistics(a, b, name) for a, b in pairs) else []
+    numbers = all(isinstance(v, int | float) for v in (saved, ours))
+    same = math.isclose(saved, ours, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == ours
+    return [] if same else [name]

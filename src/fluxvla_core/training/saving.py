@@ -1,0 +1,402 @@
+"""What goes into a checkpoint, and how the ranks write it together."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.checkpoints import checkpoint as ckpt
+from fluxvla_core.checkpoints.directory import rotate
+from fluxvla_core.checkpoints.parts import is_split, own_parts
+from fluxvla_core.checkpoints.tensors import TensorFile
+from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
+from fluxvla_core.config.load import FORMAT
+from fluxvla_core.config.snapshot import environment
+from fluxvla_core.contracts.training import VLA, Dataset
+from fluxvla_core.training import lora
+from fluxvla_core.training.distributed import World, agree, on_first, texts
+from fluxvla_core.training.ema import Ema
+from fluxvla_core.training.state import rng_state, seeds_of
+from fluxvla_core.training.weights import LeftOut
+
+if TYPE_CHECKING:
+    from fluxvla_core.training.base_runner import BaseTrainRunner
+
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One moment of a run: the tensors as they are in memory, everything else as JSON values.
+
+    Args:
+        model: weights and buffers of the model's file.
+        optimizer: its state by ``<parameter>/<key>``.
+        described: ``optimizer.json``.
+        trainer: ``trainer.json``.
+        adapter: what LoRA trains, by peft's names; it is not among the model's file.
+        documents: file name -> JSON object, fixed for the run.
+        folders: folder name -> what fills it.
+    """
+
+    model: Mapping[str, Tensor]
+    optimizer: Mapping[str, Tensor]
+    described: Mapping[str, Any]
+    trainer: Mapping[str, Any]
+    ema: Ema | None = None
+    adapter: Mapping[str, Tensor] = field(default_factory=dict)
+    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    folders: Mapping[str, Callable[[Path], Any]] = field(default_factory=dict)
+
+
+def save_snapshot(
+    saver: Saver,
+    work_dir: Path,
+    step: int,
+    epoch: int,
+    snapshot: Snapshot,
+    keep: int,
+    spare: int | None = None,
+) -> Path:
+    """Begin the checkpoint of ``step``; ``saver.settle`` tells when it is there.
+
+    Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
+    but for that of step ``spare``; old ones that cannot be removed are only warned of.
+
+    Returns:
+        The folder that it will be.
+
+    Raises:
+        RunFailed: the state of the scheduler or metric is not JSON.
+    """
+    world = saver.world
+    writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
+    tensors = snapshot.optimizer
+    split = any(map(is_split, tensors.values()))
+    values = {ckpt.OPTIMIZER_META: snapshot.described, ckpt.TRAINER: snapshot.trainer}
+    documents: dict[str, bytes] = {}
+
+    def prepare() -> str:
+        for name, value in {**values, **snapshot.documents}.items():
+            documents[name] = json_bytes(name, value)
+        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
+        # Now rather than in the thread: the training may use the same tokenizer meanwhile.
+        for name, fill in snapshot.folders.items():
+            writer.fill_folder(name, fill)
+        return ""
+
+    on_first(world, prepare)
+    files = [
+        *_model_files(saver, snapshot),
+        TensorFile.whole(rng_file(world.rank), rng_state(), True),
+    ]
+    if split:
+        parts = own_parts(tensors, world.first)
+        if parts:
+            files.append(TensorFile.parts(part_file(world.rank), parts))
+    else:
+        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
+
+    def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
+        try:
+            for file in held:
+                file.write(writer)
+        except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
+            writer.refuse(error)
+        reports = texts(group, writer.report())
+
+        def finish() -> str:
+            writer.join(reports)
+            for name, data in documents.items():
+                writer.write_bytes(name, data)
+            for name in snapshot.folders:
+                writer.enter_folder(name)
+            path = writer.commit()
+            try:
+                rotate(work_dir, keep, spare=spare)
+            except OSError as error:
+                warn(f"old checkpoints could not be removed: {error}")
+            return str(path)
+
+        return Path(on_first(group, finish))
+
+    saver.start(step, files, write)
+    return writer.final
+
+
+def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
+    model = snapshot.model
+    if saver.beside:
+        # The next forward pass may change buffers, while weights stay until the optimizer's step.
+        copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
+        model = {name: copies.get(id(t), t) for name, t in model.items()}
+    first = saver.world.first
+    files = [TensorFile.whole(ckpt.MODEL, model, first)]
+    if snapshot.adapter:
+        files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
+    if snapshot.ema is not None:
+        files.append(TensorFile.whole(ckpt.EMA, snapshot.ema.shadow, first))
+    return files
+
+
+def rng_file(rank: int) -> str:
+    """Name of a rank's file of random states."""
+    return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
+
+
+def part_file(rank: int) -> str:
+    """Name of a rank's file with its parts of the optimizer's state."""
+    return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
+
+
+def take_snapshot(run: BaseTrainRunner, train_loss: float | None, only_trainable: bool) -> Snapshot:
+    """The runner's present moment.
+
+    Args:
+        only_trainable: leave out frozen weights that the model brings itself.
+    """
+    without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
+    state, (optimizer, described) = run.model_tensors(), run.optimizer_tensors()
+    adapter = lora.adapter_names(run.model)
+    elsewhere = {*without.names, *adapter}
+    documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
+    if run.lora is not None:
+        documents[lora.CONFIG] = run.lora.for_peft(run.adapter_base)
+    trainer = {
+        **run.progress.to_dict(),
+        "train_loss": train_loss,
+        "scheduler": run.lr_scheduler.state_dict(),
+        "metric": run.metric.state_dict(),
+        "seed": run.plan.seed,
+        "data_seeds": seeds_of(run.dataset),
+        "n_train_examples": run.plan.length,
+        "step_samples": run.plan.step_samples,
+        "world_size": run.plan.world,
+        "shuffle_episodes": run.loader_options.shuffle_episodes,
+        "left_out": without.to_dict(),
+    }
+    return Snapshot(
+        {name: tensor for name, tensor in state.items() if name not in elsewhere},
+        optimizer,
+        described,
+        trainer,
+        run.ema,
+        {theirs: state[name] for name, theirs in adapter.items()},
+        documents,
+        run_folders(run.dataset, run.tokenizer),
+    )
+
+
+def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
+    """The JSON files that are the same in every checkpoint of a run.
+
+    ``policy.json``: ``action_rate_hz`` is the dataset's ``fps`` (Hz), ``horizon`` the first of
+    the model's ``action_shape``, else the dataset's ``action_window_size``; null where unknown.
+    """
+    described = Dataset.adapt(dataset)
+    shape = VLA.adapt(model).action_shape
+    horizon = shape[0] if shape else described.action_window_size
+    rate = described.fps
+    config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
+    documents: dict[str, dict[str, Any]] = {
+        ckpt.CONFIG: plain(config),
+        ckpt.ENVIRONMENT: environment(),
+        ckpt.POLICY: {
+            "action_rate_hz": None if rate is None else float(rate),
+            "horizon": None if horizon is None else int(horizon),
+        },
+        ckpt.STATISTICS: dict(described.statistics or {}),
+    }
+    embodiment = described.embodiment
+    if embodiment is not None:
+        documents[ckpt.EMBODIMENT] = embodiment.to_dict()
+    return documents
+
+
+def plain(config: Any) -> Any:
+    """``config`` as JSON values; objects, which one made in Python may hold, are described."""
+    return json.loads(json.dumps(config, default=_described))
+
+
+def _described(value: Any) -> str:
+    """Where it lies in memory is another place in every process."""
+    return _ADDRESS.sub("", repr(value))
+
+
+def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]]:
+    """What fills the checkpoint's ``processors``: the dataset's pipeline, else the tokenizer."""
+    for owner in (getattr(dataset, "pipeline", None), getattr(dataset, "transforms", None)):
+        save = getattr(owner, "save_pretrained", None)
+        if save is not None:
+            return {ckpt.PROCESSORS: save}
+    save = getattr(tokenizer, "save_pretrained", None)
+    if save is None:
+        return {}
+    return {ckpt.PROCESSORS: lambda folder: save(folder / "tokenizer")}
+
+
+@dataclass
+class _Job:
+    """A checkpoint on its way: ``copied`` when nothing of the training is needed any more."""
+
+    step: int
+    copied: threading.Event = field(default_factory=threading.Event)
+    warnings: list[str] = field(default_factory=list)
+    path: Path | None = None
+    error: BaseException | None = None
+    thread: threading.Thread | None = None
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A checkpoint that has its name."""
+
+    step: int
+    path: Path
+    warnings: tuple[str, ...]
+
+
+class Saver:
+    """Writes checkpoints of one run, in a thread of its own or at once.
+
+    Args:
+        world: the processes that save together.
+        beside: use a thread.
+        optimizer: waits, in its ``step``, for the copy; one without ``register_step_pre_hook``
+            is copied before :meth:`start` returns.
+    """
+
+    def __init__(self, world: World, beside: bool, optimizer: Any = None) -> None:
+        self.world, self.beside = world, beside
+        self._threads = world
+        if beside and world.size > 1:
+            # The threads of all ranks talk while the training talks on the other groups.
+            self._threads = replace(world, control=dist.new_group(backend="gloo"))
+        self._job: _Job | None = None
+        self._memory: dict[tuple[str, int], Tensor] = {}
+        self._before_step = getattr(optimizer, "register_step_pre_hook", None)
+        self._hook: Any = None
+
+    def start(
+        self,
+        step: int,
+        files: Sequence[TensorFile],
+        write: Callable[[World, Iterable[TensorFile], Callable[[str], None]], Path],
+    ) -> None:
+        """Let ``write(world, files, warn)`` make the checkpoint of ``step``; all ranks call it.
+
+        The one before must have been settled.
+        """
+        job = self._job = _Job(step)
+        warn = job.warnings.append
+        if not self.beside:
+            self._run(job, lambda: write(self.world, files, warn))
+            return
+        gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
+        ready = _reached(self.world.device)
+        job.thread = threading.Thread(
+            target=self._run,
+            args=(job, lambda: write(self._threads, self._held(job, gathered, ready), warn)),
+            name=f"checkpoint-{step}",
+            daemon=True,
+        )
+        job.thread.start()
+        if self._before_step is None:
+            self.copied()
+        else:
+            # Only while there is something to wait for: each hook costs every step its time.
+            self._hook = self._before_step(lambda *_: self.copied())
+
+    def copied(self) -> None:
+        """Wait until weights and optimizer may change; needed before anything but a step does."""
+        if self._job is not None and self._job.thread is not None:
+            self._job.copied.wait()
+
+    def settle(self, wait: bool) -> Saved | None:
+        """What became of the checkpoint on its way; all ranks call it at the same step.
+
+        Args:
+            wait: for its end; otherwise None is returned while some rank still writes.
+
+        Raises:
+            RunFailed: it could not be saved.
+        """
+        job = self._job
+        if job is None:
+            return None
+        if job.thread is not None:
+            if not wait and agree(self.world, int(job.thread.is_alive())):
+                return None
+            job.thread.join()
+        if self._hook is not None:
+            self._hook.remove()
+        self._job = self._hook = None
+        if job.error is not None:
+            raise job.error
+        assert job.path is not None
+        return Saved(job.step, job.path, tuple(job.warnings))
+
+    def close(self) -> None:
+        """Let the checkpoint on its way be finished, whatever becomes of it."""
+        if self._job is not None and self._job.thread is not None:
+            self._job.thread.join()
+
+    def _run(self, job: _Job, work: Callable[[], Path]) -> None:
+        try:
+            job.path = work()
+        except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
+            job.error = error
+
+    def _held(
+        self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
+    ) -> Iterator[TensorFile]:
+        """Copies of ``files``; all are made before the first is written."""
+        try:
+            with ready:
+                held = [
+                    replace(
+                        file,
+                        tensors=tuple(
+                            self._copy_of(file.name, i, t) for i, t in enumerate(file.tensors)
+                        ),
+                    )
+                    for file in files
+                ]
+        finally:
+            job.copied.set()
+        yield from held
+
+    def _copy_of(self, file: str, index: int, tensor: Tensor) -> Tensor:
+        return self._copy((file, index), tensor)
+
+    def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
+        """``tensor`` in host memory that is kept from save to save, pinned if it is on a GPU."""
+        kept = self._memory.get(place)
+        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
+            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+            self._memory[place] = kept
+        if kept is tensor:
+            return kept
+        with torch.no_grad():
+            return kept.copy_(tensor)
+
+
+def _reached(device: torch.device) -> AbstractContextManager[object]:
+    """Inside, a GPU copies beside the work that is enqueued later than now, and after the rest."""
+    if device.type != "cuda":
+        return nullcontext()
+    stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    stream.wait_stream(torch.cuda.current_stream(device))
+    return torch.cuda.stream(stream)

@@ -1,0 +1,290 @@
+"""A model's weights in a checkpoint: which are in it, and whether they are this model's."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
+from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.training import lora
+from fluxvla_core.training.distributed import World, on_first
+from fluxvla_core.training.model import frozen_sources, set_frozen_source
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Frozen weights that are not saved because the model brings them itself.
+
+    A module says so by ``frozen_source``: where its frozen weights come from when it is built
+    (a package, a file). ``sha256`` proves on loading that they are still the same.
+    """
+
+    sources: Mapping[str, str] = field(default_factory=dict)
+    names: frozenset[str] = frozenset()
+    sha256: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {"sources": dict(self.sources), "sha256": self.sha256}
+
+
+@dataclass(frozen=True)
+class SavedLeftOut:
+    """:class:`LeftOut` in ``trainer.json``."""
+
+    sources: dict[str, str] = field(default_factory=dict)
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class SavedWeights:
+    """What ``trainer.json`` says in every checkpoint, exported ones too."""
+
+    left_out: SavedLeftOut
+
+
+def left_out(model: nn.Module) -> LeftOut:
+    """What :class:`LeftOut` there is in ``model``; reads those weights once to sum them up."""
+    sources = frozen_sources(model)
+    state = model.state_dict(keep_vars=True)
+    # What stands in no part by itself but in the whole model may be a buffer that training changes.
+    names = frozenset(
+        name
+        for name, tensor in state.items()
+        if not tensor.requires_grad
+        and any(_inside(name, p) and (p or isinstance(tensor, nn.Parameter)) for p in sources)
+    )
+    digest = hashlib.sha256()
+    for name in sorted(names):
+        flat = state[name].detach().cpu().contiguous().reshape(-1)
+        digest.update(name.encode() + str(tuple(state[name].shape)).encode())
+        digest.update(memoryview(flat.view(torch.uint8).numpy()) if flat.numel() else b"")
+    return LeftOut(sources, names, digest.hexdigest() if names else "")
+
+
+def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
+    """Parameters and persistent buffers by name, but for those in ``without``.
+
+    Raises:
+        CheckpointError: the model keeps extra state that is no tensor.
+    """
+    skipped = set(without)
+    state = model.state_dict(keep_vars=True)
+    other = sorted(name for name, value in state.items() if not isinstance(value, Tensor))
+    if other:
+        raise CheckpointError(
+            f"the model's state_dict holds other than tensors: {', '.join(other)}",
+            next="keep such state in buffers, or in the config",
+        )
+    return {name: tensor for name, tensor in state.items() if name not in skipped}
+
+
+def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
+    state = model_tensors(model)
+    # strict=False only for what is left out of checkpoints: names and sizes have been checked.
+    model.load_state_dict(
+        {name: like(state[name].detach(), tensor) for name, tensor in tensors.items()},
+        strict=False,
+    )
+
+
+def check_model_tensors(
+    model: nn.Module,
+    tensors: Mapping[str, Tensor],
+    brings: LeftOut,
+    saved: Mapping[str, Any],
+    where: str,
+) -> None:
+    """Refuse weights that are not all of this model's, or that other frozen parts go with.
+
+    Args:
+        tensors: the checkpoint's weights.
+        brings: what the model says that it brings itself.
+        saved: what was left out of the checkpoint (``left_out`` of ``trainer.json``).
+
+    Raises:
+        CheckpointError: lists what differs.
+    """
+    brings = brings if saved.get("sha256") else LeftOut()
+    if lora.adapter_names(model):
+        _check_base(brings, saved, where)
+    check_left_out(brings, saved, where)
+    check_names(tensors, model_tensors(model, brings.names), "the weights", where)
+
+
+def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
+    now, before = ours.sources.get(""), saved.get("sources", {}).get("")
+    if ours.sha256 != saved.get("sha256", "") and now and before and now != before:
+        raise CheckpointError(
+            "frozen weights differ from those that the checkpoint was trained with (the model from "
+            f"{now}; then from {before})",
+            where=where,
+            cause="init_from was changed, or that place has other weights by now",
+            next=f"--set runner.init_from=DIR, where the weights of {before} are; or resume "
+            "without it",
+        )
+
+
+def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
+    """Refuse frozen weights other than those that the checkpoint was trained with.
+
+    Raises:
+        CheckpointError: names where they come from.
+    """
+    if ours.sha256 != saved.get("sha256", ""):
+        places = {**saved.get("sources", {}), **ours.sources}
+        listed = "; ".join(f"{name or 'the model'} from {place}" for name, place in places.items())
+        raise CheckpointError(
+            f"frozen weights differ from those that the checkpoint was trained with ({listed})",
+            where=where,
+            cause="another version of the package or file that they come from is installed",
+            next="environment.json in the checkpoint's folder has the versions that made it",
+        )
+
+
+def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
+    """Put a checkpoint's weights (the averaged ones if kept) into a freshly built ``model``.
+
+    Adapters are merged: the model keeps its names, and which of its parts are trainable.
+
+    Raises:
+        CheckpointError: they are not this model's, or frozen parts have changed.
+    """
+    saved = checkpoint.json(TRAINER, SavedWeights)["left_out"]
+    options = lora.LoraOptions.of_checkpoint(checkpoint)
+    trained = {name: p.requires_grad for name, p in model.named_parameters()}
+    if options is not None:
+        base = base_of(checkpoint)
+        if base is not None:
+            start_from(model, base)
+            set_frozen_source(model, base)
+        lora.attach(model, options, trained=True)
+    tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
+    if checkpoint.has(EMA):
+        tensors |= _by_all_names(model, checkpoint.tensors(EMA))
+    check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
+    put_model_tensors(model, tensors)
+    if options is not None:
+        lora.merge_(model)
+        set_frozen_source(model, None)
+        for name, parameter in model.named_parameters():
+            parameter.requires_grad_(trained[name])
+
+
+def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """``tensors``, and tied weights under their other names too: averages have the first alone."""
+    state = model_tensors(model)
+    known = {id(state[name]): tensor for name, tensor in tensors.items() if name in state}
+    others = {name: known[id(own)] for name, own in state.items() if id(own) in known}
+    return {**tensors, **others}
+
+
+def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
+    """Where the weights are that a checkpoint's adapter stands beside; None if it needs no others.
+
+    They are where they were found, or else, as folders are moved together, at the place that was
+    asked for. A sum tells if they are others by now.
+
+    Args:
+        init_from: the place that is asked for now, which goes first when it is a new one.
+    """
+    noted = _noted_base(checkpoint)
+    if noted is None:
+        return None
+    asked, found = noted
+    if init_from not in (None, asked):
+        return init_from
+    return next((place for place in (found, asked) if Path(place).exists()), found)
+
+
+def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None:
+    """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
+
+    Args:
+        before: what the run goes on from; where it is asked for no other base, it keeps that one.
+    """
+    if before is None:
+        return init_from
+    noted = _noted_base(before)
+    return None if noted is None else init_from or noted[0]
+
+
+def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
+    """Where a checkpoint's base was asked for, and found."""
+    if not checkpoint.has(lora.CONFIG):
+        return None
+    asked = checkpoint.json(lora.CONFIG, lora.SavedAdapter)["base_model_name_or_path"]
+    found = checkpoint.json(TRAINER, SavedWeights)["left_out"].get("sources", {}).get("")
+    return None if asked is None or found is None else (asked, found)
+
+
+def exact_place(place: str | Path) -> str:
+    """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
+
+    Which one is a work dir's newest, or its ``best``, changes while that run goes on.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    path = Path(os.path.realpath(place))
+    return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
+
+
+def start_from(model: nn.Module, place: str | Path) -> Path:
+    """Give a freshly built ``model`` the weights of another training, or of an export.
+
+    Args:
+        place: a checkpoint's folder, a work dir (its newest one), or a safetensors file.
+
+    Returns:
+        The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
+        ``best``, changes while that run goes on.
+
+    Raises:
+        CheckpointError: there is nothing there, it is damaged, or it is of another model.
+    """
+    path = Path(os.path.realpath(place))
+    if path.suffix != ".safetensors":
+        checkpoint = Checkpoint.open(path)
+        checkpoint.verify()
+        load_for_inference(model, checkpoint)
+        return checkpoint.path
+    if not path.is_file():
+        raise CheckpointError(f"there are no weights at {path}")
+    tensors = read_tensors(path)
+    brings = left_out(model).names - set(tensors)
+    check_names(tensors, model_tensors(model, brings), "the weights", str(path))
+    put_model_tensors(model, tensors)
+    return path
+
+
+def start_training_from(
+    model: nn.Module, init_from: str | None, before: Checkpoint | None, adapter: bool, world: World
+) -> None:
+    """Give a freshly built ``model`` the weights that ``init_from`` names, if any.
+
+    Args:
+        before: what the run resumes from: all weights are in it, but for an adapter's base.
+        adapter: the model is an adapter's base, whose weights are not saved.
+    """
+    place = base_of(before, init_from) if before is not None else init_from
+    if place is None:
+        return
+    # Found once: ranks that looked one after the other could find different ones.
+    found = start_from(model, on_first(world, lambda: exact_place(place)))
+    if adapter:
+        set_frozen_source(model, str(found))
+
+
+def _inside(name: str, prefix: str) -> bool:
+    return not prefix or name.startswith(prefix + ".")

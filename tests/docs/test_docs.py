@@ -146,10 +146,8 @@ def terminal(block: Block, folder: Path, variables: Mapping[str, str]) -> Iterat
         assert ended is None, f"it ended by itself: {said.read()}"
 
 
-@pytest.fixture(scope="module")
-def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files of the repository in a folder that tests may fill as they like."""
-    root = tmp_path_factory.mktemp("nightly") / "clone"
+def cloned(root: Path) -> Path:
+    """The files of the repository, copied to ``root``, which tests may fill as they like."""
     words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in listed.split("\0"):
@@ -160,11 +158,12 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def after_demo(clone: Path, env: Env) -> Path:
+def after_demo(tmp_path_factory: pytest.TempPathFactory, env: Env) -> Path:
     """A clone in which the demo ran; its short form stands where the default one would be."""
-    env.run("python", "-m", "tools.demo", "--smoke", cwd=clone, env=rendering.VARIABLES, quiet=True)
-    (clone / "demo_out" / "default").symlink_to("smoke")
-    return clone
+    root = cloned(tmp_path_factory.mktemp("after_demo") / "clone")
+    env.run("python", "-m", "tools.demo", "--smoke", cwd=root, env=rendering.VARIABLES, quiet=True)
+    (root / "demo_out" / "default").symlink_to("smoke")
+    return root
 
 
 @pytest.mark.slow
@@ -184,8 +183,9 @@ def test_what_is_done_with_the_demos_policy_works(page: Path, env: Env, after_de
 
 @pytest.mark.slow
 @pytest.mark.timeout(4 * 3600)
-def test_what_installs_and_trains_works(clone: Path) -> None:
+def test_what_installs_and_trains_works(tmp_path: Path) -> None:
     """README and the demo's page as they are typed in a fresh clone, README's other blocks too."""
+    clone = cloned(tmp_path / "clone")
     faulthandler.cancel_dump_traceback_later()
     path = os.pathsep.join([str(clone / "env" / "bin"), os.environ.get("PATH", os.defpath)])
     for page in (ROOT / "README.md", ROOT / "docs" / "demo.md"):

@@ -51,7 +51,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
 from fluxvla_core.build import RunContext
-from fluxvla_core.robot import priority
+from fluxvla_core.robot.control import priority
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE

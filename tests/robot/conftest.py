@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.robot.clock import SimulatedClock
+from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint

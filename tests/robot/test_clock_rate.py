@@ -7,7 +7,13 @@ import time
 
 import pytest
 
-from fluxvla_core.robot.clock import MonotonicClock, Rate, SimulatedClock, clock_of, in_lockstep
+from fluxvla_core.robot.control.clock import (
+    MonotonicClock,
+    Rate,
+    SimulatedClock,
+    clock_of,
+    in_lockstep,
+)
 
 
 class Stepped:

@@ -12,13 +12,12 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.robot import priority
-from fluxvla_core.robot.checks import check_beginning
-from fluxvla_core.robot.clock import Rate
-from fluxvla_core.robot.joining import Chunk
-from fluxvla_core.robot.limits import CommandLimiter
-from fluxvla_core.robot.safety_settings import SafetySettings
-from fluxvla_core.robot.tracking import TrackingWatch
+from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control.chunks import Chunk, check_beginning
+from fluxvla_core.robot.control.clock import Rate
+from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.safety import SafetySettings
+from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 on_linux = pytest.mark.skipif(

@@ -22,10 +22,9 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.robot.checks import as_action, as_frame, as_number, as_state
-from fluxvla_core.robot.clock import clock_of, in_lockstep
-from fluxvla_core.robot.delays import DelayMonitor, robot_call
-from fluxvla_core.robot.stops import BadFrame
+from fluxvla_core.robot.control.clock import clock_of, in_lockstep
+from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
+from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before a person is told to use the emergency stop.
@@ -316,3 +315,79 @@ def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
                     f"the config's embodiment widens {name} of {ours.name} to {given:g}; "
                     f"the robot's own limit is {getattr(theirs, name):g}"
                 )
+
+
+def as_frame(value: Any, source: str) -> Frame:
+    """``value`` if it has what a frame has.
+
+    Args:
+        value: what ``source`` gave, for example ``Arm.get_frame()``.
+
+    Raises:
+        BadFrame: it is something else; names ``source``.
+    """
+    fields = ("state", "images", "stamps")
+    if not all(hasattr(value, field) for field in fields):
+        raise BadFrame(
+            f"{source} gave a {type(value).__name__}, not a Frame",
+            cause="a Frame has state, images and stamps; where there is no reading yet, "
+            "get_frame() raises NotReady",
+            next="see docs/writing-a-plugin.md for an example",
+        )
+    for field in fields[1:]:
+        found = getattr(value, field)
+        if not isinstance(found, Mapping):
+            raise BadFrame(f"{field} of what {source} gave is a {type(found).__name__}, not a dict")
+    frame: Frame = value
+    return frame
+
+
+def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
+    """``(state_dim,)`` float64 of what ``source`` gave.
+
+    Raises:
+        BadFrame: it is no array of numbers, has another shape, or is not finite.
+    """
+    return _as_vector(value, embodiment.state_names, embodiment.name, source)
+
+
+def as_action(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
+    """``(dim,)`` float64 of what ``source`` gave.
+
+    Raises:
+        BadFrame: it is no array of numbers, has another shape, or is not finite.
+    """
+    return _as_vector(value, embodiment.joint_names, embodiment.name, source)
+
+
+def as_number(value: Any, source: str) -> float:
+    """A finite number that ``source`` gave.
+
+    Raises:
+        BadFrame: it is none.
+    """
+    if not is_number(value) or not math.isfinite(value):
+        raise BadFrame(f"{source} is {value!r}, not a finite number")
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a real number, numpy's among them; a truth value is none."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def _as_vector(
+    value: Any, names: tuple[str, ...], robot: str, source: str
+) -> npt.NDArray[np.float64]:
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "fiu":
+        raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
+    if found.shape != (len(names),):
+        raise BadFrame(f"{source} has shape {found.shape}; {robot} has ({len(names)},)")
+    bad = [name for name, ok in zip(names, np.isfinite(found), strict=True) if not ok]
+    if bad:
+        raise BadFrame(f"{source} is not finite for {', '.join(bad)}")
+    return found.astype(np.float64)

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fluxvla_core.errors import ConfigError, Faulted
-from fluxvla_core.robot import priority
+from fluxvla_core.robot.control import priority
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.memory import keep_large_blocks
 from fluxvla_core.ros2.require import require_rclpy

@@ -23,9 +23,8 @@ from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording import ros_messages as ros
-from fluxvla_core.robot.recording.logs import EVENTS_FILE
-from fluxvla_core.robot.recording.mcap import McapFile
-from fluxvla_core.robot.recording.trace import SUMMARY_FILE
+from fluxvla_core.robot.recording.bag import McapFile
+from fluxvla_core.robot.recording.trace import EVENTS_FILE, SUMMARY_FILE
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 from fluxvla_core.untrusted import read_bytes
 

@@ -7,6 +7,7 @@ pictures long before events.
 
 from __future__ import annotations
 
+import json
 import queue
 import re
 import threading
@@ -14,17 +15,19 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core import atomic
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot import priority
-from fluxvla_core.robot.recording.logs import Bag, JsonLines, Log
+from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.recording import ros_messages as ros
+from fluxvla_core.robot.recording.bag import Bag
 from fluxvla_core.robot.recording.video import VideoWriter
 
+EVENTS_FILE = "trace.jsonl"
 SUMMARY_FILE = "episode.json"
 # What may wait: pictures in bytes (35 of 640x480 in colour), events in number (minutes of them).
 _WAITING_BYTES = 32 * 1024 * 1024
@@ -39,6 +42,62 @@ Source = Callable[[str, float], tuple[Sequence[tuple[float, Picture]], int]]
 """``pictures_after`` of an operator: camera and a time -> the kept ones of those that arrived
 later, ``(stamp, picture)``, oldest first, and how many arrived since it was connected. It must be
 safe to call from any thread."""
+
+
+class Log(Protocol):
+    """Events in; every method is called in one thread, but for the constructor."""
+
+    def add(self, event: Mapping[str, Any]) -> None:
+        """Append one event: JSON values and arrays, with ``event`` and ``t``."""
+
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
+        """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``.
+
+        One that need not be ``exact`` may lose a little: a camera's whole stream is large.
+        """
+
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        """Append one ``(H, W)`` depth picture that arrived at ``stamp``."""
+
+    def flush(self) -> None:
+        """Give what is there to the system: a process that is killed then loses none of it."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+def _json(value: Any) -> str:
+    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        return "[" + ", ".join(map(_json, value)) + "]"
+    return json.dumps(value, default=ros.plain)
+
+
+class JsonLines:
+    """``trace.jsonl`` in ``folder``. It holds no pictures."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8")
+
+    def add(self, event: Mapping[str, Any]) -> None:
+        fields = (f"{json.dumps(key)}: {_json(value)}" for key, value in event.items())
+        self._file.write("{" + ", ".join(fields) + "}\n")
+
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
+        return
+
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        return
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
 
 
 @dataclass(frozen=True)

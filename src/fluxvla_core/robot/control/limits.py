@@ -40,7 +40,7 @@ the same ``b`` bounds the closing speed, so a step is followed in the least time
 lag.
 
 Joints that state a ``jerk`` limit ``J`` are smoothed after that: what is sent is the mean of the
-last ``N`` such commands, which also keeps ``|a - a_before| <= J dt``; ``robot.smoothing`` proves
+last ``N`` such commands, which also keeps ``|a - a_before| <= J dt``; ``smoothing`` proves
 it, and that such an arm comes to rest within all limits too. A motion that keeps the limits is sent
 ``(N - 1) / 2`` periods late then.
 """
@@ -54,8 +54,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.smoothing import Smoothing
-from fluxvla_core.robot.stops import BadCommand
+from fluxvla_core.robot.control.safety import BadCommand
+from fluxvla_core.robot.control.smoothing import Smoothing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

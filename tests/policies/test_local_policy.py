@@ -125,7 +125,7 @@ def observation(pose=(0.3, -0.4)):
 
 
 def load(path, **arguments):
-    from fluxvla_core.robot.local_policy import load_policy
+    from fluxvla_core.policies.loading import load_policy
 
     return load_policy(path, **arguments)
 
@@ -260,7 +260,7 @@ def test_bf16_computes_and_still_gives_float64(tmp_path):
     ],
 )
 def test_processes_of_one_machine_have_a_gpu_each(environment, count, device):
-    from fluxvla_core.robot.local_policy import own_device
+    from fluxvla_core.policies.loading import own_device
 
     assert own_device(environment, count) == device
 
@@ -277,7 +277,7 @@ def test_a_plain_cuda_is_the_gpu_of_this_process(tmp_path, monkeypatch):
 
 
 def test_a_work_dir_means_its_newest_whole_checkpoint(tmp_path):
-    from fluxvla_core.robot.local_policy import find_checkpoint
+    from fluxvla_core.policies.loading import find_checkpoint
 
     save(tmp_path, step=100)
     newest = save(tmp_path, step=200)

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 
 from fluxvla_core.contracts.robot import Clock
-from fluxvla_core.robot import priority
+from fluxvla_core.robot.control import priority
 
 
 class MonotonicClock:

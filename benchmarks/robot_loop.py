@@ -279,7 +279,7 @@ def upstream(seconds: float, prompt: float) -> dict[str, Any]:
 def bare(seconds: float, prompt: float) -> dict[str, Any]:
     """A loop that does nothing; ``late_share`` and jitter as the others have them."""
     woke, late = [], []
-    with priority.first():
+    with priority.real_time():
         due = time.monotonic()
         for _ in range(round(seconds * RATE_HZ)):
             due += 1 / RATE_HZ

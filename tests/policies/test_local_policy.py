@@ -362,19 +362,3 @@ def test_weights_of_another_model_and_damaged_files_are_refused(tmp_path):
         wrong = writer.commit()
     with pytest.raises(CheckpointError, match="gain"):
         load(wrong)
-
-
-def test_the_runner_loads_the_work_dirs_checkpoint(bench, make_arm):
-    save(bench.work_dir)
-    bench.arm = make_arm(embodiment=ARM)
-    bench.arm.state = np.zeros(2)
-    bench.policy = None
-
-    result = bench.run(max_publish_step=20, execute_horizon=2, safety={"jump_s": 50, "excess": 50})
-
-    assert result["outcome"] == "max_steps"
-    summary = bench.episode()
-    assert set(summary["timings"]) == {
-        "receipt", "sync", "policy", "preprocess", "inference", "postprocess", "late", "send",
-    }  # fmt: skip
-    assert any("step-000000100" in line for line in bench.notes.lines)

@@ -105,9 +105,7 @@ class LocalPolicy(Policy):
         Raises:
             DataError, ConfigError: the observation lacks something that the transforms need.
         """
-        chunk = self.predict_batch([Question(observation, self._seed, self._calls)])[0]
-        self._calls += 1
-        return chunk
+        return self._predict(observation)
 
     @property
     def continues(self) -> bool:
@@ -127,10 +125,7 @@ class LocalPolicy(Policy):
             ConfigError: the model takes no such thing, or its actions cannot be scaled back.
             DataError: the observation lacks something that the transforms need.
         """
-        question = Question(observation, self._seed, self._calls, rest)
-        chunk = self.predict_batch([question])[0]
-        self._calls += 1
-        return chunk
+        return self._predict(observation, rest)
 
     def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
         """An answer to each of at most ``batch_size`` questions, in one forward pass.
@@ -176,6 +171,11 @@ class LocalPolicy(Policy):
             "postprocess": time.perf_counter() - inferred,
         }
         return chunks
+
+    def _predict(self, observation: Observation, rest: Continuation | None = None) -> Array:
+        chunk = self.predict_batch([Question(observation, self._seed, self._calls, rest)])[0]
+        self._calls += 1
+        return chunk
 
     def _row(self, question: Question) -> dict[str, Any]:
         """A batch of one, with what the model takes."""

@@ -274,7 +274,7 @@ class Robot:
         if given is not None and not isinstance(given, (EmbodimentSpec, Mapping)):
             raise ConfigError(f"embodiment must be a table, got {given!r}")
         said = EmbodimentSpec.from_dict(given) if isinstance(given, Mapping) else given
-        own = getattr(self._operator, "embodiment", None)
+        own: Any = self._operator.embodiment if self._has("embodiment") else None
         if own is None and said is None:
             raise LoadFailed(
                 f"{self.name} has no embodiment: which joints it moves and within which limits is "
@@ -300,20 +300,18 @@ class Robot:
 def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
     """A config may narrow a robot's limits; it cannot widen them."""
     for ours, theirs in zip(said.joints, own.joints, strict=True):
-        wider = {
-            "lower": ours.lower < theirs.lower,
-            "upper": ours.upper > theirs.upper,
-            "velocity": ours.velocity > theirs.velocity,
-            "acceleration": ours.acceleration > theirs.acceleration,
-            "jerk": (ours.jerk or math.inf) > (theirs.jerk or math.inf),
+        limits = {
+            "lower": (ours.lower, theirs.lower),
+            "upper": (ours.upper, theirs.upper),
+            "velocity": (ours.velocity, theirs.velocity),
+            "acceleration": (ours.acceleration, theirs.acceleration),
+            "jerk": (ours.jerk or math.inf, theirs.jerk or math.inf),
         }
-        for name, is_wider in wider.items():
-            if is_wider:
-                given = getattr(ours, name)
-                given = math.inf if given is None else given
+        for name, (given, own_limit) in limits.items():
+            if (given < own_limit) if name == "lower" else (given > own_limit):
                 raise SpecMismatch(
                     f"the config's embodiment widens {name} of {ours.name} to {given:g}; "
-                    f"the robot's own limit is {getattr(theirs, name):g}"
+                    f"the robot's own limit is {own_limit:g}"
                 )
 
 

@@ -33,7 +33,7 @@ from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.robot.control import priority
 from fluxvla_core.robot.control.commands import check_pose
-from fluxvla_core.robot.control.filters import SnapGripper, bind_filters
+from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
@@ -199,7 +199,8 @@ class BaseInferenceRunner(Runner):
         if gripper_threshold is not None:
             # After the config's own filters, right before the limits.
             self.action_filters.append(SnapGripper(gripper_threshold))
-        bind_filters(self.action_filters, self.embodiment)
+        for each in self.action_filters:
+            each.bind(self.embodiment)
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
         self._history = RunHistory()
@@ -288,7 +289,7 @@ class BaseInferenceRunner(Runner):
                 hooks.call("run_started")
                 source.open()
                 self.robot.connect()
-                with nullcontext() if self.robot.lockstep else priority.first():
+                with nullcontext() if self.robot.lockstep else priority.real_time():
                     result = session.run(self._run_episode)
                 ended = "ok"
             except Interrupted as signal:

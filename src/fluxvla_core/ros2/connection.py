@@ -143,7 +143,7 @@ class Connection:
 
     def _spin(self) -> None:
         # Whoever sends commands waits for the interpreter while this thread has it.
-        priority.second()
+        priority.just_below_real_time()
         main = threading.main_thread()
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without

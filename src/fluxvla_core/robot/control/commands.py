@@ -184,18 +184,19 @@ class CommandSender:
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
         self.latch.check()
-        self._send_brake()
+        self.stay()
 
     def brake(self) -> None:
         """Come to rest; also while the latch is tripped."""
         for _ in range(self.limiter.longest_stop):
             if self.limiter.at_rest:
                 return
-            self._send_brake()
+            self.stay()
 
     def stay(self) -> None:
         """Send one command as ``hold`` does; also while the latch is tripped."""
-        self._send_brake()
+        before = self.limiter.last
+        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
     def lead(self, goal: Array, most: int) -> None:
         """Come to rest at the ``(D,)`` goal, or where the limits let it; also while tripped.
@@ -212,10 +213,6 @@ class CommandSender:
             command = self.limiter.settle(reachable, share)
             self._send(reachable[None], command[None], [[]], held=True)
         self.brake()
-
-    def _send_brake(self) -> None:
-        before = self.limiter.last
-        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
     def _send(
         self,

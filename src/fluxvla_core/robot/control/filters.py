@@ -7,7 +7,7 @@ A filter is ``f(action) -> action`` on one ``(D,)`` target in physical units; se
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,16 +25,6 @@ Columns = npt.NDArray[np.intp]
 _ROUNDS = 20
 _DAMPING = 1e-4  # m^2/rad^2, keeps steps finite where the arm is stretched
 _INSIDE = 1e-6  # m
-
-
-def bind_filters(filters: Iterable[ActionFilter], embodiment: EmbodimentSpec) -> None:
-    """Tell every filter that wants to know which robot it is for.
-
-    Raises:
-        ConfigError: one of them does not fit it.
-    """
-    for each in filters:
-        each.bind(embodiment)
 
 
 class SnapGripper(ActionFilter):

@@ -47,7 +47,6 @@ it, and that such an arm comes to rest within all limits too. A motion that keep
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -406,13 +405,3 @@ def braking_speed(room: Array, step: Array, period: float) -> Array:
     steps = np.floor((np.sqrt(1.0 + 8.0 * reach / step) - 1.0) / 2.0)
     speed: Array = (reach + step * steps * (steps + 1.0) / 2.0) / (steps + 1.0)
     return speed
-
-
-def count_clamps(rows: Sequence[Sequence[Clamp]]) -> dict[str, dict[str, int]]:
-    """joint -> reason -> how many commands."""
-    counts: dict[str, dict[str, int]] = {}
-    for row in rows:
-        for clamp in row:
-            reasons = counts.setdefault(clamp.joint, {})
-            reasons[clamp.reason] = reasons.get(clamp.reason, 0) + 1
-    return counts

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, ClassVar
 
-from fluxvla_core.errors import ConfigError, FluxError, OperatorError, SafetyStop
+from fluxvla_core.errors import ConfigError, FluxError, OperatorError, RunFailed, SafetyStop
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,13 @@ class SafetySettings:
     first_chunk_s: float = 120.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for name, value in vars(self).items():
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             if not number or not math.isfinite(value) or value <= 0:
-                raise ConfigError(f"safety.{field.name} must be a positive number, got {value!r}")
-            if field.name.endswith("_scale") and value > 1:
+                raise ConfigError(f"safety.{name} must be a positive number, got {value!r}")
+            if name.endswith("_scale") and value > 1:
                 raise ConfigError(
-                    f"safety.{field.name} must be above 0 and at most 1, got {value}",
+                    f"safety.{name} must be above 0 and at most 1, got {value}",
                     cause="a scale uses a share of the robot's limits; it cannot lift them",
                 )
 
@@ -142,6 +141,12 @@ class Starved(RuleStop):
     rule = Rule.STARVATION
 
 
+class PolicyFailed(RunFailed):
+    """A policy raised something."""
+
+    rule: ClassVar[str] = Rule.POLICY
+
+
 def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:
     """The rule that an error belongs to: its own ``rule``, or ``operator`` for an operator's.
 
@@ -149,9 +154,8 @@ def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:
         error: what ended a motion.
         otherwise: for an error that says nothing.
     """
-    rule: str | None = getattr(error, "rule", None)
-    if rule is not None:
-        return str(rule)
+    if isinstance(error, (RuleStop, PolicyFailed)):
+        return error.rule
     return Rule.OPERATOR if isinstance(error, OperatorError) else otherwise
 
 

@@ -54,8 +54,6 @@ class Bag:
         store = ros.typestore()
         if folder.exists():
             raise FileExistsError(f"{folder} is there already")
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-
         self._store = store
         self._packer = ros.Packer(store)
         self._names = names
@@ -63,9 +61,7 @@ class Bag:
         self._channels: dict[str, Any] = {}
         self._written: dict[str, deque[int]] = {}
         self._has_jpeg = ros.has_jpeg()
-        # Version 8 of the metadata is read by every release from Humble on.
-        self._writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer = bag_writer(folder)
         self._writer.open()
         storage: Any = self._writer.storage
         storage.compressor = partial(zstd().compress, level=_LEVEL)
@@ -236,6 +232,16 @@ class McapFile:
                 cause="the file was damaged after it was written",
             )
         return content
+
+
+def bag_writer(folder: Path) -> Any:
+    """A rosbags writer of compressed MCAP, not opened yet; ``folder`` must not exist."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    # Version 8 of the metadata is read by every release from Humble on.
+    writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    return writer
 
 
 def zstd() -> Any:

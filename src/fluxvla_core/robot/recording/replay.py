@@ -20,7 +20,14 @@ from fluxvla_core.errors import ConfigError, DataError, NotReady
 from fluxvla_core.robot.control.clock import MonotonicClock, SimulatedClock
 from fluxvla_core.robot.policy_calls import PolicyEnded
 from fluxvla_core.robot.recording import episode_log
-from fluxvla_core.robot.recording.recorded import Event, Recorded, age_at, open_recording
+from fluxvla_core.robot.recording.recorded import (
+    ROUNDING_S,
+    Event,
+    Recorded,
+    age_at,
+    newest_at,
+    open_recording,
+)
 from fluxvla_core.robot.recording.ros_messages import BASE
 from fluxvla_core.ros2.actions import checked_action
 from fluxvla_core.ros2.frames import RobotFrame
@@ -31,8 +38,6 @@ Array = npt.NDArray[np.float64]
 CHUNKS, COMMANDS = "chunks", "commands"
 ENDED = "recording_ended"
 """An episode's outcome."""
-# Times in a recording are rounded to nanoseconds.
-_ROUNDING_S = 1e-6
 
 
 class ReplayOperator(Operator):
@@ -114,7 +119,7 @@ class ReplayOperator(Operator):
             NotReady: not connected.
         """
         now = self._now()
-        look = max(0, _newest(self._looked, now))
+        look = int(newest_at(self._looked, now))
         arrived = {stream: self._arrived(stream, look, now) for stream in self._arrivals}
         cameras, depths = self.recorded.pictures, self.recorded.depths
         images = {name: found.shown(arrived[name]) for name, found in cameras.items()}
@@ -152,7 +157,7 @@ class ReplayOperator(Operator):
 
     def task_done(self) -> bool:
         """Whether the recording is over; said once."""
-        over = self._now() >= self._last - _ROUNDING_S
+        over = self._now() >= self._last - ROUNDING_S
         if over and not self._ended:
             self._ended = True
             cut = "" if self.recorded.whole else ", where it was cut short"
@@ -221,7 +226,7 @@ class ReplayOperator(Operator):
 
     def _state(self, time: float) -> Array:
         times, states = self._states
-        return np.array(states[max(0, _newest(times, time))])
+        return np.array(states[newest_at(times, time)])
 
 
 class RecordingEnded(PolicyEnded):
@@ -327,8 +332,3 @@ class ReplayPolicy(Policy):
                 where=str(recorded.path),
             )
         return found
-
-
-def _newest(times: Array, now: float) -> int:
-    """Index of the last of ascending ``times`` that is not after ``now``; -1 if there is none."""
-    return int(np.searchsorted(times, now + _ROUNDING_S, side="right")) - 1

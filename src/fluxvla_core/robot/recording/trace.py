@@ -45,7 +45,11 @@ safe to call from any thread."""
 
 
 class Log(Protocol):
-    """Events in; every method is called in one thread, but for the constructor."""
+    """Where events go: JSON lines, or a bag that ROS tools open, which has the pictures too.
+
+    Both take the same events and give the same events back (``recording.recorded``). Every method
+    is called in one thread, but for the constructor.
+    """
 
     def add(self, event: Mapping[str, Any]) -> None:
         """Append one event: JSON values and arrays, with ``event`` and ``t``."""
@@ -56,10 +60,13 @@ class Log(Protocol):
         """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``.
 
         One that need not be ``exact`` may lose a little: a camera's whole stream is large.
+        A log that holds no pictures drops them.
         """
+        return
 
     def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
         """Append one ``(H, W)`` depth picture that arrived at ``stamp``."""
+        return
 
     def flush(self) -> None:
         """Give what is there to the system: a process that is killed then loses none of it."""
@@ -68,14 +75,7 @@ class Log(Protocol):
         """Finish the file."""
 
 
-def _json(value: Any) -> str:
-    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
-    if isinstance(value, np.ndarray) and value.ndim > 1:
-        return "[" + ", ".join(map(_json, value)) + "]"
-    return json.dumps(value, default=ros.plain)
-
-
-class JsonLines:
+class JsonLines(Log):
     """``trace.jsonl`` in ``folder``. It holds no pictures."""
 
     def __init__(self, folder: Path) -> None:
@@ -85,19 +85,18 @@ class JsonLines:
         fields = (f"{json.dumps(key)}: {_json(value)}" for key, value in event.items())
         self._file.write("{" + ", ".join(fields) + "}\n")
 
-    def picture(
-        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
-    ) -> None:
-        return
-
-    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
-        return
-
     def flush(self) -> None:
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
+
+
+def _json(value: Any) -> str:
+    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        return "[" + ", ".join(map(_json, value)) + "]"
+    return json.dumps(value, default=ros.plain)
 
 
 @dataclass(frozen=True)
@@ -234,7 +233,7 @@ class EpisodeTrace:
 
     def _run(self) -> None:
         # Whoever sends commands waits for the interpreter while this thread has it.
-        priority.second()
+        priority.just_below_real_time()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -248,7 +247,7 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
-        with priority.ordinary():
+        with priority.normal():
             self._finish()
 
     def _finish(self) -> None:
@@ -269,7 +268,7 @@ class EpisodeTrace:
             self._log.add(item)
             return
         camera, stamp, image = item
-        with priority.ordinary():
+        with priority.normal():
             if stamp is None:
                 self._film(camera, image)
             elif image.ndim == 2:
@@ -298,7 +297,7 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
-        with priority.ordinary():
+        with priority.normal():
             self._poll_all(self._source)
 
     def _poll_all(self, source: Source) -> None:

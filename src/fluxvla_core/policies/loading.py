@@ -95,7 +95,7 @@ def load_policy(
 
 
 def own_device(environment: Mapping[str, str], count: int) -> str:
-    """The GPU of this process: of several on one machine each has its own, as far as they reach.
+    """The torch device of this process: ranks on one machine share its GPUs evenly.
 
     Args:
         environment: of the process; torchrun sets ``LOCAL_RANK``, ``srun`` ``SLURM_LOCALID``.

@@ -116,7 +116,7 @@ class LocalPolicy(Policy):
         return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """As ``predict_action``, for a chunk that goes on from ``rest`` (``ContinuesChunks``).
+        """As ``predict_action``, for a chunk that goes on from ``rest``.
 
         The model gets ``prev_actions`` ``(1, T, D)`` normalised, ``prefix_weights`` ``(1, T)``,
         ``prefix_len`` ``(1,)`` and ``max_guidance_weight`` ``(1,)``.
@@ -236,7 +236,7 @@ class LocalPolicy(Policy):
 
 @dataclass(frozen=True)
 class Scaling:
-    """From a policy's actions back to what its model computes with, whatever made them physical.
+    """Element-wise offset and slope between a model's normalised actions and physical ones.
 
     ``physical = offset + slope * normalized``, both ``(T, D)``; the model's rows are wider.
 

@@ -210,7 +210,7 @@ def _is_nothing(state: Any) -> bool:
 
 
 class FreshnessGate:
-    """Receipt age and skew of the streams of an observation, and that none runs backwards.
+    """Checks receipt age and skew of an observation's streams, and that none runs backwards.
 
     Args:
         max_age_s: how old the newest reading of any stream may be.
@@ -221,10 +221,6 @@ class FreshnessGate:
         self.max_age_s = max_age_s
         self.max_skew_s = max_skew_s
         self._newest: dict[str, float] = {}
-
-    def reset(self) -> None:
-        """Forget what was seen: the operator was connected anew."""
-        self._newest.clear()
 
     def check(self, stamps: Mapping[str, float], cameras: Iterable[str], now: float) -> float:
         """Admit one observation.
@@ -305,7 +301,7 @@ def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]
 
 
 def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:
-    """Whether a robot's cameras show what the policy was trained on.
+    """Check that a robot's cameras show what the policy was trained on, perhaps larger.
 
     A camera may have more pixels than in training; it may not show another view.
 

@@ -1,4 +1,4 @@
-"""A robot as a runner uses it, whether its operator has the full contract or only some of it.
+"""``Robot``: an operator with its embodiment and clock; checks everything the operator returns.
 
 The specification's operators have ``get_frame`` and commands of their own (``servoj``,
 ``movegrip``), no specs, and open their connection in the constructor. One like that is accepted
@@ -226,7 +226,7 @@ class Robot:
         return implements(self._operator, Operator, ability)
 
     def _ask(self, method: str, function: Callable[[], object]) -> Any:
-        """What the operator says; where that goes wrong, its commands still arrive."""
+        """The result of a getter of the operator's; if it fails, commands can still be sent."""
         try:
             return function()
         except FluxError:
@@ -245,13 +245,14 @@ class Robot:
             raise Faulted(f"{self.name}.{method} raised {type(error).__name__}: {error}") from error
 
     def _bounded(self, method: str, function: Callable[[], object]) -> str | None:
-        problem: list[str] = []
         if self.lockstep:
             # Simulations are bound to one thread (renderers are), and cannot hurt anybody.
             return self._reported(method, function)
 
+        found: list[str | None] = []
+
         def call() -> None:
-            problem.extend(filter(None, [self._reported(method, function)]))
+            found.append(self._reported(method, function))
 
         thread = threading.Thread(target=call, name=f"fluxvla-{method}", daemon=True)
         thread.start()
@@ -261,7 +262,7 @@ class Robot:
                 f"{self.name}.{method} did not return within {STOP_S:g} s: "
                 "use the robot's emergency stop"
             )
-        return problem[0] if problem else None
+        return found[0] if found else None
 
     def _reported(self, method: str, function: Callable[[], object]) -> str | None:
         try:
@@ -316,7 +317,7 @@ def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
 
 
 def as_frame(value: Any, source: str) -> Frame:
-    """``value`` if it has what a frame has.
+    """``value``, checked to have the fields of a ``Frame``.
 
     Args:
         value: what ``source`` gave, for example ``Arm.get_frame()``.
@@ -341,7 +342,7 @@ def as_frame(value: Any, source: str) -> Frame:
 
 
 def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
-    """``(state_dim,)`` float64 of what ``source`` gave.
+    """``value`` as a checked ``(state_dim,)`` float64 array; ``source`` is for the message.
 
     Raises:
         BadFrame: it is no array of numbers, has another shape, or is not finite.
@@ -350,7 +351,7 @@ def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray
 
 
 def as_action(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
-    """``(dim,)`` float64 of what ``source`` gave.
+    """``value`` as a checked ``(dim,)`` float64 array; ``source`` is for the message.
 
     Raises:
         BadFrame: it is no array of numbers, has another shape, or is not finite.
@@ -359,7 +360,7 @@ def as_action(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArra
 
 
 def as_number(value: Any, source: str) -> float:
-    """A finite number that ``source`` gave.
+    """``value`` as a float, checked to be finite; ``source`` is for the message.
 
     Raises:
         BadFrame: it is none.
@@ -370,7 +371,7 @@ def as_number(value: Any, source: str) -> float:
 
 
 def is_number(value: Any) -> bool:
-    """Whether ``value`` is a real number, numpy's among them; a truth value is none."""
+    """Whether ``value`` is a real number, of Python or numpy, and not a bool."""
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 

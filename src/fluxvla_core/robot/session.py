@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.safety import Latch, PolicyFailed
+from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.episode import Episode, EpisodeSettings, Equipment
-from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.policy_calls import PolicyFailed, PolicyThread
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
 _LOOK_S = 0.02
@@ -29,7 +29,7 @@ _KEPT = ("task", "outcome", "success", "steps")
 
 @dataclass
 class RunHistory:
-    """What a runner keeps from one ``run()`` to the next, as an arm keeps its pose.
+    """What a runner keeps from one ``run()`` to the next.
 
     Args:
         episodes: how many there were.

@@ -38,7 +38,7 @@ class Task:
 
     @property
     def warning(self) -> str:
-        """What is to be said of an instruction that is free."""
+        """The warning about an instruction that the config does not know."""
         return (
             f"{self.instruction!r} is none of the config's task_descriptions: the policy is not "
             "known to be trained on it, and the arm may do anything within its limits"

@@ -1,1 +1,4 @@
-"""What commands an arm: clock, chunks, filters, limits, stops; nothing of policies or pictures."""
+"""What commands an arm: clock, chunk joining, action filters, limits, stops.
+
+Nothing in it knows of policies, pictures, tasks or recordings; an import contract keeps it so.
+"""

@@ -43,7 +43,7 @@ class Chunk:
         return len(self.keyframes) / self.rate_hz
 
     def reaches(self, elapsed: float) -> bool:
-        """Whether it says anything about ``elapsed`` seconds after its beginning."""
+        """Whether it lasts until ``elapsed`` seconds after its beginning."""
         # One part in a million of a keyframe's time is rounding, not an end.
         return elapsed <= self.seconds + 1e-6 / self.rate_hz
 
@@ -207,15 +207,15 @@ def check_beginning(
         BadChunk: no motion explains the jump.
     """
     lower, upper = np.array([(j.lower, j.upper) for j in embodiment.joints]).T
-    way = np.array([last, np.clip(keyframes[0], lower, upper)])
-    _check_jumps(way, 0, embodiment, rate_hz, settings)
+    points = np.array([last, np.clip(keyframes[0], lower, upper)])
+    _check_jumps(points, 0, embodiment, rate_hz, settings)
 
 
 def _check_jumps(
-    way: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
+    points: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
 ) -> None:
-    """Of the points ``(N, dim)`` of a way, the second of which is keyframe ``first``."""
-    moves = np.diff(way, axis=0)
+    """Refuse jumps between points ``(N, dim)``, the second of which is keyframe ``first``."""
+    moves = np.diff(points, axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
     seconds = np.abs(moves) / np.array([j.velocity for j in embodiment.joints]) - 1.0 / rate_hz
     if not (seconds > settings.jump_s).any():
@@ -231,7 +231,7 @@ def _check_jumps(
 
 
 def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:
-    """What of a policy's chunk ``(T, dim)`` is not finite, in words; None if all of it is."""
+    """A message that names the first value of a chunk ``(T, dim)`` that is not finite, or None."""
     bad = np.argwhere(~np.isfinite(chunk))
     if not bad.size:
         return None

@@ -1,4 +1,4 @@
-"""What may alter an action on its way: the ``action_filters`` of a config, in its order.
+"""Action filters: the ``action_filters`` of a config, applied in its order before the limits.
 
 A filter is ``f(action) -> action`` on one ``(D,)`` target in physical units; see
 ``contracts.ActionFilter``. The limits come after all filters, so that no filter can undo them.

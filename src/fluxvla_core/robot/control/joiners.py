@@ -72,7 +72,7 @@ class ChunkJoiner(ABC):
 
 
 class StreamedJoiner(ChunkJoiner):
-    """What joiners have in common that ask for the next chunk while one is being played.
+    """Base of the joiners that ask for the next chunk while one is being played.
 
     Args:
         every_s: how far apart the observations that are answered should be, at least; a slow
@@ -146,7 +146,7 @@ class LatestOnly(StreamedJoiner):
 
 
 class TemporalEnsemble(StreamedJoiner):
-    """The weighted mean of every chunk that says something about a moment.
+    """The weighted mean of all chunks that reach a moment.
 
     Zhao et al. 2023 (ACT, arXiv 2304.13705, section IV-B) ask the policy at every step and give
     the ``i``-th oldest of the predictions for a moment the weight ``exp(-m i)``: the oldest counts

@@ -1,4 +1,4 @@
-r"""The last thing between a policy and a robot: position, velocity and acceleration limits.
+r"""Limits of commands, applied last: position, velocity, acceleration (``smoothing``: jerk).
 
 ``CommandLimiter`` turns any finite sequence of wanted targets into commands that keep, joint by
 joint and for every command ``p`` with its speed ``v = (p - p_before) / dt``:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, ClassVar
 
-from fluxvla_core.errors import ConfigError, FluxError, OperatorError, RunFailed, SafetyStop
+from fluxvla_core.errors import ConfigError, FluxError, SafetyStop
 
 
 @dataclass(frozen=True)
@@ -141,22 +141,15 @@ class Starved(RuleStop):
     rule = Rule.STARVATION
 
 
-class PolicyFailed(RunFailed):
-    """A policy raised something."""
-
-    rule: ClassVar[str] = Rule.POLICY
-
-
 def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:
-    """The rule that an error belongs to: its own ``rule``, or ``operator`` for an operator's.
+    """The rule that an error belongs to: its own ``rule``, if it has one.
 
     Args:
         error: what ended a motion.
         otherwise: for an error that says nothing.
     """
-    if isinstance(error, (RuleStop, PolicyFailed)):
-        return error.rule
-    return Rule.OPERATOR if isinstance(error, OperatorError) else otherwise
+    own = error.rule if isinstance(error, FluxError) else ""
+    return str(own or otherwise)
 
 
 @dataclass(frozen=True)

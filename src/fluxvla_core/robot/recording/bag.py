@@ -1,4 +1,4 @@
-"""Reading an MCAP file from its beginning, whether it was finished or cut short.
+"""MCAP files: ``Bag`` writes an episode as a rosbag2, ``McapFile`` reads one, whole or cut short.
 
 A process that is killed leaves no index at the end of its file. What it wrote until then is a
 sequence of whole records, and this reads records, so that nothing of it is lost. Format:

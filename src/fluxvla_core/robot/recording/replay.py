@@ -156,7 +156,7 @@ class ReplayOperator(Operator):
             self.clock.advance(1.0 / self.embodiment.rate_hz)
 
     def task_done(self) -> bool:
-        """Whether the recording is over; said once."""
+        """Whether the recording is over, which is reported once."""
         over = self._now() >= self._last - ROUNDING_S
         if over and not self._ended:
             self._ended = True

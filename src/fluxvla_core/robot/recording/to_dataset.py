@@ -83,7 +83,7 @@ def row_times(recorded: Recorded, fps: float) -> Array:
 
 
 def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recorded]:
-    """Those that can be used; what is left out is said."""
+    """Those that can be used; what is left out is reported."""
     found, failed = [], 0
     for path in paths:
         recorded = open_recording(path)
@@ -147,7 +147,7 @@ def _write(
 def _pictures(
     recorded: Recorded, cameras: Sequence[str], times: Array, fps: float, say: Reporter
 ) -> dict[str, npt.NDArray[np.intp]]:
-    """Camera -> which of its pictures is the newest at each of ``times``; sparse ones are said."""
+    """Camera -> which of its pictures is the newest at each of ``times``; warns of sparse ones."""
     found = {}
     for name in cameras:
         index = newest_at(np.array(recorded.pictures[name].times), times)

@@ -1,4 +1,4 @@
-"""What an episode leaves behind: its events, a video for each camera, ``episode.json``.
+"""Writing an episode's files: its events, a video for each camera, ``episode.json``.
 
 Everything is handed over at once and written by a thread of its own: recording never makes a
 command late. What waits to be written is bounded; what finds no room is dropped and counted,

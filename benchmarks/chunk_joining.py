@@ -31,8 +31,8 @@ from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.policy import Continuation
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.robot.joiners import METHODS
-from fluxvla_core.robot.local_policy import find_checkpoint, load_policy
+from fluxvla_core.policies.loading import find_checkpoint, load_policy
+from fluxvla_core.robot.control.joiners import METHODS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]

@@ -51,7 +51,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
 from fluxvla_core.build import RunContext
-from fluxvla_core.robot import priority
+from fluxvla_core.robot.control import priority
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2.rates import large_frames_profile
 from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
@@ -279,7 +279,7 @@ def upstream(seconds: float, prompt: float) -> dict[str, Any]:
 def bare(seconds: float, prompt: float) -> dict[str, Any]:
     """A loop that does nothing; ``late_share`` and jitter as the others have them."""
     woke, late = [], []
-    with priority.first():
+    with priority.real_time():
         due = time.monotonic()
         for _ in range(round(seconds * RATE_HZ)):
             due += 1 / RATE_HZ

@@ -46,7 +46,7 @@ _EXPORTS: dict[str, str] = {
     "TrainRunner": "fluxvla_core.contracts.runner",
     "Transform": "fluxvla_core.contracts.training",
     "VLA": "fluxvla_core.contracts.training",
-    "load_policy": "fluxvla_core.robot.local_policy",
+    "load_policy": "fluxvla_core.policies.loading",
 }
 
 __all__ = [*sorted(_EXPORTS), "__version__"]

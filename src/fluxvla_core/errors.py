@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 __all__ = [
     "EXIT_BAD_INPUT",
@@ -78,6 +78,8 @@ class FluxError(Exception):
     """
 
     exit_code = EXIT_FAILED
+    rule: ClassVar[str] = ""
+    """The safety rule that a robot's stop is recorded under, if this error ends its motion."""
 
     def __init__(
         self,
@@ -226,6 +228,8 @@ class RunFailed(FluxError):
 
 class OperatorError(FluxError):
     """The robot, or its driver, did not do what it was asked."""
+
+    rule: ClassVar[str] = "operator"
 
 
 class NotReady(OperatorError):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.training import VLA as VLA
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
-    from fluxvla_core.robot.local_policy import load_policy as load_policy
+    from fluxvla_core.policies.loading import load_policy as load_policy
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -33,6 +33,6 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.policy": ["Policy"],
         "fluxvla_core.contracts.training": ["VLA"],
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
-        "fluxvla_core.robot.local_policy": ["load_policy"],
+        "fluxvla_core.policies.loading": ["load_policy"],
     },
 )

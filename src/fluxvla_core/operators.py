@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.robot import ActionFilter as ActionFilter
     from fluxvla_core.contracts.robot import Clock as Clock
     from fluxvla_core.contracts.robot import Operator as Operator
-    from fluxvla_core.robot.clock import MonotonicClock as MonotonicClock
-    from fluxvla_core.robot.clock import SimulatedClock as SimulatedClock
-    from fluxvla_core.robot.filters import LowPass as LowPass
-    from fluxvla_core.robot.filters import SnapGripper as SnapGripper
+    from fluxvla_core.robot.control.clock import MonotonicClock as MonotonicClock
+    from fluxvla_core.robot.control.clock import SimulatedClock as SimulatedClock
+    from fluxvla_core.robot.control.filters import LowPass as LowPass
+    from fluxvla_core.robot.control.filters import SnapGripper as SnapGripper
+    from fluxvla_core.robot.control.filters import WorkspaceBox as WorkspaceBox
+    from fluxvla_core.robot.control.safety import SafetySettings as SafetySettings
     from fluxvla_core.robot.recording.trace import EpisodeTrace as EpisodeTrace
     from fluxvla_core.robot.recording.trace import next_folder as next_folder
     from fluxvla_core.robot.runner import BaseInferenceRunner as BaseInferenceRunner
-    from fluxvla_core.robot.safety_settings import SafetySettings as SafetySettings
     from fluxvla_core.robot.tasks import Task as Task
     from fluxvla_core.robot.tasks import check_descriptions as check_descriptions
     from fluxvla_core.robot.tasks import task_source as task_source
     from fluxvla_core.robot.tasks import tasks as tasks
-    from fluxvla_core.robot.workspace import WorkspaceBox as WorkspaceBox
     from fluxvla_core.spec.embodiment import Camera as Camera
     from fluxvla_core.spec.embodiment import EmbodimentSpec as EmbodimentSpec
     from fluxvla_core.spec.embodiment import Joint as Joint
@@ -45,13 +45,12 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.frame": ["Frame", "Observation", "STATE"],
         "fluxvla_core.contracts.policy": ["Continuation", "Policy"],
         "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator"],
-        "fluxvla_core.robot.clock": ["MonotonicClock", "SimulatedClock"],
-        "fluxvla_core.robot.filters": ["LowPass", "SnapGripper"],
+        "fluxvla_core.robot.control.clock": ["MonotonicClock", "SimulatedClock"],
+        "fluxvla_core.robot.control.filters": ["LowPass", "SnapGripper", "WorkspaceBox"],
+        "fluxvla_core.robot.control.safety": ["SafetySettings"],
         "fluxvla_core.robot.recording.trace": ["EpisodeTrace", "next_folder"],
         "fluxvla_core.robot.runner": ["BaseInferenceRunner"],
-        "fluxvla_core.robot.safety_settings": ["SafetySettings"],
         "fluxvla_core.robot.tasks": ["Task", "check_descriptions", "task_source", "tasks"],
-        "fluxvla_core.robot.workspace": ["WorkspaceBox"],
         "fluxvla_core.spec.embodiment": ["Camera", "EmbodimentSpec", "Joint"],
     },
 )

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from fluxvla_core.atomic import write_text as write_text
     from fluxvla_core.config.snapshot import work_dirs_below as work_dirs_below
     from fluxvla_core.robot.recording import episode_log as episode_log
-    from fluxvla_core.robot.recording.logs import EVENTS_FILE as EVENTS_FILE
     from fluxvla_core.robot.recording.recorded import bag_of as bag_of
     from fluxvla_core.robot.recording.recorded import is_recording as is_recording
     from fluxvla_core.robot.recording.recorded import open_recording as open_recording
     from fluxvla_core.robot.recording.recorded import read_bag as read_bag
+    from fluxvla_core.robot.recording.trace import EVENTS_FILE as EVENTS_FILE
     from fluxvla_core.robot.recording.trace import SUMMARY_FILE as SUMMARY_FILE
     from fluxvla_core.untrusted import parse_json as parse_json
     from fluxvla_core.untrusted import read_bytes as read_bytes
@@ -31,14 +31,13 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.atomic": ["prepare_folder", "write_text"],
         "fluxvla_core.config.snapshot": ["work_dirs_below"],
         "fluxvla_core.robot.recording.episode_log": ["episode_log"],
-        "fluxvla_core.robot.recording.logs": ["EVENTS_FILE"],
         "fluxvla_core.robot.recording.recorded": [
             "bag_of",
             "is_recording",
             "open_recording",
             "read_bag",
         ],
-        "fluxvla_core.robot.recording.trace": ["SUMMARY_FILE"],
+        "fluxvla_core.robot.recording.trace": ["EVENTS_FILE", "SUMMARY_FILE"],
         "fluxvla_core.untrusted": ["parse_json", "read_bytes", "read_json"],
     },
 )

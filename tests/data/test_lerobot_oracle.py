@@ -26,7 +26,7 @@ from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.data.validate import validate
-from fluxvla_core.robot.local_policy import load_policy
+from fluxvla_core.policies.loading import load_policy
 from tools import lerobot_env, shell
 
 from .version2 import write_v2

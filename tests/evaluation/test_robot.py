@@ -12,7 +12,7 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import ConfigError, RunFailed, SafetyStop, UsageError
 from fluxvla_core.evaluation.robot import RobotEvalRunner
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
-from fluxvla_core.robot.clock import SimulatedClock
+from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 

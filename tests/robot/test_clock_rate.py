@@ -7,7 +7,14 @@ import time
 
 import pytest
 
-from fluxvla_core.robot.clock import MonotonicClock, Rate, SimulatedClock, clock_of, in_lockstep
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.robot.control.clock import (
+    MonotonicClock,
+    Rate,
+    SimulatedClock,
+    clock_of,
+    in_lockstep,
+)
 
 
 class Stepped:
@@ -103,7 +110,8 @@ def test_the_supervisor_is_called_at_each_beat_and_can_leave_the_loop():
         if len(beats) == 3:
             raise KeyError("enough")
 
-    rate = Rate(50, Stepped(), on_tick=look)
+    rate = Rate(50, Stepped())
+    rate.on_tick = look
     rate.sleep()
     rate.sleep()
     with pytest.raises(KeyError, match="enough"):
@@ -158,9 +166,9 @@ def test_an_operators_own_clock_is_used_and_means_lockstep_unless_it_says_otherw
     class Plain:
         clock = None
 
-    assert clock_of(Robot()) is Robot.clock
-    assert isinstance(clock_of(Plain()), MonotonicClock)
-    assert isinstance(clock_of(object()), MonotonicClock)
+    assert clock_of(Operator.adapt(Robot())) is Robot.clock
+    assert isinstance(clock_of(Operator.adapt(Plain())), MonotonicClock)
+    assert isinstance(clock_of(Operator.adapt(object())), MonotonicClock)
     assert in_lockstep(Robot.clock)
     assert not in_lockstep(MonotonicClock())
     Own.lockstep = False

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.clock import Rate, SimulatedClock
-from fluxvla_core.robot.commands import CommandSender
-from fluxvla_core.robot.limits import CommandLimiter
-from fluxvla_core.robot.stops import Latch
+from fluxvla_core.robot.control.clock import Rate, SimulatedClock
+from fluxvla_core.robot.control.commands import CommandSender
+from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ONE = EmbodimentSpec("one", (Joint("j", "rad", -1.0, 1.0, 2.0, 10.0),), (), 50.0)

@@ -8,8 +8,8 @@ import pytest
 from fluxvla_core.contracts.policy import Continuation
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.joiners import soft_mask
-from fluxvla_core.robot.local_policy import scaling_of
+from fluxvla_core.policies.local import scaling_of
+from fluxvla_core.robot.control.joiners import soft_mask
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
@@ -50,7 +50,7 @@ class Stubborn(torch.nn.Module):
 
 
 def policy(model, denormalize=None, **arguments):
-    from fluxvla_core.robot.local_policy import LocalPolicy
+    from fluxvla_core.policies.local import LocalPolicy
 
     def prepare(observation):
         return {"states": torch.zeros(1, WIDTH)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.filters import LowPass, SnapGripper, bind_filters
+from fluxvla_core.robot.control.filters import LowPass, SnapGripper
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 
@@ -29,7 +29,7 @@ ARM = EmbodimentSpec(
 
 
 def bound(each):
-    bind_filters([each], ARM)
+    each.bind(ARM)
     return each
 
 

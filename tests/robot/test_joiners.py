@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.joiners import (
+from fluxvla_core.robot.control.joiners import (
     METHODS,
     LatestOnly,
     Overlap,

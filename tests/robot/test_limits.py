@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.robot.limits import Clamp, CommandLimiter, braking_speed, count_clamps
+from fluxvla_core.robot.control.limits import Clamp, CommandLimiter, braking_speed
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 JOINTS = (
@@ -233,12 +233,6 @@ def test_slowing_down_before_a_limit_is_called_braking():
 
     first = next(row for row in clamps if row)
     assert [c.reason for c in first] == ["braking"]
-
-
-def test_clamps_are_counted_by_joint_and_reason():
-    row = [Clamp("a", 1, 0, "velocity"), Clamp("b", 1, 0, "position")]
-
-    assert count_clamps([row, [], row[:1]]) == {"a": {"velocity": 2}, "b": {"position": 1}}
 
 
 def test_scales_use_a_share_of_the_limits():

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import DataError, RunFailed
+from fluxvla_core.robot.control.safety import BadChunk
 from fluxvla_core.robot.recording.recorded import (
     find_recordings,
     finish_recording,
     open_recording,
 )
-from fluxvla_core.robot.stops import BadChunk
 
 rosbags = pytest.importorskip("rosbags")
 
@@ -188,7 +188,7 @@ def test_what_fits_nothing_is_recorded_as_text(bench):
 
 
 def test_a_reading_that_was_refused_is_recorded(bench):
-    from fluxvla_core.robot.stops import BadFrame
+    from fluxvla_core.robot.control.safety import BadFrame
 
     def fault():
         if len(bench.arm.sent) > 3:

@@ -9,12 +9,11 @@ import pytest
 
 from fluxvla_core.build import build_operator_from_cfg, build_policy_from_cfg
 from fluxvla_core.errors import ConfigError, DataError, NotReady, Rejected, SpecMismatch
-from fluxvla_core.robot.checks import FreshnessGate
-from fluxvla_core.robot.clock import SimulatedClock
-from fluxvla_core.robot.joiners import METHODS
+from fluxvla_core.robot.control.clock import SimulatedClock
+from fluxvla_core.robot.control.joiners import METHODS
+from fluxvla_core.robot.observation import FreshnessGate
 from fluxvla_core.robot.recording.recorded import open_recording
-from fluxvla_core.robot.recording.replay_operator import ReplayOperator
-from fluxvla_core.robot.recording.replay_policy import RecordingEnded, ReplayPolicy
+from fluxvla_core.robot.recording.replay import RecordingEnded, ReplayOperator, ReplayPolicy
 from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.testing import OperatorConformance

@@ -15,7 +15,7 @@ from fluxvla_core.errors import (
     SafetyStop,
     SpecMismatch,
 )
-from fluxvla_core.robot.clock import SimulatedClock
+from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.checks import check_beginning, check_chunk
-from fluxvla_core.robot.safety_settings import SafetySettings
-from fluxvla_core.robot.stops import Latch, Trip
-from fluxvla_core.robot.tracking import TrackingWatch, action_columns
+from fluxvla_core.robot.control.chunks import check_beginning, check_chunk
+from fluxvla_core.robot.control.safety import Latch, SafetySettings, Trip
+from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.robot.kinematics import Chain
-from fluxvla_core.robot.limits import CommandLimiter
-from fluxvla_core.robot.workspace import WorkspaceBox
+from fluxvla_core.robot.control.filters import WorkspaceBox
+from fluxvla_core.robot.control.kinematics import Chain
+from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 NAMES = ("pan", "lift", "elbow")

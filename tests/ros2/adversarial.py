@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from fluxvla_core import Frame
 from fluxvla_core.contracts.policy import Continuation
-from fluxvla_core.robot.clock import SimulatedClock
-from fluxvla_core.robot.filters import LowPass, SnapGripper
-from fluxvla_core.robot.joiners import METHODS
-from fluxvla_core.robot.tracking import HOLD_REACH
+from fluxvla_core.robot.control.clock import SimulatedClock
+from fluxvla_core.robot.control.filters import LowPass, SnapGripper
+from fluxvla_core.robot.control.joiners import METHODS
+from fluxvla_core.robot.control.tracking import HOLD_REACH
 from fluxvla_core.ros2.holding import PATIENCE_S, hold_target, way_to_hold
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 

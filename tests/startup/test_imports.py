@@ -22,7 +22,7 @@ HEAVY = {
 AT_HOME = {
     "torch": {"checkpoints", "training", "data", "testing"},
     "numpy": {
-        *("data", "robot", "evaluation", "testing"),
+        *("data", "policies", "robot", "evaluation", "testing"),
         *("training", "ros2"),
     },
     "av": {"data", "robot"},

@@ -22,7 +22,7 @@ from fluxvla_sim.ros2.streams import stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import ConfigError, NotReady, UsageError
-from fluxvla_core.robot.clock import in_lockstep
+from fluxvla_core.robot.control.clock import in_lockstep
 from fluxvla_core.ros2 import BadMessage, Fault
 from fluxvla_core.testing.ros2 import ros_domain
 

@@ -24,6 +24,9 @@ class Reporter(Protocol):
     def artifact(self, kind: str, path: Path) -> None:
         """A file or folder that the run made and that somebody will look for."""
 
+    def settle(self) -> None:
+        """Leave the terminal to whoever types: a question comes next."""
+
 
 class SilentReporter:
     """Drops everything: the default, and what ranks other than 0 get."""
@@ -41,4 +44,7 @@ class SilentReporter:
         return
 
     def artifact(self, kind: str, path: Path) -> None:
+        return
+
+    def settle(self) -> None:
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Frame
@@ -15,14 +15,21 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 
-class Clock(Protocol):
+class Clock(Contract):
     """The time that the control loop lives in: monotonic on robots, stepped in simulations."""
 
+    @abstractmethod
     def now(self) -> float:
         """Seconds; only differences mean something."""
 
+    @abstractmethod
     def sleep_until(self, deadline: float) -> None:
         """Return at ``deadline`` (seconds on this clock), at once if it is past."""
+
+    @attribute
+    def lockstep(self) -> bool:
+        """Whether time passes only with commands, as in a simulation that steps its physics."""
+        return True
 
 
 class Operator(Contract):
@@ -89,7 +96,7 @@ class Operator(Contract):
 
         None if it has none, or one of somebody else's. Where this is defined episodes begin from
         there: an arm lags behind what holds it, and a gripper presses, and neither is to be let go.
-        After a stop, a joint further from it than ``robot.tracking.HOLD_REACH`` was moved, and
+        After a stop, a joint further from it than ``HOLD_REACH`` (``robot.control``) was moved, and
         begins where it is.
         """
         return None

@@ -30,7 +30,7 @@ from fluxvla_core.evaluation.policies import fit, resolve_name
 from fluxvla_core.evaluation.pool import Outcome, run_jobs
 from fluxvla_core.evaluation.rollout import ChunkCommands, shaped
 from fluxvla_core.evaluation.worker import choose_tasks
-from fluxvla_core.robot.checks import not_finite
+from fluxvla_core.robot.control.chunks import not_finite
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 from fluxvla_core.untrusted import checked, read_json
 

@@ -30,7 +30,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
 from fluxvla_core.evaluation.divergence import check_step
 from fluxvla_core.evaluation.live_settings import Live
-from fluxvla_core.robot.clock import MonotonicClock
+from fluxvla_core.robot.control.clock import MonotonicClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 

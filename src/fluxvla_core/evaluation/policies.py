@@ -17,7 +17,7 @@ from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.spec.embodiment import Camera, check_match
 
 if TYPE_CHECKING:
-    from fluxvla_core.robot.local_policy import LocalPolicy
+    from fluxvla_core.policies.local import LocalPolicy
 from pathlib import Path
 
 CHECKPOINT, UNTRAINED, EXPERT, RANDOM = "checkpoint", "untrained", "expert", "random"
@@ -88,7 +88,7 @@ def make_policy(source: Source) -> Actor:
 def load(source: Source) -> LocalPolicy:
     """The policy of a checkpoint, or its untrained twin: the same model with fresh random weights
     and everything else as it is, which tells what the pipeline does without having learned."""
-    from fluxvla_core.robot.local_policy import load_policy
+    from fluxvla_core.policies.loading import load_policy
 
     assert source.ckpt_path is not None
     dataset, denormalize = source.dataset, source.denormalize_action
@@ -209,7 +209,7 @@ def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
     """
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.checkpoints.manifest import NAME, hash_file
-    from fluxvla_core.robot.local_policy import find_checkpoint
+    from fluxvla_core.policies.loading import find_checkpoint
 
     path = find_checkpoint(ckpt_path, work_dir)
     checkpoint = Checkpoint.open(path)

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import EXIT_BAD_INPUT, ConfigError, FluxError, RunFailed
-from fluxvla_core.robot.local_policy import LocalPolicy, Question
+from fluxvla_core.policies.local import LocalPolicy, Question
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -21,11 +21,10 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import SpecMismatch
 from fluxvla_core.evaluation.divergence import check_state, check_step
-from fluxvla_core.robot.checks import not_finite
-from fluxvla_core.robot.commands import CommandFormer
-from fluxvla_core.robot.joining import interpolate
-from fluxvla_core.robot.limits import CommandLimiter, PassThrough
-from fluxvla_core.robot.tracking import action_columns
+from fluxvla_core.robot.control.chunks import interpolate, not_finite
+from fluxvla_core.robot.control.commands import CommandFormer
+from fluxvla_core.robot.control.limits import CommandLimiter, PassThrough
+from fluxvla_core.robot.control.tracking import action_columns
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]

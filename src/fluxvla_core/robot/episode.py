@@ -17,10 +17,15 @@ from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.clock import Rate
-from fluxvla_core.robot.commands import CommandSender, Execute, Sent, come_to_rest, ramp
-from fluxvla_core.robot.control_loop import ControlLoop
-from fluxvla_core.robot.delays import MACHINE
+from fluxvla_core.robot.control.clock import Rate
+from fluxvla_core.robot.control.commands import CommandSender, Execute, Sent, come_to_rest, ramp
+from fluxvla_core.robot.control.delays import MACHINE
+from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.robot.control.joiners import ChunkJoiner
+from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
+from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
+from fluxvla_core.robot.control_loop import ControlLoop, Supervisor
 from fluxvla_core.robot.events import (
     EpisodeEnded,
     EpisodeObserver,
@@ -31,17 +36,10 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.joining import ChunkJoiner
-from fluxvla_core.robot.limits import CommandLimiter
 from fluxvla_core.robot.observation import Look, ObservationReader
 from fluxvla_core.robot.policy_calls import PolicyCaller, PolicyThread
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.safety_settings import SafetySettings
-from fluxvla_core.robot.stops import Latch, Rule, rule_of
-from fluxvla_core.robot.supervision import Supervisor
 from fluxvla_core.robot.tasks import Task
-from fluxvla_core.robot.tracking import TrackingWatch, action_columns
 
 Array = npt.NDArray[np.float64]
 # How long before its deadline a command is made ready, in seconds and as a share of the period.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import wait
 from typing import Any
 
@@ -11,19 +12,19 @@ import numpy as np
 
 from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.errors import FluxError, NotReady, SpecMismatch
-from fluxvla_core.robot.checks import FreshnessGate, check_frame
+from fluxvla_core.robot.control.interrupt import Interrupts
+from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
+from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import Event, Observed, Reading, Refused
-from fluxvla_core.robot.interrupt import Interrupts
 from fluxvla_core.robot.policy_calls import PolicyThread
-from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.safety_settings import SafetySettings
-from fluxvla_core.robot.stops import BadFrame, BadTiming
-from fluxvla_core.robot.tracking import TrackingWatch
+from fluxvla_core.robot.robot import Robot, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 _LOOK_S = 0.5  # that a reading may take
 _LONG_S = 0.1  # a reading that takes longer makes its own streams old
 
+# A stamp may be this far in the future: the reading was taken while its age was computed.
+AHEAD_S = 0.005
 
 Look = Callable[[], tuple[dict[str, Any], Frame | None]]
 """A runner's: makes an observation of the robot's newest frame and, if it can, gives the frame."""
@@ -208,8 +209,99 @@ def _is_nothing(state: Any) -> bool:
     return state is None
 
 
+class FreshnessGate:
+    """Checks receipt age and skew of an observation's streams, and that none runs backwards.
+
+    Args:
+        max_age_s: how old the newest reading of any stream may be.
+        max_skew_s: how far the streams may be apart.
+    """
+
+    def __init__(self, max_age_s: float, max_skew_s: float) -> None:
+        self.max_age_s = max_age_s
+        self.max_skew_s = max_skew_s
+        self._newest: dict[str, float] = {}
+
+    def check(self, stamps: Mapping[str, float], cameras: Iterable[str], now: float) -> float:
+        """Admit one observation.
+
+        Args:
+            stamps: stream -> receipt time, on the clock that ``now`` is of.
+            cameras: the streams that are needed besides the state.
+            now: seconds.
+
+        Returns:
+            The age of its oldest stream, in seconds.
+
+        Raises:
+            BadTiming: a stamp is missing, not finite, too old, in the future, older than the one
+                before it, or too far from the others.
+        """
+        ages: dict[str, float] = {}
+        for stream in (STATE, *cameras):
+            stamp = stamps.get(stream)
+            if stamp is None or not is_number(stamp) or not math.isfinite(stamp):
+                raise BadTiming(f"stream {stream} has no receipt stamp")
+            age = now - stamp
+            if age < -AHEAD_S:
+                raise BadTiming(
+                    f"stream {stream} is stamped {-age:.3f} s in the future",
+                    cause="stamps must be receipt times on the operator's own clock",
+                )
+            before = self._newest.get(stream)
+            if before is not None and stamp < before:
+                raise BadTiming(f"stream {stream} went back in time by {before - stamp:.3f} s")
+            if age > self.max_age_s:
+                raise BadTiming(
+                    f"stream {stream} is stale: its newest reading is {age:.2f} s old, "
+                    f"safety.max_age_s is {self.max_age_s:g}",
+                    cause="the camera or the driver froze, or the network lost it",
+                )
+            ages[stream] = age
+        oldest, newest = max(ages, key=ages.__getitem__), min(ages, key=ages.__getitem__)
+        skew = ages[oldest] - ages[newest]
+        if skew > self.max_skew_s:
+            raise BadTiming(
+                f"streams {oldest} and {newest} are {skew:.2f} s apart, "
+                f"safety.max_skew_s is {self.max_skew_s:g}",
+                cause="one of them is delayed or slower than the other",
+            )
+        self._newest.update({stream: stamps[stream] for stream in ages})
+        return ages[oldest]
+
+
+def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]) -> None:
+    """Refuse a frame that is not what the embodiment describes.
+
+    Args:
+        frame: as ``Operator.get_frame`` returns it.
+        embodiment: whose state and cameras are expected.
+        cameras: the names of those that are needed.
+
+    Raises:
+        BadFrame: state of another shape or not finite; a camera missing; a picture that is not
+            ``(height, width, 3)`` uint8 of the camera's size.
+    """
+    as_state(frame.state, embodiment, "the robot's state")
+    sizes = {camera.name: (camera.height, camera.width, 3) for camera in embodiment.cameras}
+    for name in cameras:
+        image = frame.images.get(name)
+        if image is None:
+            raise BadFrame(
+                f"camera {name} gave no picture", cause="it is not connected, or has another name"
+            )
+        if not isinstance(image, np.ndarray):
+            raise BadFrame(f"camera {name} gives a {type(image).__name__}, not an array")
+        if image.dtype != np.uint8 or image.shape != sizes.get(name, image.shape):
+            raise BadFrame(
+                f"camera {name} gives {image.shape} {image.dtype}, "
+                f"the embodiment says {sizes.get(name)} uint8",
+                cause="the camera's mode was changed, or the spec is of another camera",
+            )
+
+
 def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:
-    """Whether a robot's cameras show what the policy was trained on.
+    """Check that a robot's cameras show what the policy was trained on, perhaps larger.
 
     A camera may have more pixels than in training; it may not show another view.
 

@@ -8,18 +8,17 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.checks import check_chunk
-from fluxvla_core.robot.delays import POLICY, DelayMonitor
+from fluxvla_core.robot.control.chunks import check_chunk
+from fluxvla_core.robot.control.delays import POLICY, DelayMonitor
+from fluxvla_core.robot.control.safety import BadChunk, Rule, SafetySettings
 from fluxvla_core.robot.events import Reading
-from fluxvla_core.robot.safety_settings import SafetySettings
-from fluxvla_core.robot.stops import BadChunk, Rule
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -27,9 +26,9 @@ T = TypeVar("T")
 
 
 class PolicyFailed(RunFailed):
-    """A policy raised something; ``rule`` is for the latch and the record."""
+    """A policy raised something."""
 
-    rule = Rule.POLICY
+    rule: ClassVar[str] = Rule.POLICY
 
 
 class PolicyEnded(RunFailed):

@@ -1,4 +1,4 @@
-"""A robot as a runner uses it, whether its operator has the full contract or only some of it.
+"""``Robot``: an operator with its embodiment and clock; checks everything the operator returns.
 
 The specification's operators have ``get_frame`` and commands of their own (``servoj``,
 ``movegrip``), no specs, and open their connection in the constructor. One like that is accepted
@@ -22,10 +22,9 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.robot.checks import as_action, as_frame, as_number, as_state
-from fluxvla_core.robot.clock import clock_of, in_lockstep
-from fluxvla_core.robot.delays import DelayMonitor, robot_call
-from fluxvla_core.robot.stops import BadFrame
+from fluxvla_core.robot.control.clock import clock_of, in_lockstep
+from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
+from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before a person is told to use the emergency stop.
@@ -227,7 +226,7 @@ class Robot:
         return implements(self._operator, Operator, ability)
 
     def _ask(self, method: str, function: Callable[[], object]) -> Any:
-        """What the operator says; where that goes wrong, its commands still arrive."""
+        """The result of a getter of the operator's; if it fails, commands can still be sent."""
         try:
             return function()
         except FluxError:
@@ -246,13 +245,14 @@ class Robot:
             raise Faulted(f"{self.name}.{method} raised {type(error).__name__}: {error}") from error
 
     def _bounded(self, method: str, function: Callable[[], object]) -> str | None:
-        problem: list[str] = []
         if self.lockstep:
             # Simulations are bound to one thread (renderers are), and cannot hurt anybody.
             return self._reported(method, function)
 
+        found: list[str | None] = []
+
         def call() -> None:
-            problem.extend(filter(None, [self._reported(method, function)]))
+            found.append(self._reported(method, function))
 
         thread = threading.Thread(target=call, name=f"fluxvla-{method}", daemon=True)
         thread.start()
@@ -262,7 +262,7 @@ class Robot:
                 f"{self.name}.{method} did not return within {STOP_S:g} s: "
                 "use the robot's emergency stop"
             )
-        return problem[0] if problem else None
+        return found[0] if found else None
 
     def _reported(self, method: str, function: Callable[[], object]) -> str | None:
         try:
@@ -275,7 +275,7 @@ class Robot:
         if given is not None and not isinstance(given, (EmbodimentSpec, Mapping)):
             raise ConfigError(f"embodiment must be a table, got {given!r}")
         said = EmbodimentSpec.from_dict(given) if isinstance(given, Mapping) else given
-        own = getattr(self._operator, "embodiment", None)
+        own: Any = self._operator.embodiment if self._has("embodiment") else None
         if own is None and said is None:
             raise LoadFailed(
                 f"{self.name} has no embodiment: which joints it moves and within which limits is "
@@ -301,18 +301,92 @@ class Robot:
 def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
     """A config may narrow a robot's limits; it cannot widen them."""
     for ours, theirs in zip(said.joints, own.joints, strict=True):
-        wider = {
-            "lower": ours.lower < theirs.lower,
-            "upper": ours.upper > theirs.upper,
-            "velocity": ours.velocity > theirs.velocity,
-            "acceleration": ours.acceleration > theirs.acceleration,
-            "jerk": (ours.jerk or math.inf) > (theirs.jerk or math.inf),
+        limits = {
+            "lower": (ours.lower, theirs.lower),
+            "upper": (ours.upper, theirs.upper),
+            "velocity": (ours.velocity, theirs.velocity),
+            "acceleration": (ours.acceleration, theirs.acceleration),
+            "jerk": (ours.jerk or math.inf, theirs.jerk or math.inf),
         }
-        for name, is_wider in wider.items():
-            if is_wider:
-                given = getattr(ours, name)
-                given = math.inf if given is None else given
+        for name, (given, own_limit) in limits.items():
+            if (given < own_limit) if name == "lower" else (given > own_limit):
                 raise SpecMismatch(
                     f"the config's embodiment widens {name} of {ours.name} to {given:g}; "
-                    f"the robot's own limit is {getattr(theirs, name):g}"
+                    f"the robot's own limit is {own_limit:g}"
                 )
+
+
+def as_frame(value: Any, source: str) -> Frame:
+    """``value``, checked to have the fields of a ``Frame``.
+
+    Args:
+        value: what ``source`` gave, for example ``Arm.get_frame()``.
+
+    Raises:
+        BadFrame: it is something else; names ``source``.
+    """
+    fields = ("state", "images", "stamps")
+    if not all(hasattr(value, field) for field in fields):
+        raise BadFrame(
+            f"{source} gave a {type(value).__name__}, not a Frame",
+            cause="a Frame has state, images and stamps; where there is no reading yet, "
+            "get_frame() raises NotReady",
+            next="see docs/writing-a-plugin.md for an example",
+        )
+    for field in fields[1:]:
+        found = getattr(value, field)
+        if not isinstance(found, Mapping):
+            raise BadFrame(f"{field} of what {source} gave is a {type(found).__name__}, not a dict")
+    frame: Frame = value
+    return frame
+
+
+def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
+    """``value`` as a checked ``(state_dim,)`` float64 array; ``source`` is for the message.
+
+    Raises:
+        BadFrame: it is no array of numbers, has another shape, or is not finite.
+    """
+    return _as_vector(value, embodiment.state_names, embodiment.name, source)
+
+
+def as_action(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
+    """``value`` as a checked ``(dim,)`` float64 array; ``source`` is for the message.
+
+    Raises:
+        BadFrame: it is no array of numbers, has another shape, or is not finite.
+    """
+    return _as_vector(value, embodiment.joint_names, embodiment.name, source)
+
+
+def as_number(value: Any, source: str) -> float:
+    """``value`` as a float, checked to be finite; ``source`` is for the message.
+
+    Raises:
+        BadFrame: it is none.
+    """
+    if not is_number(value) or not math.isfinite(value):
+        raise BadFrame(f"{source} is {value!r}, not a finite number")
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a real number, of Python or numpy, and not a bool."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def _as_vector(
+    value: Any, names: tuple[str, ...], robot: str, source: str
+) -> npt.NDArray[np.float64]:
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "fiu":
+        raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
+    if found.shape != (len(names),):
+        raise BadFrame(f"{source} has shape {found.shape}; {robot} has ({len(names)},)")
+    bad = [name for name, ok in zip(names, np.isfinite(found), strict=True) if not ok]
+    if bad:
+        raise BadFrame(f"{source} is not finite for {', '.join(bad)}")
+    return found.astype(np.float64)

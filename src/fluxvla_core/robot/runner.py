@@ -31,23 +31,21 @@ from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot import priority
-from fluxvla_core.robot.commands import check_pose
+from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control.commands import check_pose
+from fluxvla_core.robot.control.filters import SnapGripper
+from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
+from fluxvla_core.robot.control.safety import Latch, SafetySettings
 from fluxvla_core.robot.episode import EpisodeSettings, Equipment
 from fluxvla_core.robot.events import HookObserver
-from fluxvla_core.robot.filters import SnapGripper, bind_filters
-from fluxvla_core.robot.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.joiners import make_joiner
-from fluxvla_core.robot.joining import ChunkJoiner
 from fluxvla_core.robot.observation import scaled_views
 from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.safety_settings import SafetySettings
 from fluxvla_core.robot.session import RobotSession, RunHistory
-from fluxvla_core.robot.stops import Latch
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
@@ -83,8 +81,9 @@ class BaseInferenceRunner(Runner):
             By default all of them; while chunks are joined in motion, as few as the policy is
             quick enough for (one, in a simulation whose time stands still meanwhile).
         async_execution: think while moving: short for ``chunk_joining="latest_only"``.
-        chunk_joining: how chunks become one motion: a name of ``robot.joiners.METHODS``, or a
-            table with ``method = '<name>'`` and its parameters. ``synchronous`` by default.
+        chunk_joining: how chunks become one motion: a name of ``METHODS`` in
+            ``robot.control.joiners``, or a table with ``method = '<name>'`` and its parameters.
+            ``synchronous`` by default.
         simulated_latency: seconds from an observation to its chunk, in a simulation whose time
             stands still while the policy thinks: how the same policy would do on a slower computer.
         gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
@@ -200,7 +199,8 @@ class BaseInferenceRunner(Runner):
         if gripper_threshold is not None:
             # After the config's own filters, right before the limits.
             self.action_filters.append(SnapGripper(gripper_threshold))
-        bind_filters(self.action_filters, self.embodiment)
+        for each in self.action_filters:
+            each.bind(self.embodiment)
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
         self._history = RunHistory()
@@ -219,7 +219,7 @@ class BaseInferenceRunner(Runner):
         if self.context.task is not None or self.context.task_file is not None:
             self._task_source()
         if self.policy is None:
-            from fluxvla_core.robot.local_policy import find_checkpoint, load_policy
+            from fluxvla_core.policies.loading import find_checkpoint, load_policy
 
             place = find_checkpoint(self.ckpt_path, self.context.work_dir)
             self.context.reporter.info(f"policy: {place}")
@@ -289,7 +289,7 @@ class BaseInferenceRunner(Runner):
                 hooks.call("run_started")
                 source.open()
                 self.robot.connect()
-                with nullcontext() if self.robot.lockstep else priority.first():
+                with nullcontext() if self.robot.lockstep else priority.real_time():
                     result = session.run(self._run_episode)
                 ended = "ok"
             except Interrupted as signal:

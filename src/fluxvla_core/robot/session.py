@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
+from fluxvla_core.robot.control.interrupt import Interrupts
+from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.episode import Episode, EpisodeSettings, Equipment
-from fluxvla_core.robot.interrupt import Interrupts
 from fluxvla_core.robot.policy_calls import PolicyFailed, PolicyThread
-from fluxvla_core.robot.stops import Latch
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
 _LOOK_S = 0.02
@@ -29,7 +29,7 @@ _KEPT = ("task", "outcome", "success", "steps")
 
 @dataclass
 class RunHistory:
-    """What a runner keeps from one ``run()`` to the next, as an arm keeps its pose.
+    """What a runner keeps from one ``run()`` to the next.
 
     Args:
         episodes: how many there were.

@@ -38,7 +38,7 @@ class Task:
 
     @property
     def warning(self) -> str:
-        """What is to be said of an instruction that is free."""
+        """The warning about an instruction that the config does not know."""
         return (
             f"{self.instruction!r} is none of the config's task_descriptions: the policy is not "
             "known to be trained on it, and the arm may do anything within its limits"
@@ -354,15 +354,14 @@ def task_source(
         UsageError: a task is unknown, or there is none and nobody to ask.
     """
     say = context.reporter.info
-    settle = getattr(context.reporter, "settle", lambda: None)
     if context.task is not None:
         return GivenTasks([resolve_task(context.task, known, free)], context.reporter.warn)
     if context.task_file is not None:
         return GivenTasks(read_tasks(context.task_file, known, free), context.reporter.warn)
     if topic is not None:
-        return TopicTasks(topic, say, domain_id, settle)
+        return TopicTasks(topic, say, domain_id, context.reporter.settle)
     if sys.stdin is not None and sys.stdin.isatty():
-        return TerminalTasks(known, say, settle)
+        return TerminalTasks(known, say, context.reporter.settle)
     ids = f"one of {', '.join(known)}" if known else "an instruction, and --free-task"
     raise UsageError(
         "no task was given, and there is no terminal to ask at; nothing was moved",

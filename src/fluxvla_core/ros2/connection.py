@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fluxvla_core.errors import ConfigError, Faulted
-from fluxvla_core.robot import priority
+from fluxvla_core.robot.control import priority
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.memory import keep_large_blocks
 from fluxvla_core.ros2.require import require_rclpy
@@ -143,7 +143,7 @@ class Connection:
 
     def _spin(self) -> None:
         # Whoever sends commands waits for the interpreter while this thread has it.
-        priority.second()
+        priority.just_below_real_time()
         main = threading.main_thread()
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without

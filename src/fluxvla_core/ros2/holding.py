@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.robot.limits import CommandLimiter
-from fluxvla_core.robot.tracking import HOLD_REACH
+from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.tracking import HOLD_REACH
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

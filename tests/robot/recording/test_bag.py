@@ -12,15 +12,14 @@ import pytest
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import DataError, RunFailed
-from fluxvla_core.robot.recording.logs import Bag, JsonLines
-from fluxvla_core.robot.recording.mcap import McapFile
+from fluxvla_core.robot.recording.bag import Bag, McapFile
 from fluxvla_core.robot.recording.recorded import (
     finish_recording,
     open_recording,
     read_bag,
     read_lines,
 )
-from fluxvla_core.robot.recording.trace import EpisodeTrace, Recording
+from fluxvla_core.robot.recording.trace import EpisodeTrace, JsonLines, Recording
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 pytest.importorskip("rosbags")

@@ -23,9 +23,8 @@ from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording import ros_messages as ros
-from fluxvla_core.robot.recording.logs import EVENTS_FILE
-from fluxvla_core.robot.recording.mcap import McapFile
-from fluxvla_core.robot.recording.trace import SUMMARY_FILE
+from fluxvla_core.robot.recording.bag import McapFile, bag_writer
+from fluxvla_core.robot.recording.trace import EVENTS_FILE, SUMMARY_FILE
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 from fluxvla_core.untrusted import read_bytes
 
@@ -33,7 +32,7 @@ Array = npt.NDArray[np.float64]
 Event = dict[str, Any]
 Place = tuple[int, int, int]
 # Times are rounded to nanoseconds on their way into a file.
-_ROUNDING_S = 1e-6
+ROUNDING_S = 1e-6
 _LARGEST_TRACE = 1 << 30  # bytes: a day of one arm at 50 Hz
 
 
@@ -70,7 +69,7 @@ class Pictures:
 
     def newest(self, time: float) -> int | None:
         """Index of the newest picture that had arrived by ``time``; None before the first."""
-        index = bisect_right(self.times, time + _ROUNDING_S) - 1
+        index = bisect_right(self.times, time + ROUNDING_S) - 1
         return index if index >= 0 else None
 
     def shown(self, time: float) -> npt.NDArray[Any]:
@@ -325,6 +324,12 @@ def _sorted(
     return found
 
 
+def newest_at(times: Array, at: float | Array) -> npt.NDArray[np.intp]:
+    """Index of the last of ascending ``times`` that is not after each of ``at``; at least 0."""
+    index = np.searchsorted(times, np.asarray(at) + ROUNDING_S, side="right") - 1
+    return np.maximum(index, 0)
+
+
 def age_at(event: Event, stream: str) -> float:
     """How old, in seconds, a stream of an ``observation`` event was when it was looked at."""
     stamps: Mapping[str, float] = event.get("stamps") or {}
@@ -389,11 +394,7 @@ def finish_recording(folder: str | Path) -> bool:
 
 
 def _rewrite(file: McapFile, out: Path) -> None:
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-
-    store = ros.typestore()
-    writer = Writer(out, version=8, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    store, writer = ros.typestore(), bag_writer(out)
     channels: dict[str, Any] = {}
     with writer:
         for entry in file.entries():

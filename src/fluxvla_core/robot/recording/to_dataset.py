@@ -18,16 +18,16 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording.recorded import (
+    ROUNDING_S,
     Recorded,
     check_same_embodiment,
     find_recordings,
+    newest_at,
     open_recording,
 )
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
-# Times in a recording are rounded to nanoseconds.
-_ROUNDING_S = 1e-6
 
 
 def recordings_to_dataset(
@@ -77,13 +77,13 @@ def row_times(recorded: Recorded, fps: float) -> Array:
         return np.zeros(0)
     # A command's time is when it was done; the observation that led to the first one came before.
     first = max((e["t"] for e in recorded.of("observation") if e["t"] < ends[0]), default=ends[0])
-    count = int(np.floor((ends[-1] - first) * fps + _ROUNDING_S))
+    count = int(np.floor((ends[-1] - first) * fps + ROUNDING_S))
     times: Array = first + np.arange(count) / fps
     return times
 
 
 def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recorded]:
-    """Those that can be used; what is left out is said."""
+    """Those that can be used; what is left out is reported."""
     found, failed = [], 0
     for path in paths:
         recorded = open_recording(path)
@@ -134,8 +134,8 @@ def _write(
         raise DataError(f"the task took less than one row of {fps:g} Hz", where=str(recorded.path))
     state_times, states = recorded.states()
     command_times, commands = recorded.commands("run")
-    at = _newest(state_times, times)
-    then = _newest(command_times, times + 1.0 / fps)
+    at = newest_at(state_times, times)
+    then = newest_at(command_times, times + 1.0 / fps)
     shown = _pictures(recorded, cameras, times, fps, say)
     for row in range(len(times)):
         images = {name: recorded.pictures[name].read(index[row]) for name, index in shown.items()}
@@ -147,10 +147,10 @@ def _write(
 def _pictures(
     recorded: Recorded, cameras: Sequence[str], times: Array, fps: float, say: Reporter
 ) -> dict[str, npt.NDArray[np.intp]]:
-    """Camera -> which of its pictures is the newest at each of ``times``; sparse ones are said."""
+    """Camera -> which of its pictures is the newest at each of ``times``; warns of sparse ones."""
     found = {}
     for name in cameras:
-        index = _newest(np.array(recorded.pictures[name].times), times)
+        index = newest_at(np.array(recorded.pictures[name].times), times)
         found[name] = index
         fresh = len(np.unique(index))
         if fresh < 0.75 * len(times):
@@ -159,10 +159,3 @@ def _pictures(
                 f"--fps {fps * fresh / len(times):.2g} would show each once"
             )
     return found
-
-
-def _newest(times: Array, at: Array) -> npt.NDArray[np.intp]:
-    """Index of the last of ascending ``times`` that is not after each of ``at``; the first one
-    where there is none."""
-    index = np.searchsorted(times, at + _ROUNDING_S, side="right") - 1
-    return np.maximum(index, 0)

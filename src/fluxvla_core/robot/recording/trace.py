@@ -1,4 +1,4 @@
-"""What an episode leaves behind: its events, a video for each camera, ``episode.json``.
+"""Writing an episode's files: its events, a video for each camera, ``episode.json``.
 
 Everything is handed over at once and written by a thread of its own: recording never makes a
 command late. What waits to be written is bounded; what finds no room is dropped and counted,
@@ -7,6 +7,7 @@ pictures long before events.
 
 from __future__ import annotations
 
+import json
 import queue
 import re
 import threading
@@ -14,17 +15,19 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core import atomic
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot import priority
-from fluxvla_core.robot.recording.logs import Bag, JsonLines, Log
+from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.recording import ros_messages as ros
+from fluxvla_core.robot.recording.bag import Bag
 from fluxvla_core.robot.recording.video import VideoWriter
 
+EVENTS_FILE = "trace.jsonl"
 SUMMARY_FILE = "episode.json"
 # What may wait: pictures in bytes (35 of 640x480 in colour), events in number (minutes of them).
 _WAITING_BYTES = 32 * 1024 * 1024
@@ -39,6 +42,61 @@ Source = Callable[[str, float], tuple[Sequence[tuple[float, Picture]], int]]
 """``pictures_after`` of an operator: camera and a time -> the kept ones of those that arrived
 later, ``(stamp, picture)``, oldest first, and how many arrived since it was connected. It must be
 safe to call from any thread."""
+
+
+class Log(Protocol):
+    """Where events go: JSON lines, or a bag that ROS tools open, which has the pictures too.
+
+    Both take the same events and give the same events back (``recording.recorded``). Every method
+    is called in one thread, but for the constructor.
+    """
+
+    def add(self, event: Mapping[str, Any]) -> None:
+        """Append one event: JSON values and arrays, with ``event`` and ``t``."""
+
+    def picture(
+        self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
+    ) -> None:
+        """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``.
+
+        One that need not be ``exact`` may lose a little: a camera's whole stream is large.
+        A log that holds no pictures drops them.
+        """
+        return
+
+    def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
+        """Append one ``(H, W)`` depth picture that arrived at ``stamp``."""
+        return
+
+    def flush(self) -> None:
+        """Give what is there to the system: a process that is killed then loses none of it."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+class JsonLines(Log):
+    """``trace.jsonl`` in ``folder``. It holds no pictures."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8")
+
+    def add(self, event: Mapping[str, Any]) -> None:
+        fields = (f"{json.dumps(key)}: {_json(value)}" for key, value in event.items())
+        self._file.write("{" + ", ".join(fields) + "}\n")
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _json(value: Any) -> str:
+    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        return "[" + ", ".join(map(_json, value)) + "]"
+    return json.dumps(value, default=ros.plain)
 
 
 @dataclass(frozen=True)
@@ -175,7 +233,7 @@ class EpisodeTrace:
 
     def _run(self) -> None:
         # Whoever sends commands waits for the interpreter while this thread has it.
-        priority.second()
+        priority.just_below_real_time()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -189,7 +247,7 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
-        with priority.ordinary():
+        with priority.normal():
             self._finish()
 
     def _finish(self) -> None:
@@ -210,7 +268,7 @@ class EpisodeTrace:
             self._log.add(item)
             return
         camera, stamp, image = item
-        with priority.ordinary():
+        with priority.normal():
             if stamp is None:
                 self._film(camera, image)
             elif image.ndim == 2:
@@ -239,7 +297,7 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
-        with priority.ordinary():
+        with priority.normal():
             self._poll_all(self._source)
 
     def _poll_all(self, source: Source) -> None:

@@ -10,7 +10,7 @@ numbers of an interval is in it. From one period to the next, the mean of the ac
 the newest and loses the oldest of them: it changes by ``(a_k - a_{k-N}) / N``, at most ``2 A / N``;
 over ``dt`` that is the jerk. ∎
 
-**Braking.** As ``u`` comes to rest within its limits from wherever it is (``robot.limits`` proves
+**Braking.** As ``u`` comes to rest within its limits from wherever it is (``limits`` proves
 it) and then stays, ``N - 1`` periods later ``p`` is the mean of ``N`` equal numbers: it is at rest
 in the same place. On the way there the claim holds for every ``p``. So braking never needs room
 that there is not, and the limits of position, velocity, acceleration and jerk are all kept.

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.clock import Rate
-from fluxvla_core.robot.limits import Clamp, CommandLimiter, PassThrough
-from fluxvla_core.robot.stops import BadCommand, Latch
-from fluxvla_core.robot.tracking import TrackingWatch
+from fluxvla_core.robot.control.clock import Rate
+from fluxvla_core.robot.control.limits import Clamp, CommandLimiter, PassThrough
+from fluxvla_core.robot.control.safety import BadCommand, Latch
+from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
@@ -184,18 +184,19 @@ class CommandSender:
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
         self.latch.check()
-        self._send_brake()
+        self.stay()
 
     def brake(self) -> None:
         """Come to rest; also while the latch is tripped."""
         for _ in range(self.limiter.longest_stop):
             if self.limiter.at_rest:
                 return
-            self._send_brake()
+            self.stay()
 
     def stay(self) -> None:
         """Send one command as ``hold`` does; also while the latch is tripped."""
-        self._send_brake()
+        before = self.limiter.last
+        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
     def lead(self, goal: Array, most: int) -> None:
         """Come to rest at the ``(D,)`` goal, or where the limits let it; also while tripped.
@@ -212,10 +213,6 @@ class CommandSender:
             command = self.limiter.settle(reachable, share)
             self._send(reachable[None], command[None], [[]], held=True)
         self.brake()
-
-    def _send_brake(self) -> None:
-        before = self.limiter.last
-        self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
     def _send(
         self,

@@ -1,4 +1,4 @@
-r"""The last thing between a policy and a robot: position, velocity and acceleration limits.
+r"""Limits of commands, applied last: position, velocity, acceleration (``smoothing``: jerk).
 
 ``CommandLimiter`` turns any finite sequence of wanted targets into commands that keep, joint by
 joint and for every command ``p`` with its speed ``v = (p - p_before) / dt``:
@@ -40,22 +40,21 @@ the same ``b`` bounds the closing speed, so a step is followed in the least time
 lag.
 
 Joints that state a ``jerk`` limit ``J`` are smoothed after that: what is sent is the mean of the
-last ``N`` such commands, which also keeps ``|a - a_before| <= J dt``; ``robot.smoothing`` proves
+last ``N`` such commands, which also keeps ``|a - a_before| <= J dt``; ``smoothing`` proves
 it, and that such an arm comes to rest within all limits too. A motion that keeps the limits is sent
 ``(N - 1) / 2`` periods late then.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.smoothing import Smoothing
-from fluxvla_core.robot.stops import BadCommand
+from fluxvla_core.robot.control.safety import BadCommand
+from fluxvla_core.robot.control.smoothing import Smoothing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -406,13 +405,3 @@ def braking_speed(room: Array, step: Array, period: float) -> Array:
     steps = np.floor((np.sqrt(1.0 + 8.0 * reach / step) - 1.0) / 2.0)
     speed: Array = (reach + step * steps * (steps + 1.0) / 2.0) / (steps + 1.0)
     return speed
-
-
-def count_clamps(rows: Sequence[Sequence[Clamp]]) -> dict[str, dict[str, int]]:
-    """joint -> reason -> how many commands."""
-    counts: dict[str, dict[str, int]] = {}
-    for row in rows:
-        for clamp in row:
-            reasons = counts.setdefault(clamp.joint, {})
-            reasons[clamp.reason] = reasons.get(clamp.reason, 0) + 1
-    return counts

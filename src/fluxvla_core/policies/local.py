@@ -1,36 +1,19 @@
-"""A policy from a checkpoint alone: model, transforms, statistics and robot are all in it."""
+"""``LocalPolicy``: a model in this process as a policy, with pre- and postprocessing."""
 
 from __future__ import annotations
 
 import inspect
-import os
-import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.build import (
-    build_dataset_from_cfg,
-    build_transform_from_cfg,
-    build_vla_from_cfg,
-    parameters,
-)
-from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whole
-from fluxvla_core.config.snapshot import work_dirs_below
-from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
-from fluxvla_core.contracts.training import Transform
-from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
-from fluxvla_core.data.lerobot import camera_name
-from fluxvla_core.data.mixture import first_dataset
-from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
-from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -122,9 +105,7 @@ class LocalPolicy(Policy):
         Raises:
             DataError, ConfigError: the observation lacks something that the transforms need.
         """
-        chunk = self.predict_batch([Question(observation, self._seed, self._calls)])[0]
-        self._calls += 1
-        return chunk
+        return self._predict(observation)
 
     @property
     def continues(self) -> bool:
@@ -135,7 +116,7 @@ class LocalPolicy(Policy):
         return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """As ``predict_action``, for a chunk that goes on from ``rest`` (``ContinuesChunks``).
+        """As ``predict_action``, for a chunk that goes on from ``rest``.
 
         The model gets ``prev_actions`` ``(1, T, D)`` normalised, ``prefix_weights`` ``(1, T)``,
         ``prefix_len`` ``(1,)`` and ``max_guidance_weight`` ``(1,)``.
@@ -144,10 +125,7 @@ class LocalPolicy(Policy):
             ConfigError: the model takes no such thing, or its actions cannot be scaled back.
             DataError: the observation lacks something that the transforms need.
         """
-        question = Question(observation, self._seed, self._calls, rest)
-        chunk = self.predict_batch([question])[0]
-        self._calls += 1
-        return chunk
+        return self._predict(observation, rest)
 
     def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
         """An answer to each of at most ``batch_size`` questions, in one forward pass.
@@ -193,6 +171,11 @@ class LocalPolicy(Policy):
             "postprocess": time.perf_counter() - inferred,
         }
         return chunks
+
+    def _predict(self, observation: Observation, rest: Continuation | None = None) -> Array:
+        chunk = self.predict_batch([Question(observation, self._seed, self._calls, rest)])[0]
+        self._calls += 1
+        return chunk
 
     def _row(self, question: Question) -> dict[str, Any]:
         """A batch of one, with what the model takes."""
@@ -251,166 +234,9 @@ class LocalPolicy(Policy):
         return generator.standard_normal(shape, dtype=np.float32)
 
 
-def load_policy(
-    ckpt_path: str | Path,
-    device: str = "cpu",
-    dataset: Any = None,
-    denormalize_action: Any = None,
-    mixed_precision_dtype: str = "float32",
-) -> LocalPolicy:
-    """Build the policy that a checkpoint holds; its config is data and never executed.
-
-    Args:
-        ckpt_path: a checkpoint's folder, or a work dir, whose newest one is taken.
-        device: of torch; a plain ``cuda`` is ``own_device``'s.
-        dataset: table or object that prepares observations instead of the training dataset's
-            transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
-            ``norm_stats`` and ``processors``, is the checkpoint's.
-        denormalize_action: table or object instead of the inverse of the training's
-            normalisation; ``norm_stats`` is the checkpoint's if it is not set.
-        mixed_precision_dtype: ``float32`` or ``bf16``.
-
-    Raises:
-        CheckpointError: it is missing, damaged, or of another model.
-        SpecMismatch: it does not say for which robot, or at which rate, its actions are.
-        ConfigError, PluginError: a part that its config names cannot be built here.
-    """
-    checkpoint = Checkpoint.open(ckpt_path)
-    checkpoint.verify()
-    where = str(checkpoint.path)
-    config = checkpoint.config()
-    embodiment, facts = checkpoint.embodiment(), checkpoint.policy()
-    unknown = [key for key in ("action_rate_hz", "horizon") if facts.get(key) is None]
-    if embodiment is None or unknown:
-        lacks = ", ".join([*(["the embodiment"] if embodiment is None else []), *unknown])
-        raise SpecMismatch(
-            f"the checkpoint does not say {lacks}: what its actions mean is unknown",
-            where=where,
-            cause="the dataset that it was trained on did not say",
-            next="train on a dataset with an embodiment; fluxvla writes it on recording",
-        )
-    trained_on = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
-    if trained_on.get("use_delta"):
-        raise SpecMismatch(
-            "the policy was trained with use_delta=True: differences from frame to frame, "
-            "which no robot here takes",
-            where=where,
-            next="train with relative_actions=True, whose chunks come out absolute",
-        )
-    prepare = _prepare(dataset, trained_on, checkpoint)
-    denormalize = _denormalize(denormalize_action, prepare, checkpoint)
-    if device == "cuda":
-        import torch
-
-        device = own_device(os.environ, torch.cuda.device_count())
-    model = _model(config, checkpoint, device)
-    keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
-    return LocalPolicy(
-        model=model,
-        prepare=prepare,
-        denormalize=denormalize,
-        embodiment=embodiment,
-        cameras=tuple(camera_name(key) for key in keys),
-        action_rate_hz=float(facts["action_rate_hz"]),
-        horizon=int(facts["horizon"]),
-        device=device,
-        precision=mixed_precision_dtype,
-        source=where,
-    )
-
-
-def own_device(environment: Mapping[str, str], count: int) -> str:
-    """The GPU of this process: of several on one machine each has its own, as far as they reach.
-
-    Args:
-        environment: of the process; torchrun sets ``LOCAL_RANK``, ``srun`` ``SLURM_LOCALID``.
-        count: how many GPUs it sees.
-    """
-    local = environment.get("LOCAL_RANK", environment.get("SLURM_LOCALID"))
-    return "cuda" if local is None or count < 1 else f"cuda:{int(local) % count}"
-
-
-def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
-    """The checkpoint to load: the one that is named, else the newest whole one of the work dir.
-
-    Raises:
-        CheckpointError: there is none; what was wrong with damaged ones is said.
-    """
-    if ckpt_path is not None:
-        return Checkpoint.open(ckpt_path).path
-    found, refused = newest_whole(work_dir)
-    if found is not None:
-        return found.path
-    damaged = "; ".join(error.what for error in refused)
-    others = [shlex.quote(str(p)) for p in work_dirs_below(Path()) if folders(p)][:3]
-    here = f", such as {' or '.join(others)}" if others else ""
-    raise CheckpointError(
-        f"there is no whole checkpoint in {work_dir}" + (f": {damaged}" if damaged else ""),
-        next=f"train first (--section runner), or name the work dir of a training{here}: "
-        f"--work-dir {others[0] if others else 'DIR'}",
-    )
-
-
-def _model(config: Mapping[str, Any], checkpoint: Checkpoint, device: str) -> Any:
-    from fluxvla_core.training.weights import load_for_inference
-
-    if "model" not in config:
-        raise CheckpointError(
-            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
-        )
-    model = build_vla_from_cfg(config["model"])
-    load_for_inference(model, checkpoint)
-    return model.to(device).eval()
-
-
-def _prepare(dataset: Any, trained_on: Mapping[str, Any], checkpoint: Checkpoint) -> Any:
-    defaults: dict[str, Any] = {
-        "norm_stats": checkpoint.statistics(),
-        "processors": checkpoint.processors,
-    }
-    if dataset is not None:
-        return build_dataset_from_cfg(dataset, **_taken(dataset, DATASETS, defaults))
-    missing = [key for key in ("img_keys", "transforms") if key not in trained_on]
-    if missing:
-        raise CheckpointError(
-            f"the checkpoint's train_dataloader.dataset has no {', '.join(missing)}: "
-            "how its observations are prepared is unknown",
-            where=str(checkpoint.path),
-            next="give the section dataset = dict(type='PrivateInferenceDataset', ...)",
-        )
-    wanted = ("img_keys", "transforms", "embodiment_id", "statistic_name")
-    taken = {key: trained_on[key] for key in wanted if key in trained_on}
-    return PrivateInferenceDataset(**taken, **defaults)
-
-
-def _denormalize(given: Any, prepare: Any, checkpoint: Checkpoint) -> Any:
-    statistics = checkpoint.statistics()
-    if given is not None:
-        defaults = {"norm_stats": statistics}
-        return build_transform_from_cfg(given, **_taken(given, TRANSFORMS, defaults))
-    transforms = getattr(getattr(prepare, "pipeline", None), "transforms", ())
-    for transform in transforms:
-        if implements(transform, Transform, "denormalizer"):
-            name = getattr(prepare, "statistic_name", "private")
-            return transform.denormalizer(statistics, name)
-    raise ConfigError(
-        "no transform tells how actions were normalised",
-        where=str(checkpoint.path),
-        next="give the section denormalize_action = dict(type='DenormalizePrivateAction', ...)",
-    )
-
-
-def _taken(table: Any, registry: Registry, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Those ``defaults`` that the class which a table names has parameters for."""
-    if not isinstance(table, Mapping) or not isinstance(table.get("type"), str):
-        return {}
-    names = parameters(registry.get(table["type"]))
-    return {key: value for key, value in defaults.items() if key in names}
-
-
 @dataclass(frozen=True)
 class Scaling:
-    """From a policy's actions back to what its model computes with, whatever made them physical.
+    """Element-wise offset and slope between a model's normalised actions and physical ones.
 
     ``physical = offset + slope * normalized``, both ``(T, D)``; the model's rows are wider.
 

@@ -125,7 +125,7 @@ def observation(pose=(0.3, -0.4)):
 
 
 def load(path, **arguments):
-    from fluxvla_core.robot.local_policy import load_policy
+    from fluxvla_core.policies.loading import load_policy
 
     return load_policy(path, **arguments)
 
@@ -260,7 +260,7 @@ def test_bf16_computes_and_still_gives_float64(tmp_path):
     ],
 )
 def test_processes_of_one_machine_have_a_gpu_each(environment, count, device):
-    from fluxvla_core.robot.local_policy import own_device
+    from fluxvla_core.policies.loading import own_device
 
     assert own_device(environment, count) == device
 
@@ -277,7 +277,7 @@ def test_a_plain_cuda_is_the_gpu_of_this_process(tmp_path, monkeypatch):
 
 
 def test_a_work_dir_means_its_newest_whole_checkpoint(tmp_path):
-    from fluxvla_core.robot.local_policy import find_checkpoint
+    from fluxvla_core.policies.loading import find_checkpoint
 
     save(tmp_path, step=100)
     newest = save(tmp_path, step=200)
@@ -362,19 +362,3 @@ def test_weights_of_another_model_and_damaged_files_are_refused(tmp_path):
         wrong = writer.commit()
     with pytest.raises(CheckpointError, match="gain"):
         load(wrong)
-
-
-def test_the_runner_loads_the_work_dirs_checkpoint(bench, make_arm):
-    save(bench.work_dir)
-    bench.arm = make_arm(embodiment=ARM)
-    bench.arm.state = np.zeros(2)
-    bench.policy = None
-
-    result = bench.run(max_publish_step=20, execute_horizon=2, safety={"jump_s": 50, "excess": 50})
-
-    assert result["outcome"] == "max_steps"
-    summary = bench.episode()
-    assert set(summary["timings"]) == {
-        "receipt", "sync", "policy", "preprocess", "inference", "postprocess", "late", "send",
-    }  # fmt: skip
-    assert any("step-000000100" in line for line in bench.notes.lines)

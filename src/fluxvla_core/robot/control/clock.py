@@ -11,15 +11,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import ClassVar
 
-from fluxvla_core.contracts.robot import Clock
-from fluxvla_core.robot import priority
+from fluxvla_core.contracts.robot import Clock, Operator
+from fluxvla_core.robot.control import priority
 
 
-class MonotonicClock:
+class MonotonicClock(Clock):
     """Real time; wall-clock adjustments do not touch it."""
 
-    lockstep = False
+    lockstep: ClassVar[bool] = False
 
     def now(self) -> float:
         return time.monotonic()
@@ -30,10 +31,8 @@ class MonotonicClock:
             time.sleep(left)
 
 
-class SimulatedClock:
+class SimulatedClock(Clock):
     """Time that passes only by ``advance``, which the operator calls once for each command."""
-
-    lockstep = True
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
@@ -55,16 +54,15 @@ class SimulatedClock:
         """Return at once: waiting for time that only the next command makes would never end."""
 
 
-def clock_of(operator: object) -> Clock:
+def clock_of(operator: Operator) -> Clock:
     """The operator's own clock, or the monotonic one."""
-    clock: Clock | None = getattr(operator, "clock", None)
-    return clock if clock is not None else MonotonicClock()
+    clock = operator.clock
+    return MonotonicClock() if clock is None else clock
 
 
 def in_lockstep(clock: Clock) -> bool:
-    """Whether time stands still between commands: what a clock of one's own means by default."""
-    own = not isinstance(clock, MonotonicClock)
-    return bool(getattr(clock, "lockstep", own))
+    """Whether the clock's time stands still between commands."""
+    return bool(Clock.adapt(clock).lockstep)
 
 
 class Rate:
@@ -83,8 +81,9 @@ class Rate:
         hz: ticks a second.
         clock: whose time counts; the monotonic clock by default.
         lead_s: how long before each deadline ``sleep`` returns, less than a period.
-        on_tick: called at each tick, after the wait; what it raises leaves ``sleep``. The runner
-            supervises there, so that a loop of one's own around ``rate.sleep()`` is supervised too.
+
+    ``on_tick`` is called at each tick, after the wait; what it raises leaves ``sleep``. The runner
+    supervises there, so that a custom loop around ``rate.sleep()`` is supervised too.
 
     ``ticks`` were had and ``skipped`` were not; ``late_s`` tells how late the last one was, or,
     once ``wait`` was called, what was sent at the last deadline.
@@ -94,7 +93,6 @@ class Rate:
         self,
         hz: float,
         clock: Clock | None = None,
-        on_tick: Callable[[], None] | None = None,
         lead_s: float = 0.0,
     ) -> None:
         if not hz > 0:
@@ -104,7 +102,7 @@ class Rate:
         self.clock: Clock = clock or MonotonicClock()
         if not 0.0 <= lead_s < self.period:
             raise ValueError(f"a lead must be shorter than a period, got {lead_s} s at {hz} Hz")
-        self.on_tick = on_tick
+        self.on_tick: Callable[[], None] | None = None
         self.lead_s = lead_s
         self._lockstep = in_lockstep(self.clock)
         self._keeps = lead_s > 0.0 and type(self.clock) is MonotonicClock
@@ -144,10 +142,10 @@ class Rate:
         self.skipped += missed
         deadline += missed * self.period
         if self._keeps:
-            priority.share()
+            priority.share_interpreter()
         self.clock.sleep_until(deadline)
         if self._keeps:
-            priority.keep()
+            priority.keep_interpreter()
         self._woke = self.clock.now()
         late = max(0.0, self._woke - deadline)
         if not self._waits:

@@ -1,5 +1,4 @@
-"""Ctrl-C, SIGTERM, a closed terminal and the like while a robot moves: answered by a
-stop at the next control tick."""
+"""Signals while a robot moves: Ctrl-C, SIGTERM, a closed terminal stop it at the next tick."""
 
 from __future__ import annotations
 

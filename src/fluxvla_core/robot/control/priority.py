@@ -1,16 +1,16 @@
-"""While a robot is driven in real time, the thread that sends its commands goes first.
+"""Real-time priority for the thread that sends commands, and first access to the interpreter.
 
 Three things keep a Python thread from its deadline, and each has a means of its own:
 
 * other threads of the interpreter, which keep it for 5 ms unless they are asked to give it up
   earlier (``sys.setswitchinterval``), and have it just when a deadline comes unless it was taken
-  from them before (``keep``, ``wait_until``);
+  from them before (``keep_interpreter``, ``wait_until``);
 * a full garbage collection, which stops all threads for as long as it takes to look at every
   object of every imported library (``gc.freeze`` takes those out);
 * other processes, which may also stop a thread that has the interpreter just then. Where the system
   allows it (``RLIMIT_RTPRIO``, or root), the thread gets a real-time priority, as ros2_control's
   controller manager takes one, and those that take the interpreter often for an instant come next
-  (``second``); elsewhere nothing is changed. The kernel's own limit on
+  (``just_below_real_time``); elsewhere nothing is changed. The kernel's own limit on
   real-time threads (``sched_rt_runtime_us``) stays in force.
 """
 
@@ -32,22 +32,22 @@ thread that keeps it would have to give it up just when its deadline is there.""
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
 _TIMER_ABSTIME = 1  # of <time.h>
-_firsts = 0  # blocks of ``first`` that are open
+_entered = 0  # blocks of ``real_time`` that are open
 
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-def keep() -> None:
-    """Have the interpreter until ``share`` or a sleep; nothing outside of ``first``."""
-    if _firsts:
+def keep_interpreter() -> None:
+    """Keep the interpreter until ``share_interpreter`` or a sleep; only within ``real_time``."""
+    if _entered:
         sys.setswitchinterval(KEPT_S)
 
 
-def share() -> None:
-    """Let others have it, who give it up soon when it is wanted; nothing outside of ``first``."""
-    if _firsts:
+def share_interpreter() -> None:
+    """Let other threads have it, for short slices; only within ``real_time``."""
+    if _entered:
         sys.setswitchinterval(SHARED_S)
 
 
@@ -63,7 +63,7 @@ def wait_until(deadline: float) -> None:
         seconds = int(deadline)
         until = _Timespec(seconds, int((deadline - seconds) * 1e9))
         sleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
-    share()
+    share_interpreter()
     # What is left where a signal ended it.
     left = deadline - time.monotonic()
     if left > 0.0:
@@ -84,15 +84,15 @@ def _keeping_sleep() -> Callable[..., int] | None:
 
 
 @contextmanager
-def first() -> Iterator[bool]:
-    """Let the calling thread go first until the block ends; whether it has a real-time priority.
+def real_time() -> Iterator[bool]:
+    """Prefer the calling thread until the block ends; yields whether it has a real-time priority.
 
     Threads and processes that are begun inside are ordinary ones.
     """
-    global _firsts
+    global _entered
     interval = sys.getswitchinterval()
-    _firsts += 1
-    share()
+    _entered += 1
+    share_interpreter()
     _keeping_sleep()  # found now, not while an arm moves
     gc.collect()
     gc.freeze()
@@ -102,12 +102,12 @@ def first() -> Iterator[bool]:
     finally:
         _restore(before)
         gc.unfreeze()
-        _firsts -= 1
+        _entered -= 1
         sys.setswitchinterval(interval)
 
 
-def second() -> bool:
-    """Let the calling thread go right behind the first, for good; whether it may.
+def just_below_real_time() -> bool:
+    """Give the calling thread the priority below ``real_time``, for good; whether it may.
 
     For one that never computes for long, such as one that only stores what arrives.
     """
@@ -115,8 +115,8 @@ def second() -> bool:
 
 
 @contextmanager
-def ordinary() -> Iterator[None]:
-    """Let a thread that goes second be an ordinary one while it computes for long."""
+def normal() -> Iterator[None]:
+    """Give up ``just_below_real_time`` while the calling thread computes for long."""
     if sys.platform != "linux":
         yield
         return

@@ -1,4 +1,4 @@
-"""What keeps a robot waiting: a call of its operator, its policy, or the machine itself."""
+"""Timing of calls: which one, of the operator, the policy or the machine, kept a robot waiting."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class _Span:
 
 
 class DelayMonitor:
-    """Notes how long calls take, in any thread, and when this process stood still.
+    """Measures how long calls take, in any thread, and when this process stood still.
 
     Times are ``time.monotonic()``: also in a simulation, whose own time stands still in a call.
     """
@@ -88,7 +88,7 @@ class DelayMonitor:
                 self._spans.append(_Span(source, began, ended))
 
     def longest(self, since: float) -> tuple[DelaySource, float]:
-        """Who took the most of the time since then, in seconds; the policy if nobody did."""
+        """The source that took the most time since then, in seconds; the policy if none did."""
         now = time.monotonic()
         stalls = self._stalls_until(now)
         spent = {POLICY: 0.0, MACHINE: sum(_overlap(b, e, since, now) for b, e in stalls)}

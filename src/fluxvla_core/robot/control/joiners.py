@@ -1,6 +1,9 @@
-"""The chunk joiners: synchronous, latest only, temporal ensemble, cross-fade, real-time chunking.
+"""Chunk joiners: synchronous, latest only, temporal ensemble, cross-fade, real-time chunking.
 
-``make_joiner`` makes the one that a config's ``chunk_joining`` names.
+A ``ChunkJoiner`` is given chunks as they arrive and asked, for each command, where the arm should
+be. Everything in it goes by time stamps, never by counts: a chunk is placed at the time of the
+observation that it answers, so that a policy which is slow, or slow now and then, costs nothing but
+the beginning of its chunk. ``make_joiner`` makes the one that a config's ``chunk_joining`` names.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ import bisect
 import difflib
 import inspect
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,10 +23,74 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.policy import Continuation
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.joining import SAME_S, Ahead, Chunk, ChunkJoiner, StreamedJoiner, sample
+from fluxvla_core.robot.control.chunks import Chunk, sample
 
 Array = npt.NDArray[np.float64]
 SCHEDULES = ("exp", "linear", "ones", "zeros")
+# A lockstep clock sums its steps, and the sum is rounded: half a microsecond is nothing.
+SAME_S = 5e-7
+
+
+class Ahead(ABC):
+    """What is known about the motion under way when a policy is asked; it does not change."""
+
+    @abstractmethod
+    def seen_at(self, observed: float, horizon: int) -> Continuation | None:
+        """For a chunk of ``horizon`` keyframes that answers an observation of time ``observed``.
+
+        None if what is known ends before the first of them.
+        """
+
+
+class ChunkJoiner(ABC):
+    """Chunks in, targets out. All calls come from the thread that sends."""
+
+    streamed: ClassVar[bool] = True
+    """Whether it is asked at every tick; otherwise a chunk's commands are played in one piece."""
+    continues: ClassVar[bool] = False
+    """Whether the policy is asked to go on from the chunk that is being played."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget every chunk: an episode begins."""
+
+    @abstractmethod
+    def add(self, chunk: Chunk, now: float) -> None:
+        """A chunk arrived."""
+
+    @abstractmethod
+    def target(self, at: float) -> Array | None:
+        """``(D,)`` where the arm should be at time ``at``; None when no chunk reaches so far."""
+
+    @abstractmethod
+    def wants_chunk(self, now: float) -> bool:
+        """Whether the policy should be asked now, if it is free."""
+
+    def ahead(self) -> Ahead | None:
+        """What the policy has to go on from; None for nothing."""
+        return None
+
+
+class StreamedJoiner(ChunkJoiner):
+    """Base of the joiners that ask for the next chunk while one is being played.
+
+    Args:
+        every_s: how far apart the observations that are answered should be, at least; a slow
+            policy makes it more. 0 asks as soon as the policy is free.
+    """
+
+    def __init__(self, every_s: float = 0.0) -> None:
+        self.every_s = every_s
+        self._observed: float | None = None
+
+    def reset(self) -> None:
+        self._observed = None
+
+    def add(self, chunk: Chunk, now: float) -> None:
+        self._observed = max(chunk.observed, self._observed or chunk.observed)
+
+    def wants_chunk(self, now: float) -> bool:
+        return self._observed is None or now - self._observed >= self.every_s - SAME_S
 
 
 class Synchronous(ChunkJoiner):
@@ -78,7 +146,7 @@ class LatestOnly(StreamedJoiner):
 
 
 class TemporalEnsemble(StreamedJoiner):
-    """The weighted mean of every chunk that says something about a moment.
+    """The weighted mean of all chunks that reach a moment.
 
     Zhao et al. 2023 (ACT, arXiv 2304.13705, section IV-B) ask the policy at every step and give
     the ``i``-th oldest of the predictions for a moment the weight ``exp(-m i)``: the oldest counts

@@ -1,0 +1,28 @@
+"""A run without a policy of its own takes the newest checkpoint of its work dir."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from tests.policies.test_local_policy import ARM, models, save
+
+__all__ = ["models"]  # a fixture
+
+
+def test_the_runner_loads_the_work_dirs_checkpoint(bench, make_arm):
+    save(bench.work_dir)
+    bench.arm = make_arm(embodiment=ARM)
+    bench.arm.state = np.zeros(2)
+    bench.policy = None
+
+    result = bench.run(max_publish_step=20, execute_horizon=2, safety={"jump_s": 50, "excess": 50})
+
+    assert result["outcome"] == "max_steps"
+    summary = bench.episode()
+    assert set(summary["timings"]) == {
+        "receipt", "sync", "policy", "preprocess", "inference", "postprocess", "late", "send",
+    }  # fmt: skip
+    assert any("step-000000100" in line for line in bench.notes.lines)

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fluxvla_core.config.check import Checked, Use, check_config, examine, type_key
-from fluxvla_core.config.load import load_config
+from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
-from fluxvla_core.config.snapshot import CONFIG_FILE
 from fluxvla_core.config.tree import Config, join_key
 from fluxvla_core.errors import UsageError
 

@@ -17,6 +17,8 @@ from fluxvla_core.plugins.load import locate
 from fluxvla_core.untrusted import AT_MOST, read_bytes
 
 BASE = "_base_"
+CONFIG_FILE = "config.resolved.json"
+"""What a run leaves in its work dir, to be run again."""
 FORMAT = "fluxvla-config-1"
 SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100

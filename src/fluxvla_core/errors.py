@@ -216,7 +216,7 @@ class RunFailed(FluxError):
     """Work that was under way could not be finished (disk full, worker lost).
 
     Args:
-        reason: what ended it, where others act on that: a signal or whoever started it asked it
+        reason: what ended it, where others act on that: a signal or its launcher asked it
             to stop, another process of the same training is gone, or its work dir is.
     """
 

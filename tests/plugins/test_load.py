@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import tomli
 
+from fluxvla_core import OPERATORS, RUNNERS, Registry
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
 from fluxvla_core.plugins import first_party
-from fluxvla_core.plugins.registry import OPERATORS, RUNNERS, Registry
 
 ROOT = Path(__file__).parents[2]
 OPERATOR = "class {name}:\n    api = '1.0'\n    def get_frame(self): return {{}}\n"

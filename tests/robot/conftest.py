@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.commands import SilentReporter
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.robot.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
@@ -146,7 +147,7 @@ class Waver:
         return chunk if fault is None else fault(chunk)
 
 
-class Notes:
+class Notes(SilentReporter):
     """A reporter that remembers."""
 
     def __init__(self) -> None:
@@ -158,12 +159,6 @@ class Notes:
 
     def warn(self, text: str) -> None:
         self.lines.append(f"warning: {text}")
-
-    def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
-        return
-
-    def event(self, kind: str, **fields: object) -> None:
-        return
 
     def artifact(self, kind: str, path: Path) -> None:
         self.artifacts.append((kind, path))

@@ -7,7 +7,6 @@ that may break.
 from __future__ import annotations
 
 import argparse
-import difflib
 import os
 import sys
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from fluxvla_core.cli.main import COMMANDS, STRICT
 from fluxvla_core.cli.parser import Parser, positive
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.resolve import installed
-from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, PluginError
+from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, PluginError, nearest
 from fluxvla_core.plugins import import_check
 from fluxvla_core.plugins._metadata import Plugin, index
 from fluxvla_core.registries import GROUPS, PREFIX
@@ -108,6 +107,6 @@ def _show_progress(plugins: import_check.Plugins) -> None:
 
 
 def _unknown_group(plugin: Plugin) -> str:
-    near = difflib.get_close_matches(plugin.group, GROUPS, 1)
-    hint = f"; did its author mean {near[0]!r}?" if near else ""
+    near = nearest(plugin.group, GROUPS)
+    hint = f"; did its author mean {near!r}?" if near else ""
     return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"

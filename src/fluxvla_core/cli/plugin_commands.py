@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.cli.parser import Parser
 from fluxvla_core.cli.terminal import say
-from fluxvla_core.errors import MissingPlugin, PluginError
+from fluxvla_core.errors import MissingPlugin, PluginError, nearest
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical, index
 from fluxvla_core.registries import PREFIX, REGISTRIES
@@ -98,12 +98,10 @@ def providers(name: str) -> list[Plugin]:
             raise MissingPlugin(
                 f"{short!r} is provided by {owner}, which is not installed: pip install {owner}"
             )
-    import difflib
-
     from fluxvla_core.plugins.load import LIST
 
-    near = difflib.get_close_matches(short, sorted({n for _, n in every}), 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(short, sorted({n for _, n in every}))
+    hint = f"; did you mean {near!r}?" if near else ""
     raise MissingPlugin(f"nothing installed is called {name!r}{hint}", next=LIST)
 
 

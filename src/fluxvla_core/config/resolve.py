@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from fluxvla_core.errors import (
     LoadFailed,
     MissingPlugin,
     PluginError,
+    nearest,
 )
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical
@@ -171,8 +171,8 @@ def _only_registry(name: str) -> str:
                 next=LIST,
             )
     names = {n for r in SEARCHED for n in (*BY_NAME[r], *first_party.names(r))}
-    near = difflib.get_close_matches(short, sorted(names), 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(short, sorted(names))
+    hint = f"; did you mean {near!r}?" if near else ""
     raise MissingPlugin(f"no plugin named {name!r} in any registry{hint}", next=LIST)
 
 

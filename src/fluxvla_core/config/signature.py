@@ -19,6 +19,7 @@ from fluxvla_core.config.source import (
     Module,
     Opaque,
     Source,
+    assigned,
     dotted_name,
     find,
     linearize,
@@ -259,22 +260,6 @@ def _forward(node: ast.FunctionDef, kwargs: str) -> Forward | None:
     return None
 
 
-def _options(node: ast.FunctionDef, module: Module) -> tuple[Source, frozenset[str]] | None:
-    """The dataclass that ``Options(x=1, **kwargs)`` makes of a constructor's ``**kwargs``.
-
-    Returns:
-        The dataclass, and the fields that the call itself gives.
-    """
-    kwargs = node.args.kwarg.arg if node.args.kwarg else None
-    for call in (n for n in ast.walk(node) if isinstance(n, ast.Call)):
-        passed = any(k.arg is None and dotted_name(k.value) == kwargs for k in call.keywords)
-        name = dotted_name(call.func)
-        found = find(module.name, name) if passed and name else None
-        if isinstance(found, Source) and _is_dataclass(found.node):
-            return found, frozenset(k.arg for k in call.keywords if k.arg)
-    return None
-
-
 def _item(target: ast.expr, kwargs: str) -> str | None:
     if isinstance(target, ast.Subscript) and dotted_name(target.value) == kwargs:
         index = target.slice
@@ -370,8 +355,8 @@ def _meanings(order: list[Any]) -> dict[str, str]:
 
 def _argument_texts_of(node: ast.ClassDef | ast.FunctionDef) -> dict[str, str]:
     """By a class itself: strings below its fields, its docstring, and its ``__init__``'s."""
-    inits = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
-    found = argument_texts(ast.get_docstring(inits[-1])) if inits else {}
+    init = _init_of(node)
+    found = argument_texts(ast.get_docstring(init)) if init else {}
     found |= argument_texts(ast.get_docstring(node))
     return found | (field_texts(node) if isinstance(node, ast.ClassDef) else {})
 
@@ -394,11 +379,9 @@ def field_texts(node: ast.ClassDef) -> dict[str, str]:
 def _literal(order: list[Any], name: str) -> str | None:
     """The class attribute ``name`` where it is a string literal."""
     for base in order:
-        for node in base.node.body if isinstance(base, Source) else ():
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", 0)]
-            if any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                value = getattr(node, "value", None)
-                return str(value.value) if isinstance(value, ast.Constant) else None
+        value = assigned(base.node, name) if isinstance(base, Source) else None
+        if value is not None:
+            return str(value.value) if isinstance(value, ast.Constant) else None
     return None
 
 

@@ -212,15 +212,24 @@ def member(cls: Source, name: str) -> Base | None:
 
     It is a nested class, or names a class: ``Name = module.Class``.
     """
-    found: Base | None = None
     for node in cls.node.body:
         if isinstance(node, ast.ClassDef) and node.name == name:
-            found = Source(cls.module, node)
-        elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            return Source(cls.module, node)
+    value = assigned(cls.node, name)
+    if value is None:
+        return None
+    named = dotted_name(value)
+    return find(cls.module.name, named) if named else Opaque(ast.unparse(value))
+
+
+def assigned(node: ast.ClassDef | ast.FunctionDef, name: str) -> ast.expr | None:
+    """The value that the body of a class gives its attribute ``name``; None if it gives none."""
+    found: ast.expr | None = None
+    for inner in node.body:
+        if isinstance(inner, (ast.Assign, ast.AnnAssign)) and inner.value is not None:
+            targets = inner.targets if isinstance(inner, ast.Assign) else [inner.target]
             if any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                named = dotted_name(node.value)
-                found = find(cls.module.name, named) if named else Opaque(ast.unparse(node.value))
+                found = inner.value
     return found
 
 

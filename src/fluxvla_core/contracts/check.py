@@ -53,7 +53,7 @@ def contract_of(registry: str) -> type[Contract]:
 
 
 def needs(contract: type[Contract], cls: type) -> tuple[Methods, ...]:
-    """Sets of methods, one of which ``cls`` must have as a whole."""
+    """Alternative sets of methods: ``cls`` must have all methods of one set."""
     abstract = abstract_methods(contract)
     sets = (abstract,) if abstract and issubclass(cls, contract) else contract._enough(cls)
     every = methods(contract)
@@ -130,7 +130,7 @@ def _wrong(contract: type[Contract], cls: type, named: Methods) -> list[str]:
 
 
 def _is_module(cls: type) -> bool:
-    """Whether ``cls`` is a ``torch.nn.Module``, told without importing torch."""
+    """Whether ``cls`` is a ``torch.nn.Module``, by its bases' names: torch is not imported."""
     return any(
         f"{c.__module__}.{c.__name__}" == "torch.nn.modules.module.Module" for c in cls.__mro__
     )
@@ -244,13 +244,13 @@ def _method_problem(
     try:
         inspect.signature(function).bind(*bound, **dict.fromkeys(names))
     except TypeError as error:
-        return f"{method}() must accept {_told(arguments)}: {error}"
+        return f"{method}() must accept {_in_words(arguments)}: {error}"
     except ValueError:  # written in C, where not every function says what it takes
         return None
     return None
 
 
-def _told(arguments: int | tuple[str, ...]) -> str:
+def _in_words(arguments: int | tuple[str, ...]) -> str:
     if isinstance(arguments, tuple):
         return f"the keyword{'s' if len(arguments) > 1 else ''} {', '.join(arguments)}"
     if arguments == 0:

@@ -73,6 +73,7 @@ class Index:
     folders: Mapping[str, str] = field(default_factory=dict)
 
 
+@functools.cache
 def canonical(name: str) -> str:
     """A distribution's name as PyPI compares it (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
@@ -167,7 +168,7 @@ def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dic
 
 
 class _Folder:
-    """A ``.dist-info`` or ``.egg-info`` on ``sys.path``, of which nothing has been read yet."""
+    """A ``.dist-info`` or ``.egg-info`` on ``sys.path``; its files are read when asked for."""
 
     def __init__(self, path: str) -> None:
         self.path = path

@@ -354,7 +354,7 @@ def task_source(
         UsageError: a task is unknown, or there is none and nobody to ask.
     """
     say = context.reporter.info
-    settle = getattr(context.reporter, "settle", lambda: None)
+    settle = context.reporter.settle
     if context.task is not None:
         return GivenTasks([resolve_task(context.task, known, free)], context.reporter.warn)
     if context.task_file is not None:

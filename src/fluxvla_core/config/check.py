@@ -124,10 +124,10 @@ def _loader_problems(config: Config, section: str) -> list[Problem]:
     found = []
     if not isinstance(loader.get("dataset"), dict):
         found.append(config.problem("train_dataloader", "needs dataset = dict(type=...)"))
-    for name in loader:
+    for name in loader.keys() - set(LOADER_KEYS):
         # Another runner may read keys of its own; one that nearly is one of ours is a typo.
         near = nearest(name, LOADER_KEYS, 0.75)
-        if near and name not in LOADER_KEYS:
+        if near:
             key = join_key("train_dataloader", name)
             found.append(config.problem(key, f"unknown key; did you mean {near!r}?"))
     return found

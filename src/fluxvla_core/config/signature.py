@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -199,20 +199,18 @@ def _init_of(node: ast.ClassDef | ast.FunctionDef) -> ast.FunctionDef | None:
     return found[-1] if found else None
 
 
-def _init(node: ast.FunctionDef, module: Module | None, drop_self: bool = True) -> Init:
-    def place(line: int) -> str:
-        return module.place(line) if module else ""
-
+def _init(node: ast.FunctionDef, module: Module, drop_self: bool = True) -> Init:
     spec = node.args
     plain = [*spec.posonlyargs, *spec.args][1 if drop_self else 0 :]
     defaults = [*[None] * (len(plain) - len(spec.defaults)), *spec.defaults, *spec.kw_defaults]
     pairs = zip([*plain, *spec.kwonlyargs], defaults, strict=True)
     parameters = tuple(
-        Parameter(a.arg, d is None, place(a.lineno), _text(a.annotation, d)) for a, d in pairs
+        Parameter(a.arg, d is None, module.place(a.lineno), _text(a.annotation, d))
+        for a, d in pairs
     )
     if spec.kwarg is None:
         return Init(parameters)
-    return with_kwargs(parameters, node, spec.kwarg.arg, place)
+    return with_kwargs(parameters, node, spec.kwarg.arg, module.place)
 
 
 def _text(annotation: ast.expr | None, default: ast.expr | None) -> str:
@@ -221,7 +219,10 @@ def _text(annotation: ast.expr | None, default: ast.expr | None) -> str:
 
 
 def with_kwargs(
-    parameters: tuple[Parameter, ...], node: ast.FunctionDef, kwargs: str, place: Any
+    parameters: tuple[Parameter, ...],
+    node: ast.FunctionDef,
+    kwargs: str,
+    place: Callable[[int], str],
 ) -> Init:
     """An ``__init__`` that takes ``**kwargs``: what it sets and pops there, and hands on."""
     filled: set[str] = set()

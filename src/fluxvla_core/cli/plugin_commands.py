@@ -139,13 +139,14 @@ def _keys(signature: Signature) -> list[str]:
     from fluxvla_core.config.resolve import INJECTED
 
     lines = ["  keys"] if signature.parameters or signature.open else ["  keys         none"]
+    meanings = signature.meanings
     for parameter in signature.parameters:
         note = "required" if parameter.required else ""
         if parameter.name in INJECTED:
             note = "filled in when the run starts"
         text = f"    {parameter.name}{parameter.text}"
         lines.append(f"{text}   [{note}]" if note else text)
-        meaning = signature.meanings.get(parameter.name, "")
+        meaning = meanings.get(parameter.name, "")
         lines += textwrap.wrap(meaning, 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
     if signature.open:
         lines.append("    ...   [takes further keys, which cannot be checked]")

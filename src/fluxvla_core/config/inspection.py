@@ -50,9 +50,12 @@ def inspect_signature(cls: Any) -> Signature:
     doc = (inspect.getdoc(cls) or "").partition("\n")[0]
     api = getattr(cls, "api", None)
     place, version = _class_place(cls), None if api is None else str(api)
-    meanings = {**(_runtime_meanings(options) if options else {}), **_runtime_meanings(cls)}
+
+    def documented() -> dict[str, str]:
+        return {**(_runtime_meanings(options) if options else {}), **_runtime_meanings(cls)}
+
     trains = is_train_runner(cls)
-    return Signature(cls.__name__, place, parameters, is_open, doc, version, trains, meanings)
+    return Signature(cls.__name__, place, parameters, is_open, doc, version, trains, documented)
 
 
 def _runtime_init(function: Any) -> Init:

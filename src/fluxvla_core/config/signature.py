@@ -11,7 +11,7 @@ import ast
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -37,12 +37,25 @@ OPTIONS_KEYWORDS = "options"
 
 @dataclass(frozen=True)
 class Parameter:
-    """One constructor parameter; ``text`` is its annotation and default as written."""
+    """One constructor parameter.
+
+    Args:
+        stated: its annotation and default, as written or as nodes of its source.
+    """
 
     name: str
     required: bool
     place: str
-    text: str = ""
+    stated: str | tuple[ast.expr | None, ast.expr | None] = ""
+
+    @property
+    def text(self) -> str:
+        """Its annotation and default as written: ``: int = 3``."""
+        if isinstance(self.stated, str):
+            return self.stated
+        annotation, default = self.stated
+        left = f": {ast.unparse(annotation)}" if annotation else ""
+        return f"{left} = {ast.unparse(default)}" if default else left
 
 
 @dataclass(frozen=True)
@@ -77,7 +90,7 @@ class Signature:
     """What a config may say for a class.
 
     ``open`` means that further keys cannot be ruled out (``**kwargs`` that go nowhere known);
-    ``meanings`` is what docstrings say of parameters, those of the class before its bases'.
+    ``documented`` reads what docstrings say of parameters, those of the class before its bases'.
     """
 
     name: str
@@ -87,7 +100,12 @@ class Signature:
     doc: str = ""
     api: str | None = None
     trains: bool = False
-    meanings: Mapping[str, str] = field(default_factory=dict)
+    documented: Callable[[], Mapping[str, str]] = dict
+
+    @property
+    def meanings(self) -> Mapping[str, str]:
+        """What each parameter means, where a docstring says so."""
+        return self.documented()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,14 +120,13 @@ def read_signature(plugin: Plugin) -> Signature | None:
     node = source.node
     if isinstance(node, ast.FunctionDef):
         init = _init(node, source.module, drop_self=False)
-        meanings = argument_texts(ast.get_docstring(node))
         return Signature(
             node.name,
             source.place,
             init.parameters,
             init.kwargs is not None,
             _doc(node),
-            meanings=meanings,
+            documented=lambda: argument_texts(ast.get_docstring(node)),
         )
     order = linearize(source)
     inits: list[Init] = []
@@ -131,7 +148,7 @@ def read_signature(plugin: Plugin) -> Signature | None:
         _doc(node),
         _literal(order, "api"),
         _trains(order),
-        {**_meanings(options), **_meanings(order)},
+        lambda: {**_meanings(options), **_meanings(order)},
     )
 
 
@@ -205,17 +222,11 @@ def _init(node: ast.FunctionDef, module: Module, drop_self: bool = True) -> Init
     defaults = [*[None] * (len(plain) - len(spec.defaults)), *spec.defaults, *spec.kw_defaults]
     pairs = zip([*plain, *spec.kwonlyargs], defaults, strict=True)
     parameters = tuple(
-        Parameter(a.arg, d is None, module.place(a.lineno), _text(a.annotation, d))
-        for a, d in pairs
+        Parameter(a.arg, d is None, module.place(a.lineno), (a.annotation, d)) for a, d in pairs
     )
     if spec.kwarg is None:
         return Init(parameters)
     return with_kwargs(parameters, node, spec.kwarg.arg, module.place)
-
-
-def _text(annotation: ast.expr | None, default: ast.expr | None) -> str:
-    left = f": {ast.unparse(annotation)}" if annotation else ""
-    return f"{left} = {ast.unparse(default)}" if default else left
 
 
 def with_kwargs(
@@ -293,7 +304,7 @@ def _fields(order: list[Any]) -> tuple[Parameter, ...]:
                 node.target.id,
                 not _has_default(node.value),
                 base.module.place(node.lineno),
-                _text(node.annotation, _default(node.value)),
+                (node.annotation, _default(node.value)),
             )
     return tuple(found.values())
 

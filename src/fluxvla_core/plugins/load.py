@@ -29,10 +29,6 @@ LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
 TRACES = f"FLUXVLA_STRICT=1 {DOCTOR} shows the traceback"
 
-_NAME = re.compile(r"[\w.-]+")
-_PLAIN = re.compile(r"[\w.-]+(?:\[[\w, -]*\])?\s*(?P<ranges>[\d.,<>= ]*)")
-_RELEASE = re.compile(r"\d+(?:\.\d+)*")
-_RANGE = re.compile(r"(>=|>|<=|<)\s*(\d+(?:\.\d+)*)")
 _COMPARE: Final[Mapping[str, Any]] = {
     ">=": operator.ge,
     ">": operator.gt,
@@ -122,17 +118,18 @@ def _certainly_met(requires: tuple[str, ...], have: str) -> bool:
 
     Importing ``packaging`` takes a third of ``fluxvla config check``; it decides about all else.
     """
-    if not _RELEASE.fullmatch(have):
+    release = r"\d+(?:\.\d+)*"
+    if not re.fullmatch(release, have):
         return False
     for text in requires:
-        name = _NAME.match(text)
+        name = re.match(r"[\w.-]+", text)
         if name is not None and canonical(name[0]) != CORE:
             continue
-        stated = _PLAIN.fullmatch(text)
+        stated = re.fullmatch(r"[\w.-]+(?:\[[\w, -]*\])?\s*(?P<ranges>[\d.,<>= ]*)", text)
         if stated is None:
             return False
         for clause in filter(None, stated["ranges"].split(",")):
-            found = _RANGE.fullmatch(clause.strip())
+            found = re.fullmatch(rf"(>=|>|<=|<)\s*({release})", clause.strip())
             if found is None or not _COMPARE[found[1]](_release(have), _release(found[2])):
                 return False
     return True

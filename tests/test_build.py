@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 import fluxvla_core
-from fluxvla_core.build import RunContext, build_from_cfg, parameters, takes
+from fluxvla_core import Registry, RunContext
+from fluxvla_core.build import build_from_cfg, parameters, takes
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.plugins.registry import Registry
 
 
 class Base:

@@ -24,19 +24,17 @@ import torch
 from fluxvla_report.read import read_facts
 from safetensors.torch import save
 
+from fluxvla_core import Camera, EmbodimentSpec, Joint
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, read_manifest
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.config.check import examine
 from fluxvla_core.config.load import load_config
-from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.transforms.pipeline import Pipeline
+from fluxvla_core.data import LeRobotWriter, ParquetDataset, Pipeline
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.data.validate import validate
-from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.recording.recorded import open_recording
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.optim import SavedOptimizer
 from fluxvla_core.training.state import Progress, SavedTrainer

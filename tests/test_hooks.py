@@ -4,12 +4,10 @@ import dataclasses
 
 import pytest
 
-from fluxvla_core.build import RunContext
-from fluxvla_core.contracts import Hook
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core import HOOKS, Hook, RunContext
+from fluxvla_core.commands import SilentReporter
 from fluxvla_core.errors import ConfigError, LoadFailed
 from fluxvla_core.hooks import NAMES, HookCaller, build_hooks
-from fluxvla_core.plugins.registry import HOOKS
 
 
 class Notes(SilentReporter):

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.errors import DataError
-from fluxvla_core.untrusted import checked, parse_json, read_bytes, read_json
+from fluxvla_core.results import parse_json, read_bytes, read_json
+from fluxvla_core.untrusted import checked
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def _finite(value: Any) -> Any:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text beside ``path``, in a folder that exists, and rename it there.
 
-    A reader never sees half a file, and whoever is killed leaves what was there before.
+    A reader never sees half a file; a writer that is killed leaves what was there before.
 
     Raises:
         OSError: it cannot be written; nothing is left beside it.

@@ -22,6 +22,7 @@ FluxError                     1
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -122,6 +123,17 @@ def printable(text: str) -> str:
     return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
+def nearest(name: str, names: Iterable[str], least: float = 0.6) -> str | None:
+    """The one of ``names`` that ``name`` is most likely a misspelling of; None if none is close.
+
+    Args:
+        least: similarity, from 0 to 1, below which a name is not close.
+    """
+    import difflib  # most commands have nothing to suggest
+
+    return next(iter(difflib.get_close_matches(name, list(names), 1, least)), None)
+
+
 @dataclass(frozen=True)
 class Problem:
     """One finding in a config; a ``ConfigError`` carries all of them.
@@ -206,7 +218,7 @@ class RunFailed(FluxError):
     """Work that was under way could not be finished (disk full, worker lost).
 
     Args:
-        reason: what ended it, where others act on that: a signal or whoever started it asked it
+        reason: what ended it, where others act on that: a signal or its launcher asked it
             to stop, another process of the same training is gone, or its work dir is.
     """
 

@@ -9,16 +9,15 @@ or the motion that it watches.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pluggy
 
+from fluxvla_core.build import RunContext, build_from_cfg
 from fluxvla_core.contracts.contract import implements, public_methods
 from fluxvla_core.contracts.runner import Hook
 from fluxvla_core.errors import ConfigError, LoadFailed
-
-if TYPE_CHECKING:
-    from fluxvla_core.build import RunContext
+from fluxvla_core.plugins.registry import HOOKS
 
 NAMES = tuple(public_methods(Hook))
 """The hooks that there are."""
@@ -34,9 +33,7 @@ class HookCaller:
 
     def __init__(self, context: RunContext, plugins: Iterable[tuple[str, object]] = ()) -> None:
         self._context = context
-        self._managers: list[tuple[str, pluggy.PluginManager]] = []
-        for name, plugin in plugins:
-            self._managers.append((name, _manager(name, plugin)))
+        self._managers = [(name, _manager(name, plugin)) for name, plugin in plugins]
 
     def call(self, hook: str, **arguments: Any) -> None:
         """Call ``hook`` on each plugin; one that raises is reported and left out from then on."""
@@ -62,9 +59,6 @@ def build_hooks(context: RunContext) -> HookCaller:
         ConfigError: the value is no list of names and tables.
         PluginError: a hook cannot be had, or has a method that is no hook.
     """
-    from fluxvla_core.build import build_from_cfg
-    from fluxvla_core.plugins.registry import HOOKS
-
     wanted = context.config.get("hooks", ())
     if not isinstance(wanted, (list, tuple)):
         raise ConfigError(
@@ -102,7 +96,7 @@ class _Marked:
         brought = [name for name in NAMES if implements(plugin, Hook, name)]
         self.names = [name for name in brought if callable(getattr(plugin, name))]
         for name in self.names:
+            method = getattr(plugin, name)
             # A method cannot carry pluggy's mark; a function around it would hide its arguments.
-            function = getattr(plugin, name).__func__
-            _implemented(function)
-            setattr(self, name, getattr(plugin, name))
+            _implemented(method.__func__)
+            setattr(self, name, method)

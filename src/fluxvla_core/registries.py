@@ -5,12 +5,12 @@ Everything else follows from it: the entry-point groups (``fluxvla.runners``), t
 against, the versions of the contracts, and what ``fluxvla_core`` exports. A new registry is one
 line here.
 
-It imports nothing: ``import fluxvla_core`` and the scan of installed packages read it.
+It imports next to nothing: ``import fluxvla_core`` and the scan of installed packages read it.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 PREFIX = "fluxvla."
 """Of every entry-point group."""
@@ -88,3 +88,37 @@ ROWS = (
 BY_NAME = {row.name: row for row in ROWS}
 REGISTRIES = tuple(BY_NAME)
 GROUPS = tuple(row.group for row in ROWS)
+
+
+def check_api(registry: str, name: str, written: Any, origin: str) -> None:
+    """Caret check of the version of a contract that a class was written for.
+
+    Args:
+        name: the class's.
+        written: its ``api``; a class without one (None) is taken as is.
+
+    Raises:
+        IncompatiblePlugin: too old or too new, with the upgrade that mends it.
+    """
+    from fluxvla_core.errors import IncompatiblePlugin
+
+    speaks = BY_NAME[registry].api
+    if written is None:
+        return
+    have, want = _version(speaks), _version(str(written))
+    if want is None or have is None:
+        raise IncompatiblePlugin(f"{origin}: {name}.api = {written!r} is no version")
+    if want == have or (want[0] == have[0] and want[1] <= have[1] and have[0] > 0):
+        return
+    upgrade = "fluxvla-core" if want > have else origin.partition(" ")[0]
+    raise IncompatiblePlugin(
+        f"{origin}: {name} is written for {registry} {written}, this core speaks {speaks}",
+        next=f"pip install --upgrade {upgrade}",
+    )
+
+
+def _version(text: str) -> tuple[int, int] | None:
+    major, _, minor = text.partition(".")
+    if not (major.isdigit() and (minor or "0").isdigit()):
+        return None
+    return int(major), int(minor or 0)

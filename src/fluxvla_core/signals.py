@@ -72,10 +72,10 @@ def held_back(start_method: str) -> Iterator[None]:
 
 @contextmanager
 def handling(handler: Handler, *numbers: int) -> Iterator[None]:
-    """``handler`` answers these signals while this is entered; then whoever did before.
+    """``handler`` answers these signals while this is entered; then the previous handlers do.
 
-    Only the main thread can arrange that: in another one nothing changes, and whoever runs the
-    main thread decides.
+    Only the main thread can arrange that: in another one nothing changes, and the main
+    thread's handlers stay.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -139,7 +139,7 @@ def test_nothing_is_evaluated_after_a_stop_during_the_last_save(
     run: Fluxvla, write: Write, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     pytest.importorskip("torch")
-    from fluxvla_core.training.base_runner import BaseTrainRunner
+    from fluxvla_core import BaseTrainRunner
 
     settle = BaseTrainRunner.settle_saves
 

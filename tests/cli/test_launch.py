@@ -88,7 +88,7 @@ def test_two_ranks_train_and_one_talks(write: Write) -> None:
             "rank 1 dies",
             1,
             "rank 1 ended without a word: killed by SIGKILL\n"
-            "  likely cause: this machine, or its container, ran out of memory (dmesg tells), or "
+            "  likely cause: this machine, or its container, ran out of memory (see dmesg), or "
             "somebody killed it\n"
             "  next: go on with the same command and --resume auto\n",
         ),

@@ -204,7 +204,8 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     def leave() -> None:
         every = _metadata.index()
         ours = {k: v for k, v in every.plugins.items() if v[0].dist.startswith("acme-")}
-        monkeypatch.setattr("fluxvla_core.cli.doctor.index", lambda: _metadata.Index(ours, ()))
+        index = _metadata.Index(ours, ())
+        monkeypatch.setattr("fluxvla_core.cli.plugin_commands.index", lambda: index)
 
     return leave
 

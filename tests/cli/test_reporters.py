@@ -26,10 +26,10 @@ from fluxvla_core.cli.reporters import (
     KeepAliveReporter,
     LineReporter,
     Throttle,
-    make_reporter,
     plain,
     shown,
 )
+from fluxvla_core.commands import make_reporter
 
 
 class Terminal(io.StringIO):

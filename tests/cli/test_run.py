@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core import atomic
+from fluxvla_core import RUNNERS, atomic
 from fluxvla_core.cli.plan import default_work_dir
 from fluxvla_core.config.load import load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.snapshot import write_resolved
-from fluxvla_core.plugins.registry import RUNNERS
 from tests.conftest import Install
 
 from .conftest import CONFIG, TOY, Fluxvla, Write

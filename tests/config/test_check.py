@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
+from fluxvla_core import OPERATORS, RUNNERS
 from fluxvla_core.config.check import check_config, examine
 from fluxvla_core.config.load import load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.resolve import INJECTED
 from fluxvla_core.config.tree import Config
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
 from tests.conftest import Install
 
 from .conftest import Write

@@ -597,3 +597,68 @@ def test_the_arguments_of_a_docstring() -> None:
 @pytest.mark.parametrize("text", [None, "", "A class.", "Args:", "Args:\n\nnothing: at all"])
 def test_a_docstring_without_any(text: str | None) -> None:
     assert argument_texts(text) == {}
+
+
+METHODS = """
+class Base:
+    api = "1.0"
+
+    @property
+    def size(self) -> int:  # of something
+        return len(
+            "a:"
+        )
+
+    def short(self): return 1
+    def __init__(self, rate: float, **kwargs):
+        def inner():
+            return kwargs.pop("depth", 3)
+        self.depth = inner()
+
+    async def many(
+        self,
+        a: int = 3,
+    ) -> None:
+        \'\'\'A string
+
+        with lines.\'\'\'
+
+    def run_setup(self, *, n_train_examples: int):
+
+        if n_train_examples:
+            return
+            # and no more
+
+    LATE = 3
+
+    class Options:
+        def __init__(self): ...
+
+
+class Below(Base):
+    def first(self):
+        return 1
+
+    def __init__(self, path: str, **kwargs):
+        super().__init__(**kwargs)
+"""
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        "",
+        "\n\nclass Odd:\n    def text(self):\n        return '''\nno indentation\n'''\n",
+        "\n\nclass End:\n    def last(self):\n        return 1",
+    ],
+)
+def test_left_out_bodies_of_methods_change_nothing(read: Read, more: str) -> None:
+    """Bodies are not parsed where that can be; what is found, and where, stays the same."""
+    signature = read("Below", a=METHODS + more)
+    assert required(signature) == {"path": True, "rate": True, "depth": False}
+    assert signature is not None
+    assert (signature.trains, signature.api, signature.open) == (True, "1.0", True)
+    lines = {p.name: int(p.place.rpartition(":")[2]) for p in signature.parameters}
+    text = METHODS.splitlines()
+    assert all(name in text[line - 1] for name, line in lines.items())
+    assert "class Below" in text[int(signature.place.rpartition(":")[2]) - 1]

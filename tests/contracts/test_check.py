@@ -6,8 +6,8 @@ from abc import abstractmethod
 import pytest
 from torch import nn
 
+from fluxvla_core import VLA, Environment, Hook, Operator, Policy
 from fluxvla_core.config.resolve import installed
-from fluxvla_core.contracts import Environment, Hook, Operator, Policy
 from fluxvla_core.contracts.check import (
     check_class,
     check_operator,
@@ -15,7 +15,6 @@ from fluxvla_core.contracts.check import (
     missing_operator_methods,
 )
 from fluxvla_core.contracts.contract import implements, original
-from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import REGISTRIES

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.contracts import RandomTransform, TrainRunner
+from fluxvla_core import RandomTransform, TrainRunner
 from fluxvla_core.contracts.check import Arguments, contract_of, methods, needs
 from fluxvla_core.contracts.contract import abstract_methods
 from fluxvla_core.registries import REGISTRIES, ROWS

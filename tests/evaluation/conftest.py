@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from fluxvla_core.commands import SilentReporter
 from fluxvla_core.plugins.files import load_plugin_files
 
 WALKING = Path(__file__).with_name("walking.py")
 
 
-class Listener:
+class Listener(SilentReporter):
     """A reporter that remembers."""
 
     def __init__(self):
@@ -23,9 +24,6 @@ class Listener:
 
     def warn(self, text):
         self.warnings.append(text)
-
-    def progress(self, name, done, total, **fields):
-        return
 
     def event(self, kind, **fields):
         self.events.append((kind, fields))

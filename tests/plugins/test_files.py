@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
+from fluxvla_core import HOOKS
 from fluxvla_core.errors import LoadFailed, UsageError
 from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files, plugin_files
-from fluxvla_core.plugins.registry import HOOKS
 
 GOOD = """
 from fluxvla_core import HOOKS

@@ -5,10 +5,14 @@ from pathlib import Path
 
 import pytest
 import tomli
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
+from fluxvla_core import OPERATORS, RUNNERS, Registry
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
-from fluxvla_core.plugins import first_party
-from fluxvla_core.plugins.registry import OPERATORS, RUNNERS, Registry
+from fluxvla_core.plugins import Plugin, first_party
+from fluxvla_core.plugins._metadata import version
+from fluxvla_core.plugins.load import unmet
 
 ROOT = Path(__file__).parents[2]
 OPERATOR = "class {name}:\n    api = '1.0'\n    def get_frame(self): return {{}}\n"
@@ -106,6 +110,28 @@ def test_a_requirement_on_another_core_is_checked_before_import(install):
         IncompatiblePlugin, match=r"fluxvla-old 1\.0 needs fluxvla-core<0\.0\.1, but"
     ):
         OPERATORS.get("Old")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("fluxvla-core", "fluxvla-core>=0.1", "fluxvla-core[data]>=0.1,<0.2", "Fluxvla_Core>=0.1"),
+        *("fluxvla-core (>=0.1.0)", "fluxvla-core>0.0.9, <=0.1.0.0", "fluxvla-core>0.1"),
+        *("fluxvla-core<0.1", "fluxvla-core<=0.0.99", "fluxvla-core>=0.2", "fluxvla-core==0.1.0"),
+        *("fluxvla-core~=0.1.0", "fluxvla-core!=0.1.0", "fluxvla-core>=0.1.0rc1", "numpy<0"),
+        *("fluxvla-core<0.1; extra == 'old'", "fluxvla-core<0.1; python_version > '3'"),
+        *("fluxvla-core>=0.10", "fluxvla-core<0.10", "fluxvla-core>=1", "fluxvla-core==0.1.*"),
+    ],
+)
+def test_requirements_on_the_core_are_read_as_packaging_reads_them(text):
+    """Most are decided without importing packaging, which takes long."""
+    asked = Requirement(text)
+    applies = canonicalize_name(asked.name) == "fluxvla-core" and (
+        asked.marker is None or asked.marker.evaluate({"extra": ""})
+    )
+    met = not applies or asked.specifier.contains(version("fluxvla-core"), prereleases=True)
+    plugin = Plugin("fluxvla.operators", "X", "x:X", "fluxvla-x", "1", (text,))
+    assert (unmet(plugin) is None) == met
 
 
 @pytest.mark.parametrize(

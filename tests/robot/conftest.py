@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.commands import SilentReporter
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.robot.control.clock import SimulatedClock

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
+from fluxvla_core import Camera, EmbodimentSpec, Joint
 from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.spec import Camera, EmbodimentSpec, Joint, check_match
+from fluxvla_core.spec import check_match
 from fluxvla_core.spec.embodiment import speeds
 
 ELBOW = Joint("elbow", "rad", -1.5, 1.5, 2.0, 8.0)

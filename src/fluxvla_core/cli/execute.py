@@ -13,6 +13,7 @@ from typing import Any
 
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.plan import Plan
+from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
@@ -119,8 +120,6 @@ def _run_section(
 def _leave_records(plan: Plan) -> bool:
     """``config.resolved.json`` and ``environment.json`` at the top of the work dir, and whether
     they were written: a training's own stay when something is evaluated there later."""
-    from fluxvla_core.config.snapshot import CONFIG_FILE
-
     if not plan.trains and (plan.work_dir / CONFIG_FILE).exists():
         return False
     _write_records(plan, plan.work_dir)
@@ -129,7 +128,6 @@ def _leave_records(plan: Plan) -> bool:
 
 def _write_records(plan: Plan, folder: Path) -> None:
     from fluxvla_core.config.snapshot import (
-        CONFIG_FILE,
         ENVIRONMENT_FILE,
         environment,
         write_json,
@@ -157,7 +155,7 @@ def remove_folders(made: list[Path]) -> None:
 def _remove_records(folder: Path) -> None:
     """Remove a folder in which nothing is but what every run leaves as it begins."""
     from fluxvla_core.checkpoints.owner import LOCK
-    from fluxvla_core.config.snapshot import CONFIG_FILE, ENVIRONMENT_FILE
+    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE
 
     inside = list(folder.iterdir()) if folder.is_dir() else []
     if {path.name for path in inside} <= {CONFIG_FILE, ENVIRONMENT_FILE, LOCK}:

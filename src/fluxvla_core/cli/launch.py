@@ -98,7 +98,7 @@ def launch(
 def _store() -> Any:
     """The store by which agent and ranks find each other, listening to this machine alone.
 
-    Whoever reaches such a store can change what is in it, and by that where ranks connect to. torch
+    Anyone who reaches such a store can change what is in it, and so where ranks connect to. torch
     has it listen on all interfaces unless it is given the socket; the rendezvous of kind "static",
     which has nothing pickled in it, takes the one that this process has at its port already.
     """
@@ -192,8 +192,8 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
         text = f"ended without a word: {_ending(process.exitcode)}"
         if process.exitcode == -signal.SIGKILL:
             text += (
-                "\n  likely cause: this machine, or its container, ran out of memory (dmesg "
-                "tells), or somebody killed it"
+                "\n  likely cause: this machine, or its container, ran out of memory (see "
+                "dmesg), or somebody killed it"
             )
         elif process.exitcode < 0:
             text += (

@@ -24,6 +24,7 @@ from fluxvla_core.errors import (
     FluxError,
     RunFailed,
     UsageError,
+    nearest,
 )
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ COMMANDS: Mapping[str, Entry] = {
         "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
     ),
     "plugins doctor": Entry(
-        "fluxvla_core.cli.doctor:Doctor", "look for broken and colliding installations"
+        "fluxvla_core.cli.plugin_commands:Doctor", "look for broken and colliding installations"
     ),
     "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
     "data validate": Entry(
@@ -198,17 +199,11 @@ def _group(argv: list[str], inside: list[str]) -> int:
     if len(argv) == 1 or argv[1] in {"-h", "--help"}:
         say("\n".join(_rows(inside)))
         return EXIT_DONE
-    near = _close(argv[1], [name.split()[1] for name in inside])
-    hint = f"; did you mean 'fluxvla {argv[0]} {near[0]}'?" if near else ""
+    near = nearest(argv[1], [name.split()[1] for name in inside])
+    hint = f"; did you mean 'fluxvla {argv[0]} {near}'?" if near else ""
     raise UsageError(
         f"fluxvla {argv[0]} has no {argv[1]!r}{hint}", next=f"fluxvla {argv[0]} --help"
     )
-
-
-def _close(name: str, names: list[str]) -> list[str]:
-    import difflib  # with traceback above, a tenth of what `fluxvla --help` may take
-
-    return difflib.get_close_matches(name, names, 1)
 
 
 def _unknown(word: str, names: list[str]) -> UsageError:
@@ -216,8 +211,8 @@ def _unknown(word: str, names: list[str]) -> UsageError:
         return UsageError(
             f"unknown argument {word!r}: the command comes first", next="fluxvla run --help"
         )
-    near = _close(word, [*names, "config", "data", "eval", "plugins"])
-    hint = f"; did you mean 'fluxvla {near[0]}'?" if near else ""
+    near = nearest(word, [*names, "config", "data", "eval", "plugins"])
+    hint = f"; did you mean 'fluxvla {near}'?" if near else ""
     return UsageError(f"no command {word!r}{hint}", next="fluxvla --help")
 
 

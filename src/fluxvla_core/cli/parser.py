@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from fluxvla_core.errors import UsageError
+from fluxvla_core.errors import UsageError, nearest
 
 
 class Parser(argparse.ArgumentParser):
@@ -30,9 +29,9 @@ class Parser(argparse.ArgumentParser):
             known = [flag for action in self._actions for flag in action.option_strings]
             first = extra[0]
             if first.startswith("-"):
-                near = difflib.get_close_matches(first.partition("=")[0], known, 1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-            elif "--config" in known and getattr(args, "config", None) is None:
+                near = nearest(first.partition("=")[0], known)
+                hint = f"; did you mean {near}?" if near else ""
+            elif "--config" in known and args.config is None:
                 hint = f"; did you mean --config {first}?"
             else:
                 hint = ""

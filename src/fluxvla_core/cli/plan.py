@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fluxvla_core.config.check import Checked, Use, check_config, examine, type_key
-from fluxvla_core.config.load import load_config
+from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
-from fluxvla_core.config.snapshot import CONFIG_FILE
 from fluxvla_core.config.tree import Config, join_key
-from fluxvla_core.errors import UsageError
+from fluxvla_core.errors import UsageError, nearest
 
 CKPT_PATH = "ckpt_path"
 """The key under which a section names the checkpoint that it uses."""
@@ -115,8 +113,8 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
         if wanted in config.tree:
             what = f"section {wanted!r} cannot be run: it is no table whose type is a runner"
         else:
-            near = difflib.get_close_matches(wanted, names, 1)
-            what = f"no section {wanted!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+            near = nearest(wanted, names)
+            what = f"no section {wanted!r}" + (f"; did you mean {near!r}?" if near else "")
         raise UsageError(what, where=config.file, next=f"sections there: {listed or 'none'}")
     if len(names) == 1:
         return names[0]

@@ -1,23 +1,32 @@
-"""``fluxvla plugins list``: what is installed, from metadata alone. ``fluxvla plugins show NAME``:
-what a config may say to a class, read from its source.
+"""``fluxvla plugins list``, ``show`` and ``doctor``.
+
+``list`` reads metadata alone, ``show`` the source of a class. ``doctor`` looks for what is wrong
+with the installation: in metadata and sources first, which takes a second; then each plugin is
+imported, in processes that may break.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.cli.parser import Parser
+from fluxvla_core.cli.main import COMMANDS, STRICT
+from fluxvla_core.cli.parser import Parser, positive
 from fluxvla_core.cli.terminal import say
-from fluxvla_core.errors import MissingPlugin, PluginError
+from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, MissingPlugin, PluginError, nearest
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical, index
-from fluxvla_core.registries import PREFIX, REGISTRIES
+from fluxvla_core.registries import GROUPS, PREFIX, REGISTRIES
 
 if TYPE_CHECKING:
     from fluxvla_core.config.signature import Signature
+
+IMPORT_LIMIT_S = 120
+"""Seconds that ``doctor`` gives one import."""
 
 
 class List:
@@ -98,12 +107,10 @@ def providers(name: str) -> list[Plugin]:
             raise MissingPlugin(
                 f"{short!r} is provided by {owner}, which is not installed: pip install {owner}"
             )
-    import difflib
-
     from fluxvla_core.plugins.load import LIST
 
-    near = difflib.get_close_matches(short, sorted({n for _, n in every}), 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(short, sorted({n for _, n in every}))
+    hint = f"; did you mean {near!r}?" if near else ""
     raise MissingPlugin(f"nothing installed is called {name!r}{hint}", next=LIST)
 
 
@@ -132,14 +139,112 @@ def _keys(signature: Signature) -> list[str]:
     from fluxvla_core.config.resolve import INJECTED
 
     lines = ["  keys"] if signature.parameters or signature.open else ["  keys         none"]
+    meanings = signature.meanings
     for parameter in signature.parameters:
         note = "required" if parameter.required else ""
         if parameter.name in INJECTED:
             note = "filled in when the run starts"
         text = f"    {parameter.name}{parameter.text}"
         lines.append(f"{text}   [{note}]" if note else text)
-        meaning = signature.meanings.get(parameter.name, "")
+        meaning = meanings.get(parameter.name, "")
         lines += textwrap.wrap(meaning, 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
     if signature.open:
         lines.append("    ...   [takes further keys, which cannot be checked]")
     return lines
+
+
+class Doctor:
+    api = "1.0"
+    help = (
+        "Look for distributions that cannot be read, names that collide, requirements on the "
+        "core that do not hold, unknown groups, syntax errors, and entry points to nothing; then "
+        "import every plugin, each distribution in a process of its own, and check its classes "
+        "against their contracts."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument(
+            "--no-import", action="store_true", help="look at metadata and sources only"
+        )
+        parser.once(
+            "--limit",
+            type=positive,
+            default=IMPORT_LIMIT_S,
+            metavar="SECONDS",
+            help=f"how long one import may take (default {IMPORT_LIMIT_S})",
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        healthy = True
+        for text in self._findings(args):
+            healthy = False
+            say(text)
+        if not healthy:
+            return EXIT_FAILED
+        plugins = [p for many in index().plugins.values() for p in many]
+        dists = {p.dist for p in plugins}
+        looked = " in metadata and sources" if args.no_import else ""
+        say(f"no problems{looked}: {len(plugins)} plugin(s) of {len(dists)} distribution(s)")
+        return EXIT_DONE
+
+    def _findings(self, args: argparse.Namespace) -> Iterator[str]:
+        yield from collisions()
+        importable = []
+        for plugin in _read_groups():
+            text = _cannot_work(plugin)
+            if text is None:
+                importable.append(plugin)
+            else:
+                yield f"{plugin.group}: {text}"
+        if not args.no_import:
+            from fluxvla_core.plugins import import_check
+
+            traces = os.environ.get(STRICT) == "1"
+            yield from import_check.problems(importable, args.limit, traces, _show_progress)
+
+
+def collisions() -> Iterator[str]:
+    """One line for each distribution, group or name that the index has trouble with."""
+    yield from (f"cannot be read: {line}" for line in index().broken)
+    for (group, name), many in sorted(index().plugins.items()):
+        if group not in GROUPS:
+            yield from (_unknown_group(plugin) for plugin in many)
+            continue
+        if len(many) > 1:
+            who = ", ".join(p.origin for p in many)
+            yield (
+                f"{group}: {name!r} is provided by {who}; "
+                f"write type='<distribution>:{name}' to choose, or uninstall one"
+            )
+        if group == PREFIX + "commands" and name in COMMANDS:
+            yield f"{many[0].origin}: the command {name!r} is the core's own; rename it"
+
+
+def _read_groups() -> Iterator[Plugin]:
+    """Every plugin in a group that the core reads."""
+    for (group, _), many in sorted(index().plugins.items()):
+        if group in GROUPS:
+            yield from many
+
+
+def _cannot_work(plugin: Plugin) -> str | None:
+    from fluxvla_core.config.resolve import installed
+
+    try:
+        installed(plugin)
+    except PluginError as error:
+        from fluxvla_core.plugins.import_check import in_one_line
+
+        return in_one_line(error)
+    return None
+
+
+def _show_progress(plugins: Sequence[Plugin]) -> None:
+    if sys.stderr.isatty():
+        say(f"importing {plugins[0].origin} ({len(plugins)} plugin(s)) ...", sys.stderr)
+
+
+def _unknown_group(plugin: Plugin) -> str:
+    near = nearest(plugin.group, GROUPS)
+    hint = f"; did its author mean {near!r}?" if near else ""
+    return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"

@@ -22,17 +22,11 @@ EVERY_S = 4.0
 class RunReporter(Reporter):
     """A reporter of the command line: one that is closed, so that the terminal stays usable."""
 
-    def event(self, kind: str, **fields: object) -> None:
-        """One record for machines: left out where people read."""
-
     def still_working(self, what: str, seconds: float) -> None:
         """Nothing was reported for ``seconds`` since ``what``, and the work goes on."""
 
     def end_silence(self) -> None:
         """Something is reported again."""
-
-    def settle(self) -> None:
-        """Leave the terminal to whoever types."""
 
     def close(self) -> None:
         """Leave the terminal as it was found."""
@@ -116,7 +110,7 @@ class KeepAliveReporter(RunReporter):
                 self._last_line = now
                 try:
                     self._inner.still_working(self._what, now - self._last_report)
-                except (OSError, ValueError):  # nobody reads any more: whoever prints next fails
+                except (OSError, ValueError):  # nobody reads any more: the next report fails
                     return
 
 

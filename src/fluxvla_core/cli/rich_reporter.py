@@ -99,7 +99,7 @@ class RichReporter(RunReporter):
             self._silence = None
 
     def settle(self) -> None:
-        """Leave the terminal to whoever types: a bar would draw over it. The next one is new."""
+        """Leave the terminal to a person who types: a bar would draw over it. The next is new."""
         self.end_silence()
         self._bars.stop()
         for task in self._tasks.values():

@@ -6,7 +6,6 @@ too often wrong to refuse a config by them.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,7 @@ from fluxvla_core.config.resolve import (
 )
 from fluxvla_core.config.signature import Signature
 from fluxvla_core.config.tree import Config, all_keys, join_key
-from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem
+from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem, nearest
 from fluxvla_core.plugins._metadata import canonical, version
 from fluxvla_core.plugins.first_party import FIRST_PARTY
 from fluxvla_core.plugins.load import LIST
@@ -125,12 +124,12 @@ def _loader_problems(config: Config, section: str) -> list[Problem]:
     found = []
     if not isinstance(loader.get("dataset"), dict):
         found.append(config.problem("train_dataloader", "needs dataset = dict(type=...)"))
-    for name in loader:
+    for name in loader.keys() - set(LOADER_KEYS):
         # Another runner may read keys of its own; one that nearly is one of ours is a typo.
-        near = difflib.get_close_matches(name, LOADER_KEYS, 1, 0.75)
-        if near and name not in LOADER_KEYS:
+        near = nearest(name, LOADER_KEYS, 0.75)
+        if near:
             key = join_key("train_dataloader", name)
-            found.append(config.problem(key, f"unknown key; did you mean {near[0]!r}?"))
+            found.append(config.problem(key, f"unknown key; did you mean {near!r}?"))
     return found
 
 
@@ -158,11 +157,11 @@ class _Walk:
         elif name in SLOTS:
             self.value(key, value, name, whole=True)
         elif isinstance(value, dict) and "type" not in value:
-            near = difflib.get_close_matches(name, _NAMED, 1, 0.8)
+            near = nearest(name, _NAMED, 0.8)
             if near:
                 self.add(
                     key,
-                    f"no section of that name; did you mean {near[0]!r}? (if it is a variable of "
+                    f"no section of that name; did you mean {near!r}? (if it is a variable of "
                     "your own, give it a name that looks less like one)",
                 )
             self.children(key, value, whole=False)
@@ -249,16 +248,16 @@ class _Walk:
 
     def _unknown(self, key: str, name: str, signature: Signature, table: dict[str, Any]) -> str:
         places = {p.name: p.place for p in signature.parameters if p.name not in INJECTED}
-        near = difflib.get_close_matches(name, places, 1)
+        near = nearest(name, places)
         text = f"{signature.name} takes no {name!r}"
         if not near:
             text += f" (defined at {signature.place})"
-        elif near[0] in table:
+        elif near in table:
             # Inherited, more often than not, so that a misspelt key stands beside the right one.
-            set_at = self.config.where(join_key(key, near[0]))
-            text += f"; did you mean {near[0]!r}? (set at {set_at})"
+            set_at = self.config.where(join_key(key, near))
+            text += f"; did you mean {near!r}? (set at {set_at})"
         else:
-            text += f"; did you mean {near[0]!r}? (defined at {places[near[0]]})"
+            text += f"; did you mean {near!r}? (defined at {places[near]})"
         history = self._left_over(key, name)
         return f"{text}; {'or ' if near else ''}{history}" if history else text
 

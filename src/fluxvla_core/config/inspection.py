@@ -24,6 +24,7 @@ from fluxvla_core.config.signature import (
     field_texts,
     with_kwargs,
 )
+from fluxvla_core.contracts.check import is_train_runner
 
 _SCALARS = (bool, int, float, str)
 
@@ -46,13 +47,15 @@ def inspect_signature(cls: Any) -> Signature:
         inits.append(_runtime_init(init))
     options = options_class(cls)
     parameters, is_open = combine(inits, unknown, option_fields(cls) if options else None)
-    method = getattr(cls, "run_setup", None)
-    trains = callable(method) and "n_train_examples" in inspect.signature(method).parameters
     doc = (inspect.getdoc(cls) or "").partition("\n")[0]
     api = getattr(cls, "api", None)
     place, version = _class_place(cls), None if api is None else str(api)
-    meanings = {**(_runtime_meanings(options) if options else {}), **_runtime_meanings(cls)}
-    return Signature(cls.__name__, place, parameters, is_open, doc, version, trains, meanings)
+
+    def documented() -> dict[str, str]:
+        return {**(_runtime_meanings(options) if options else {}), **_runtime_meanings(cls)}
+
+    trains = is_train_runner(cls)
+    return Signature(cls.__name__, place, parameters, is_open, doc, version, trains, documented)
 
 
 def _runtime_init(function: Any) -> Init:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import json
 import os
 import types
@@ -17,6 +16,8 @@ from fluxvla_core.plugins.load import locate
 from fluxvla_core.untrusted import AT_MOST, read_bytes
 
 BASE = "_base_"
+CONFIG_FILE = "config.resolved.json"
+"""What a run leaves in its work dir, to be run again."""
 FORMAT = "fluxvla-config-1"
 SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100
@@ -98,6 +99,8 @@ def _check_there(path: Path) -> None:
         if not folder.is_dir():
             raise ConfigError(f"no such config: there is no folder {shown(folder)}", where=name)
         others = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES)
+        import difflib
+
         near = difflib.get_close_matches(path.name, others, 3)
         hint = f"; did you mean {' or '.join(str(path.with_name(n)) for n in near)}?"
         raise ConfigError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import re
 import shlex
 from collections.abc import Iterable
@@ -22,7 +21,7 @@ from fluxvla_core.config.tree import (
     plain,
     split_key,
 )
-from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.errors import ConfigError, Problem, nearest
 
 _PYTHON = {"True": True, "False": False, "None": None}
 _SPLIT = re.compile(r"\s*(\+?)=\s*")
@@ -33,7 +32,7 @@ def apply_overrides(config: Config, overrides: Iterable[str]) -> Config:
 
     ``key`` is dotted, with list indices (``transforms.0.height``) and ``\\.`` for a dot in a name.
     It is in the config, or the class of its table takes it; ``key+=value`` appends to a list, or
-    adds a key of which nothing is known. A value is TOML (numbers, ``true``, ``"text"``,
+    adds a key that no class is known to take. A value is TOML (numbers, ``true``, ``"text"``,
     ``[1, 2]``, ``{type = "X"}``), Python's ``True``, ``False`` and ``None``, or else a bare word
     or sentence taken as it is. A table replaces the one that is there.
 
@@ -156,8 +155,8 @@ def _step(tree: dict[str, Any], at: Any, path: list[str], part: str, key: str, t
             f"no {whole!r} in the config yet: give the whole table, "
             f"--set '{whole}={{{inner} = ...}}'"
         )
-    near = difflib.get_close_matches(key, list(all_keys(tree)), 1, 0.75)
-    hint = _meant(text, near[0]) if near else ""
+    near = nearest(key, all_keys(tree), 0.75)
+    hint = _meant(text, near) if near else ""
     raise _BadOverride(f"no {key!r} in the config{hint}")
 
 
@@ -176,8 +175,8 @@ def _check_taken(table: dict[str, Any], above: list[str], name: str, key: str, t
     takes = {n for n in signature.names if n not in INJECTED} if signature is not None else set()
     if name in takes:
         return
-    near = difflib.get_close_matches(name, {*takes, *table}, 1)
-    hint = _meant(text, join_key(parent_key(key), near[0])) if near else ""
+    near = nearest(name, {*takes, *table})
+    hint = _meant(text, join_key(parent_key(key), near)) if near else ""
     if signature is not None and not signature.open:
         missing, adding = f"{missing}, and {signature.name} takes no {name!r}", ""
     raise _BadOverride(missing + hint + adding)

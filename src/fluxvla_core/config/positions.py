@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from fluxvla_core.config.tree import join_key
 
@@ -30,22 +30,20 @@ def py_positions(tree: ast.Module, file: str) -> dict[str, str]:
     comprehension) takes the place of the nearest key around it.
     """
     walker = _PythonWalker(file)
-    for statement in _statements(tree.body):
+    for statement in _statements(ast.iter_child_nodes(tree)):
         walker.statement(statement)
     return walker.out
 
 
-def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    for node in body:
-        yield node
-        for name in ("body", "orelse", "handlers", "finalbody"):
-            inner = getattr(node, name, None)
-            if inner and isinstance(node, (ast.If, ast.For, ast.With, ast.Try, ast.While)):
-                for part in inner:
-                    if isinstance(part, ast.ExceptHandler):
-                        yield from _statements(part.body)
-                    else:
-                        yield from _statements([part])
+_BRANCHING = (ast.If, ast.For, ast.With, ast.While, ast.Try, ast.ExceptHandler)
+
+
+def _statements(nodes: Iterable[ast.AST]) -> Iterator[ast.stmt]:
+    for node in nodes:
+        if isinstance(node, ast.stmt):
+            yield node
+        if isinstance(node, _BRANCHING):
+            yield from _statements(ast.iter_child_nodes(node))
 
 
 class _PythonWalker:
@@ -111,8 +109,7 @@ class _PythonWalker:
                 if word.arg is None:
                     found.update(self.places(word.value, key))
                 else:
-                    line = getattr(word, "lineno", node.lineno)
-                    self._put(found, join_key(key, word.arg), line, word.value)
+                    self._put(found, join_key(key, word.arg), word.lineno, word.value)
         elif isinstance(called, ast.Attribute) and called.attr == "copy" and not node.args:
             return self.places(called.value, key)
         elif _name(called) in {"deepcopy", "copy"} and len(node.args) == 1:
@@ -138,7 +135,9 @@ def _target(node: ast.expr) -> str | None:
 
 
 def _name(node: ast.expr) -> str:
-    return node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def toml_positions(text: str, file: str) -> dict[str, str]:

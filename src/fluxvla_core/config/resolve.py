@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.config.inspection import inspect_signature
 from fluxvla_core.config.signature import Parameter, Signature, read_signature
 from fluxvla_core.config.source import Opaque, flaw, lacks
 from fluxvla_core.config.source import find as find_source
-from fluxvla_core.contracts.check import check_api
 from fluxvla_core.errors import (
     AmbiguousPlugin,
     IncompatiblePlugin,
     LoadFailed,
     MissingPlugin,
     PluginError,
+    nearest,
 )
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical
 from fluxvla_core.plugins.load import LIST, find, locate, unmet
 from fluxvla_core.plugins.registry import BY_NAME
-from fluxvla_core.registries import PREFIX
+from fluxvla_core.registries import PREFIX, check_api
 
 SECTIONS = ("runner", "inference", "eval")
 
@@ -100,6 +98,8 @@ def resolve(name: str, registry: str | None = None) -> Found:
             )
     here = BY_NAME[registry].registered(name)
     if here is not None:
+        from fluxvla_core.config.inspection import inspect_signature
+
         signature = inspect_signature(here)
         return Found(registry, name, "registered in this process", None, signature)
     plugin = find(PREFIX + registry, name, tuple(BY_NAME[registry]))
@@ -147,7 +147,7 @@ def installed(plugin: Plugin) -> Found:
                 "that does not exist"
             )
     elif signature.api is not None:
-        check_api(registry, type(signature.name, (), {"api": signature.api}), plugin.origin)
+        check_api(registry, signature.name, signature.api, plugin.origin)
     return Found(registry, plugin.name, plugin.origin, plugin, signature)
 
 
@@ -171,8 +171,8 @@ def _only_registry(name: str) -> str:
                 next=LIST,
             )
     names = {n for r in SEARCHED for n in (*BY_NAME[r], *first_party.names(r))}
-    near = difflib.get_close_matches(short, sorted(names), 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(short, sorted(names))
+    hint = f"; did you mean {near!r}?" if near else ""
     raise MissingPlugin(f"no plugin named {name!r} in any registry{hint}", next=LIST)
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -19,6 +19,7 @@ from fluxvla_core.config.source import (
     Module,
     Opaque,
     Source,
+    assigned,
     dotted_name,
     find,
     linearize,
@@ -36,12 +37,25 @@ OPTIONS_KEYWORDS = "options"
 
 @dataclass(frozen=True)
 class Parameter:
-    """One constructor parameter; ``text`` is its annotation and default as written."""
+    """One constructor parameter.
+
+    Args:
+        stated: its annotation and default, as written or as nodes of its source.
+    """
 
     name: str
     required: bool
     place: str
-    text: str = ""
+    stated: str | tuple[ast.expr | None, ast.expr | None] = ""
+
+    @property
+    def text(self) -> str:
+        """Its annotation and default as written: ``: int = 3``."""
+        if isinstance(self.stated, str):
+            return self.stated
+        annotation, default = self.stated
+        left = f": {ast.unparse(annotation)}" if annotation else ""
+        return f"{left} = {ast.unparse(default)}" if default else left
 
 
 @dataclass(frozen=True)
@@ -76,7 +90,7 @@ class Signature:
     """What a config may say for a class.
 
     ``open`` means that further keys cannot be ruled out (``**kwargs`` that go nowhere known);
-    ``meanings`` is what docstrings say of parameters, those of the class before its bases'.
+    ``documented`` reads what docstrings say of parameters, those of the class before its bases'.
     """
 
     name: str
@@ -86,7 +100,12 @@ class Signature:
     doc: str = ""
     api: str | None = None
     trains: bool = False
-    meanings: Mapping[str, str] = field(default_factory=dict)
+    documented: Callable[[], Mapping[str, str]] = dict
+
+    @property
+    def meanings(self) -> Mapping[str, str]:
+        """What each parameter means, where a docstring says so."""
+        return self.documented()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,14 +120,13 @@ def read_signature(plugin: Plugin) -> Signature | None:
     node = source.node
     if isinstance(node, ast.FunctionDef):
         init = _init(node, source.module, drop_self=False)
-        meanings = argument_texts(ast.get_docstring(node))
         return Signature(
             node.name,
             source.place,
             init.parameters,
             init.kwargs is not None,
             _doc(node),
-            meanings=meanings,
+            documented=lambda: argument_texts(ast.get_docstring(node)),
         )
     order = linearize(source)
     inits: list[Init] = []
@@ -130,7 +148,7 @@ def read_signature(plugin: Plugin) -> Signature | None:
         _doc(node),
         _literal(order, "api"),
         _trains(order),
-        {**_meanings(options), **_meanings(order)},
+        lambda: {**_meanings(options), **_meanings(order)},
     )
 
 
@@ -198,29 +216,24 @@ def _init_of(node: ast.ClassDef | ast.FunctionDef) -> ast.FunctionDef | None:
     return found[-1] if found else None
 
 
-def _init(node: ast.FunctionDef, module: Module | None, drop_self: bool = True) -> Init:
-    def place(line: int) -> str:
-        return module.place(line) if module else ""
-
+def _init(node: ast.FunctionDef, module: Module, drop_self: bool = True) -> Init:
     spec = node.args
     plain = [*spec.posonlyargs, *spec.args][1 if drop_self else 0 :]
     defaults = [*[None] * (len(plain) - len(spec.defaults)), *spec.defaults, *spec.kw_defaults]
     pairs = zip([*plain, *spec.kwonlyargs], defaults, strict=True)
     parameters = tuple(
-        Parameter(a.arg, d is None, place(a.lineno), _text(a.annotation, d)) for a, d in pairs
+        Parameter(a.arg, d is None, module.place(a.lineno), (a.annotation, d)) for a, d in pairs
     )
     if spec.kwarg is None:
         return Init(parameters)
-    return with_kwargs(parameters, node, spec.kwarg.arg, place)
-
-
-def _text(annotation: ast.expr | None, default: ast.expr | None) -> str:
-    left = f": {ast.unparse(annotation)}" if annotation else ""
-    return f"{left} = {ast.unparse(default)}" if default else left
+    return with_kwargs(parameters, node, spec.kwarg.arg, module.place)
 
 
 def with_kwargs(
-    parameters: tuple[Parameter, ...], node: ast.FunctionDef, kwargs: str, place: Any
+    parameters: tuple[Parameter, ...],
+    node: ast.FunctionDef,
+    kwargs: str,
+    place: Callable[[int], str],
 ) -> Init:
     """An ``__init__`` that takes ``**kwargs``: what it sets and pops there, and hands on."""
     filled: set[str] = set()
@@ -259,22 +272,6 @@ def _forward(node: ast.FunctionDef, kwargs: str) -> Forward | None:
     return None
 
 
-def _options(node: ast.FunctionDef, module: Module) -> tuple[Source, frozenset[str]] | None:
-    """The dataclass that ``Options(x=1, **kwargs)`` makes of a constructor's ``**kwargs``.
-
-    Returns:
-        The dataclass, and the fields that the call itself gives.
-    """
-    kwargs = node.args.kwarg.arg if node.args.kwarg else None
-    for call in (n for n in ast.walk(node) if isinstance(n, ast.Call)):
-        passed = any(k.arg is None and dotted_name(k.value) == kwargs for k in call.keywords)
-        name = dotted_name(call.func)
-        found = find(module.name, name) if passed and name else None
-        if isinstance(found, Source) and _is_dataclass(found.node):
-            return found, frozenset(k.arg for k in call.keywords if k.arg)
-    return None
-
-
 def _item(target: ast.expr, kwargs: str) -> str | None:
     if isinstance(target, ast.Subscript) and dotted_name(target.value) == kwargs:
         index = target.slice
@@ -307,7 +304,7 @@ def _fields(order: list[Any]) -> tuple[Parameter, ...]:
                 node.target.id,
                 not _has_default(node.value),
                 base.module.place(node.lineno),
-                _text(node.annotation, _default(node.value)),
+                (node.annotation, _default(node.value)),
             )
     return tuple(found.values())
 
@@ -370,8 +367,8 @@ def _meanings(order: list[Any]) -> dict[str, str]:
 
 def _argument_texts_of(node: ast.ClassDef | ast.FunctionDef) -> dict[str, str]:
     """By a class itself: strings below its fields, its docstring, and its ``__init__``'s."""
-    inits = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
-    found = argument_texts(ast.get_docstring(inits[-1])) if inits else {}
+    init = _init_of(node)
+    found = argument_texts(ast.get_docstring(init)) if init else {}
     found |= argument_texts(ast.get_docstring(node))
     return found | (field_texts(node) if isinstance(node, ast.ClassDef) else {})
 
@@ -394,11 +391,9 @@ def field_texts(node: ast.ClassDef) -> dict[str, str]:
 def _literal(order: list[Any], name: str) -> str | None:
     """The class attribute ``name`` where it is a string literal."""
     for base in order:
-        for node in base.node.body if isinstance(base, Source) else ():
-            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", 0)]
-            if any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                value = getattr(node, "value", None)
-                return str(value.value) if isinstance(value, ast.Constant) else None
+        value = assigned(base.node, name) if isinstance(base, Source) else None
+        if value is not None:
+            return str(value.value) if isinstance(value, ast.Constant) else None
     return None
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from fluxvla_core import atomic
-from fluxvla_core.config.load import FORMAT
+from fluxvla_core.config.load import CONFIG_FILE, FORMAT
 from fluxvla_core.config.tree import Config
 from fluxvla_core.plugins._metadata import CORE, index, version
 
-CONFIG_FILE = "config.resolved.json"
 ENVIRONMENT_FILE = "environment.json"
 _LOOKED_AT = 2000  # folders: a hint is not worth a walk over a whole disk
 _PACKAGES = ("torch", "numpy", "pyarrow", "av", "mujoco", "transformers", "rclpy")
@@ -36,6 +34,8 @@ def environment() -> dict[str, Any]:
 
     Reads metadata; imports nothing.
     """
+    import platform
+
     plugins = [
         {
             "group": plugin.group,

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import builtins
 import functools
+import re
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +25,12 @@ _PLAIN = frozenset(
         "torch.nn.Module",
         "torch.nn.modules.module.Module",
     }
+)
+# A method other than __init__ of a class at the top: its header, and the lines of its body.
+_METHOD = re.compile(
+    r"^(?P<header>    (?:async )?def (?!__init__\b)\w+\((?:(?!\n *(?:async )?def |\n\S).)*?:)"
+    r"[ ]*(?:#[^\n]*)?\n(?P<body>(?:(?:     [^\n]*)?\n)+)",
+    re.MULTILINE | re.DOTALL,
 )
 _CLOSED = frozenset(sys.stdlib_module_names | {"torch", "numpy"})
 
@@ -95,9 +103,8 @@ def parse(name: str) -> Module | None:
     path = _file(name)
     if path is None:
         return None
-    try:
-        tree = ast.parse(path.read_bytes(), str(path))
-    except (SyntaxError, ValueError):
+    tree = _tree(path)
+    if tree is None:
         return None  # ``flaw`` says why
     names: dict[str, ast.AST] = {}
     stars = []
@@ -116,6 +123,24 @@ def parse(name: str) -> Module | None:
         elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
             names[node.target.id] = node.value
     return Module(name, path, names, tuple(stars))
+
+
+def _tree(path: Path) -> ast.Module | None:
+    """The statements of a file; bodies of methods that nothing here reads are left out.
+
+    They are most of a file, and parsing takes most of the time of ``fluxvla config check``.
+    """
+    source = path.read_bytes()
+    with suppress(SyntaxError, ValueError):
+        return ast.parse(_METHOD.sub(_without_body, source.decode()), str(path))
+    with suppress(SyntaxError, ValueError):  # a string in some body has lines without indentation
+        return ast.parse(source, str(path))
+    return None
+
+
+def _without_body(method: re.Match[str]) -> str:
+    lines = method[0].count("\n", len(method["header"]))  # so that all below keeps its place
+    return f"{method['header']} ..." + "\n" * lines
 
 
 def _stored(target: ast.expr) -> list[str]:
@@ -187,15 +212,24 @@ def member(cls: Source, name: str) -> Base | None:
 
     It is a nested class, or names a class: ``Name = module.Class``.
     """
-    found: Base | None = None
     for node in cls.node.body:
         if isinstance(node, ast.ClassDef) and node.name == name:
-            found = Source(cls.module, node)
-        elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            return Source(cls.module, node)
+    value = assigned(cls.node, name)
+    if value is None:
+        return None
+    named = dotted_name(value)
+    return find(cls.module.name, named) if named else Opaque(ast.unparse(value))
+
+
+def assigned(node: ast.ClassDef | ast.FunctionDef, name: str) -> ast.expr | None:
+    """The value that the body of a class gives its attribute ``name``; None if it gives none."""
+    found: ast.expr | None = None
+    for inner in node.body:
+        if isinstance(inner, (ast.Assign, ast.AnnAssign)) and inner.value is not None:
+            targets = inner.targets if isinstance(inner, ast.Assign) else [inner.target]
             if any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                named = dotted_name(node.value)
-                found = find(cls.module.name, named) if named else Opaque(ast.unparse(node.value))
+                found = inner.value
     return found
 
 

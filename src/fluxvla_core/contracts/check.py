@@ -26,8 +26,8 @@ from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import TrainRunner
 from fluxvla_core.contracts.training import RandomTransform
-from fluxvla_core.errors import IncompatiblePlugin, LoadFailed
-from fluxvla_core.registries import BY_NAME
+from fluxvla_core.errors import LoadFailed
+from fluxvla_core.registries import BY_NAME, check_api
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Arguments = int | tuple[str, ...] | None
@@ -53,7 +53,7 @@ def contract_of(registry: str) -> type[Contract]:
 
 
 def needs(contract: type[Contract], cls: type) -> tuple[Methods, ...]:
-    """Sets of methods, one of which ``cls`` must have as a whole."""
+    """Alternative sets of methods: ``cls`` must have all methods of one set."""
     abstract = abstract_methods(contract)
     sets = (abstract,) if abstract and issubclass(cls, contract) else contract._enough(cls)
     every = methods(contract)
@@ -89,7 +89,7 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
         raise LoadFailed(
             f"{origin}: {name} in fluxvla.{registry} is a {type(cls).__name__}, not a class"
         )
-    check_api(registry, cls, origin)
+    check_api(registry, name, getattr(cls, "api", None), origin)
     contract = _contract_for(registry, cls)
     problems = [] if registry != "vlas" or _is_module(cls) else ["it is no torch.nn.Module"]
     problems += _problems(contract, cls, needs(contract, cls))
@@ -130,32 +130,9 @@ def _wrong(contract: type[Contract], cls: type, named: Methods) -> list[str]:
 
 
 def _is_module(cls: type) -> bool:
-    """Whether ``cls`` is a ``torch.nn.Module``, told without importing torch."""
+    """Whether ``cls`` is a ``torch.nn.Module``, by its bases' names: torch is not imported."""
     return any(
         f"{c.__module__}.{c.__name__}" == "torch.nn.modules.module.Module" for c in cls.__mro__
-    )
-
-
-def check_api(registry: str, cls: type, origin: str) -> None:
-    """Caret check of a class's ``api`` against the core's; a class without one is taken as is.
-
-    Raises:
-        IncompatiblePlugin: too old or too new, with the upgrade that mends it.
-    """
-    speaks = BY_NAME[registry].api
-    written = getattr(cls, "api", None)
-    if written is None:
-        return
-    have, want = _version(speaks), _version(str(written))
-    if want is None or have is None:
-        raise IncompatiblePlugin(f"{origin}: {cls.__name__}.api = {written!r} is no version")
-    if want == have or (want[0] == have[0] and want[1] <= have[1] and have[0] > 0):
-        return
-    dist = origin.partition(" ")[0]
-    upgrade = "fluxvla-core" if want > have else dist
-    raise IncompatiblePlugin(
-        f"{origin}: {cls.__name__} is written for {registry} {written}, this core speaks {speaks}",
-        next=f"pip install --upgrade {upgrade}",
     )
 
 
@@ -267,22 +244,15 @@ def _method_problem(
     try:
         inspect.signature(function).bind(*bound, **dict.fromkeys(names))
     except TypeError as error:
-        return f"{method}() must accept {_told(arguments)}: {error}"
+        return f"{method}() must accept {_in_words(arguments)}: {error}"
     except ValueError:  # written in C, where not every function says what it takes
         return None
     return None
 
 
-def _told(arguments: int | tuple[str, ...]) -> str:
+def _in_words(arguments: int | tuple[str, ...]) -> str:
     if isinstance(arguments, tuple):
         return f"the keyword{'s' if len(arguments) > 1 else ''} {', '.join(arguments)}"
     if arguments == 0:
         return "no argument"
     return f"{arguments} argument{'s' if arguments > 1 else ''}"
-
-
-def _version(text: str) -> tuple[int, int] | None:
-    major, _, minor = text.partition(".")
-    if not (major.isdigit() and (minor or "0").isdigit()):
-        return None
-    return int(major), int(minor or 0)

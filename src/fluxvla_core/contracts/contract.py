@@ -2,7 +2,7 @@
 
 A contract is a base class. Its abstract methods must be there; everything else has a default that
 works. A class may inherit it, or only have its methods: ``Contract.adapt`` makes up for the rest,
-so that whoever calls an operator, a policy or a filter never asks whether a method is there.
+so that code that calls an operator, a policy or a filter never asks whether a method is there.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Contract(metaclass=ABCMeta):
         """``made`` as an object of this contract: itself, or something that hands all on to it.
 
         What ``made`` lacks is the contract's default. An abstract method's default does nothing;
-        whoever must know asks :func:`implements`.
+        :func:`implements` distinguishes it from a method of the class.
         """
         if isinstance(made, cls):
             return made

@@ -1,13 +1,15 @@
-"""How long work tells people, and machines, where it is."""
+"""Progress and messages of a run: what work reports, for people and for programs."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 
-class Reporter(Protocol):
-    """Where a run says what it does. Only rank 0 of a distributed run has one that talks."""
+class Reporter:
+    """Where a run reports what it does; every report is dropped unless a subclass shows it.
+
+    Only rank 0 of a distributed run has one that shows anything.
+    """
 
     def info(self, text: str) -> None:
         """One line for people."""
@@ -19,32 +21,14 @@ class Reporter(Protocol):
         """``done`` of ``total`` units of ``name``; ``fields`` are shown beside it."""
 
     def event(self, kind: str, **fields: object) -> None:
-        """One record for machines; ``fields`` are JSON values."""
+        """One record for programs; ``fields`` are JSON values."""
 
     def artifact(self, kind: str, path: Path) -> None:
         """A file or folder that the run made and that somebody will look for."""
 
     def settle(self) -> None:
-        """Leave the terminal to whoever types: a question comes next."""
+        """Leave the terminal to a person who is asked something: remove what draws on it."""
 
 
-class SilentReporter:
+class SilentReporter(Reporter):
     """Drops everything: the default, and what ranks other than 0 get."""
-
-    def info(self, text: str) -> None:
-        return
-
-    def warn(self, text: str) -> None:
-        return
-
-    def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
-        return
-
-    def event(self, kind: str, **fields: object) -> None:
-        return
-
-    def artifact(self, kind: str, path: Path) -> None:
-        return
-
-    def settle(self) -> None:
-        return

@@ -28,7 +28,7 @@ class Runner(Contract):
 
     @abstractmethod
     def run_setup(self) -> None:
-        """Prepare: build what the constructor was told of."""
+        """Prepare: build what ``run`` needs."""
 
     @attribute
     def keeps_config(self) -> bool:

@@ -13,8 +13,9 @@ from typing import Any
 
 from fluxvla_core import atomic
 from fluxvla_core.build import RunContext
+from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
-from fluxvla_core.config.snapshot import CONFIG_FILE, write_json
+from fluxvla_core.config.snapshot import write_json
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluation.episode_log import DONE, EpisodeKey

@@ -249,7 +249,7 @@ class RobotEvalRunner(Runner):
                 "this robot cannot tell whether a task was done, and nobody is there to ask",
                 next="run the evaluation at a terminal, or give the operator a task_success()",
             )
-        getattr(self.context.reporter, "settle", lambda: None)()
+        self.context.reporter.settle()
         return input(question).strip()
 
     def _folders(self) -> list[Path]:

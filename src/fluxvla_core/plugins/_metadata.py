@@ -66,13 +66,16 @@ class Index:
         plugins: (group, name) -> every provider, sorted by distribution.
         broken: one ``where: reason`` line for each distribution that could not be read.
         folders: canonical name -> ``.dist-info`` folder, of everything that is installed.
+        versions: canonical name -> version, of the distributions whose plugins these are.
     """
 
     plugins: Mapping[tuple[str, str], tuple[Plugin, ...]]
     broken: tuple[str, ...]
     folders: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
 
 
+@functools.cache
 def canonical(name: str) -> str:
     """A distribution's name as PyPI compares it (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
@@ -88,6 +91,7 @@ def index() -> Index:
     found: dict[tuple[str, str], list[Plugin]] = {}
     broken: set[str] = set()
     folders: dict[str, str] = {}
+    versions: dict[str, str] = {}
     seen: set[str] = set()
     # Never metadata.entry_points(): one malformed file in any distribution ends it for all.
     for dist in _distributions():
@@ -110,6 +114,7 @@ def index() -> Index:
             if not _wanted(key):
                 continue
             version, requires = about.version, tuple(about.requires or ())
+            versions[key] = version
             for point in about.entry_points:
                 if point.group.startswith(PREFIX):
                     plugin = Plugin(point.group, point.name, point.value, name, version, requires)
@@ -118,11 +123,14 @@ def index() -> Index:
             broken.add(f"{where}: {type(error).__name__}: {error}")
     # The scan follows os.listdir, whose order is not stable.
     ordered = {k: tuple(sorted(v, key=lambda p: canonical(p.dist))) for k, v in found.items()}
-    return Index(ordered, tuple(sorted(broken)), folders)
+    return Index(ordered, tuple(sorted(broken)), folders, versions)
 
 
 def version(dist: str) -> str | None:
     """The installed version of a distribution, or None."""
+    known = index().versions.get(canonical(dist))
+    if known is not None:
+        return known
     try:
         found = _distribution(dist)
         return None if found is None else found.version
@@ -167,7 +175,7 @@ def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dic
 
 
 class _Folder:
-    """A ``.dist-info`` or ``.egg-info`` on ``sys.path``, of which nothing has been read yet."""
+    """A ``.dist-info`` or ``.egg-info`` on ``sys.path``; its files are read when asked for."""
 
     def __init__(self, path: str) -> None:
         self.path = path

@@ -22,7 +22,6 @@ from fluxvla_core.plugins.load import load
 from fluxvla_core.registries import PREFIX
 from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
-LIMIT_S = 120
 _AT_ONCE = 2  # importing torch takes a core and half a gigabyte
 
 Plugins = tuple[Plugin, ...]
@@ -30,9 +29,9 @@ Plugins = tuple[Plugin, ...]
 
 def problems(
     plugins: Iterable[Plugin],
-    limit_s: float = LIMIT_S,
-    traces: bool = False,
-    begins: Callable[[Plugins], object] = len,
+    limit_s: float,
+    traces: bool,
+    begins: Callable[[Plugins], object],
 ) -> Iterator[str]:
     """One text for each plugin that cannot be imported or breaks its contract, as they are found.
 

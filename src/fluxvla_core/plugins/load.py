@@ -8,10 +8,19 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
+import operator
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
+from fluxvla_core.errors import (
+    AmbiguousPlugin,
+    IncompatiblePlugin,
+    LoadFailed,
+    MissingPlugin,
+    nearest,
+)
 from fluxvla_core.plugins import _metadata, first_party
 from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
 from fluxvla_core.registries import PREFIX
@@ -19,6 +28,13 @@ from fluxvla_core.registries import PREFIX
 LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
 TRACES = f"FLUXVLA_STRICT=1 {DOCTOR} shows the traceback"
+
+_COMPARE: Final[Mapping[str, Any]] = {
+    ">=": operator.ge,
+    ">": operator.gt,
+    "<=": operator.le,
+    "<": operator.lt,
+}
 
 
 def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
@@ -46,8 +62,6 @@ def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
 
 
 def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[str]:
-    import difflib  # `fluxvla --help` has no use for it
-
     registry = group.removeprefix(PREFIX)
     installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
     text = f"no {group} plugin named {name!r}"
@@ -55,11 +69,11 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     if provider:
         text += f"; {provider} provides it and is not installed: pip install {provider}"
     else:
-        near = difflib.get_close_matches(short, [*installed, *first_party.names(registry)], 1)
+        near = nearest(short, [*installed, *first_party.names(registry)])
         if near:
-            text += f"; did you mean {near[0]!r}?"
-            if near[0] not in installed:
-                dist = first_party.owner(registry, near[0])
+            text += f"; did you mean {near!r}?"
+            if near not in installed:
+                dist = first_party.owner(registry, near)
                 text += f" ({dist} provides it and is not installed: pip install {dist})"
     broken = _metadata.index().broken
     if broken:
@@ -79,6 +93,8 @@ def unmet(plugin: Plugin) -> str | None:
 
 @functools.cache  # a distribution has many plugins
 def _unmet(origin: str, requires: tuple[str, ...], have: str | None) -> str | None:
+    if have and _certainly_met(requires, have):
+        return None
     from packaging.requirements import InvalidRequirement, Requirement
 
     for text in requires:
@@ -95,6 +111,33 @@ def _unmet(origin: str, requires: tuple[str, ...], have: str | None) -> str | No
                 f"{origin} needs {requirement.name}{requirement.specifier}, but {have} is installed"
             )
     return None
+
+
+def _certainly_met(requires: tuple[str, ...], have: str) -> bool:
+    """Whether ``have`` fulfils plain ranges such as ``fluxvla-core>=0.1,<0.2``.
+
+    Importing ``packaging`` takes a third of ``fluxvla config check``; it decides about all else.
+    """
+    release = r"\d+(?:\.\d+)*"
+    if not re.fullmatch(release, have):
+        return False
+    for text in requires:
+        name = re.match(r"[\w.-]+", text)
+        if name is not None and canonical(name[0]) != CORE:
+            continue
+        stated = re.fullmatch(r"[\w.-]+(?:\[[\w, -]*\])?\s*(?P<ranges>[\d.,<>= ]*)", text)
+        if stated is None:
+            return False
+        for clause in filter(None, stated["ranges"].split(",")):
+            found = re.fullmatch(rf"(>=|>|<=|<)\s*({release})", clause.strip())
+            if found is None or not _COMPARE[found[1]](_release(have), _release(found[2])):
+                return False
+    return True
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """``1.2.0`` -> ``(1, 2)``: zeros at the end do not matter."""
+    return tuple(map(int, re.sub(r"(\.0+)+$", "", version).split(".")))
 
 
 def load(plugin: Plugin) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from fluxvla_core.contracts.check import check_class
 from fluxvla_core.errors import LoadFailed, PluginError
 from fluxvla_core.plugins import _metadata
 from fluxvla_core.plugins._metadata import Plugin
@@ -44,7 +43,7 @@ class Registry:
                     f"by {present.__module__}",
                     next="give one of them another name, or say force=True",
                 )
-            check_class(self.name, cls, f"{cls.__module__}:{cls.__qualname__}")
+            self._check(cls, f"{cls.__module__}:{cls.__qualname__}")
             self._here[key] = cls
             return cls
 
@@ -67,7 +66,7 @@ class Registry:
             try:
                 plugin = find(self.group, name, tuple(self._here))
                 cls = load(plugin)
-                check_class(self.name, cls, plugin.origin)
+                self._check(cls, plugin.origin)
             except PluginError as error:
                 self._failed[name] = error
                 raise
@@ -87,8 +86,14 @@ class Registry:
         """Forget what this process registered under ``name``."""
         self._here.pop(name, None)
 
+    def _check(self, cls: Any, origin: str) -> None:
+        # Who only lists names, or checks a config, needs no contracts.
+        from fluxvla_core.contracts.check import check_class
+
+        check_class(self.name, cls, origin)
+
     def __contains__(self, name: object) -> bool:
-        return name in self._here or name in self.installed()
+        return name in self._here or (self.group, name) in _metadata.index().plugins
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self._here, *self.installed()}))

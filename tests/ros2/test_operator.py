@@ -46,8 +46,9 @@ def lasting_robot(lasting_drivers):
 
 def settled(robot):
     """The last test's operator held its arm when it was closed; that too has arrived."""
-    before = None
+    before, until = None, time.monotonic() + 30.0
     while len(robot.heard) != before:
+        assert time.monotonic() < until, f"commands still arrive: {before} by now"
         before = len(robot.heard)
         time.sleep(0.15)
 

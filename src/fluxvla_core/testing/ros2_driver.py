@@ -28,6 +28,7 @@ from fluxvla_core.ros2.faults import Fault, Faults, Outbox
 from fluxvla_core.ros2.require import message_class
 
 _START_S = 120.0
+_END_S = 5.0
 
 
 class Driver:
@@ -66,7 +67,10 @@ class Driver:
         self._reader.start()
         if not self._ready.wait(_START_S) or self._process.poll() is not None:
             self.kill()
-            raise RuntimeError(f"the driver did not start (exit code {self._process.returncode})")
+            raise RuntimeError(
+                f"the driver did not start within {_START_S:g} s "
+                f"(exit code {self._process.returncode})"
+            )
 
     def tell(self, **order: Any) -> None:
         """``fault="TOPIC=MODE:AMOUNT"``, ``change={topic: {key: value}}``, ``reset=True``: back to
@@ -83,7 +87,7 @@ class Driver:
     def kill(self) -> None:
         """End it with SIGKILL: no goodbye on the graph."""
         self._process.kill()
-        self._process.wait()
+        self._process.wait(_END_S)
 
     def close(self) -> None:
         """End it by closing its input; it leaves the graph properly."""
@@ -91,10 +95,10 @@ class Driver:
         if self._process.poll() is None:
             self._process.stdin.close()
             try:
-                self._process.wait(5.0)
+                self._process.wait(_END_S)
             except subprocess.TimeoutExpired:
                 self.kill()
-        self._reader.join(5.0)
+        self._reader.join(_END_S)
 
     def on(self, topic: str) -> list[dict[str, Any]]:
         """What it heard on ``topic``, oldest first: ``at`` (monotonic) and the message's fields."""

@@ -14,7 +14,7 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.robot.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2 import RobotFrame
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

@@ -15,7 +15,7 @@ from fluxvla_core.robot.joiners import METHODS
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.replay_operator import ReplayOperator
 from fluxvla_core.robot.recording.replay_policy import RecordingEnded, ReplayPolicy
-from fluxvla_core.ros2.frames import RobotFrame
+from fluxvla_core.ros2 import RobotFrame
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.testing import OperatorConformance
 

@@ -18,7 +18,7 @@ from fluxvla_core.robot.clock import SimulatedClock
 from fluxvla_core.robot.filters import LowPass, SnapGripper
 from fluxvla_core.robot.joiners import METHODS
 from fluxvla_core.robot.tracking import HOLD_REACH
-from fluxvla_core.ros2.holding import PATIENCE_S, hold_target, way_to_hold
+from fluxvla_core.ros2.commands import PATIENCE_S, hold_target, way_to_hold
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import Faulted, NotReady, Rejected
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.streams import JOINT_STATE, StreamSpec
-from fluxvla_core.ros2.trouble import BadMessage, Stale
+from fluxvla_core.ros2 import JOINT_STATE, BadMessage, Stale, StreamSpec, joints
 from tests.ros2.arm import (
     COMMANDS,
     NAMES,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, NotReady
-from fluxvla_core.ros2.streams import JOINT_STATE, StreamSpec, camera_stream
+from fluxvla_core.ros2 import JOINT_STATE, StreamSpec, camera_stream
 from tests.ros2.arm import (
     CAM,
     COMMANDS,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.errors import NotReady
-from fluxvla_core.ros2.rates import SEGMENT_BYTES, Reception, check, large_frames_profile
+from fluxvla_core.ros2.startup import SEGMENT_BYTES, Reception, check, large_frames_profile
 
 VGA = 640 * 480 * 3
 

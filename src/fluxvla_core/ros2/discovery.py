@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from fluxvla_core.errors import NotReady, Rejected
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.sync import Stale
 
 # Every node has these; they say nothing about which robot is there.
 _PLUMBING = frozenset({"/rosout", "/parameter_events"})
@@ -85,6 +87,35 @@ def nobody_listens(topics: Iterable[str]) -> NotReady:
         f"nobody listens on {', '.join(topics)}: commands would go nowhere",
         cause="the arm's controller is not running, or takes commands on another topic",
         next="start it, or set the operator's command topics",
+    )
+
+
+def silent_streams(
+    connection: Connection, silent: Mapping[str, float | None], max_age_s: float, whole: bool
+) -> Stale:
+    """Which topics are silent and since when; a frozen device, a dead driver, or the network.
+
+    Args:
+        silent: stream -> its age in seconds, as ``sync.silent`` gives them.
+        max_age_s: seconds that are allowed.
+        whole: whether these are all streams that should speak.
+    """
+    lines, gone = [], []
+    for name, age in silent.items():
+        stream = connection.streams[name]
+        since = f"silent for {age:.2f} s" if age is not None else "never heard"
+        lines.append(f"{stream.label} is {since}")
+        if not connection.node.get_publishers_info_by_topic(stream.topic):
+            gone.append(stream.topic)
+    cause = "the device froze, or its driver was killed or hangs"
+    if whole:
+        cause = "every stream at once: the network is gone, or this machine is overloaded"
+    if gone:
+        cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
+    return Stale(
+        f"{'; '.join(lines)}; {max_age_s:g} s is allowed",
+        cause=cause,
+        next="look at the driver; max_age_s of the operator says how long it may be silent",
     )
 
 

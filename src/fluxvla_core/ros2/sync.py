@@ -12,14 +12,24 @@ import bisect
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
-from fluxvla_core.ros2.ring import STEP, Received
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.errors import NotReady
+from fluxvla_core.ros2.streams import STEP, Received
 
 _CLOCKS = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
 # Messages of a stream that tell how long they take.
 _FEW = 16
 Streams = Mapping[str, Sequence[Received]]
+
+
+class Stale(NotReady):
+    """A stream is silent, late, or too far from the others in time; it may recover.
+
+    The arm still obeys: it is braked and held, by the safety rule named here.
+    """
+
+    rule: ClassVar[str] = "freshness"
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.ros2 import images, joints, qos
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.faults import Fault, Faults, Outbox
-from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2 import Connection, Fault, Faults, Outbox, images, joints, message_class, qos
 
 _START_S = 120.0
 _END_S = 5.0

@@ -138,7 +138,7 @@ class InSimulation(RosOperator):
         # the simulator take commands in an episode's first 0.1 s.
         wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)
         at = self.facts()["reset_at"] + round(wait_s * 1e9)
-        streams = [spec.name for spec in self._specs_of(STATE, CAMERA)]
+        streams = [spec.name for spec in self.streams() if spec.kind in (STATE, CAMERA)]
         self._wait(
             lambda: all(self._stamp(name) >= at for name in streams),
             "the simulator shows nothing of the new episode",

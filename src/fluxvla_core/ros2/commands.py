@@ -1,4 +1,7 @@
-"""How an arm comes to hold in a stop: the commands from the last one to the one that holds it."""
+"""What an arm may be sent: checked actions, and the commands of a stop.
+
+A stop goes from the last command to the one that holds the arm, within its limits.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.errors import Rejected
 from fluxvla_core.robot.limits import CommandLimiter
 from fluxvla_core.robot.tracking import HOLD_REACH
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -23,6 +27,28 @@ PATIENCE_S = 0.25
 _APART_S = 0.25
 # No arm takes as long to come to rest.
 _LONGEST_S = 3.0
+
+
+def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
+    """A fresh ``(dim,)`` float64 copy of ``action``.
+
+    Raises:
+        Rejected: another shape, not finite, or outside the joints' position limits.
+    """
+    values = np.array(action, dtype=np.float64)
+    if values.shape != (embodiment.dim,):
+        raise Rejected(
+            f"{embodiment.name} takes actions of shape ({embodiment.dim},), got {values.shape}"
+        )
+    for joint, value in zip(embodiment.joints, values, strict=True):
+        if not np.isfinite(value):
+            raise Rejected(f"{joint.name}: the command is {value}, not a finite number")
+        if not joint.lower <= value <= joint.upper:
+            raise Rejected(
+                f"{joint.name}: the command {value:.4g} {joint.unit} is outside "
+                f"[{joint.lower:.4g}, {joint.upper:.4g}]"
+            )
+    return values
 
 
 class Motion:

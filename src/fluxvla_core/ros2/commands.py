@@ -68,7 +68,7 @@ class Motion:
         self._before = (self._last, apart) if known and self._last is not None else None
         self._last, self._at = command, now
 
-    def way_to_hold(
+    def stop_commands(
         self, embodiment: EmbodimentSpec, last: Array, measured: tuple[Measured, Measured] | None
     ) -> list[Array]:
         """The commands of a stop, after which what was sent is no motion any more.
@@ -90,7 +90,7 @@ class Motion:
             ahead = time.monotonic() - receipt + PATIENCE_S
             moved = (state - earlier) * (ahead / (receipt - then) if receipt > then else 0.0)
             target = hold_target(embodiment, last, state, moved)
-        return list(way_to_hold(embodiment, last, before if moving else last, seconds, target))
+        return list(braking_commands(embodiment, last, before if moving else last, seconds, target))
 
     def wait(self, embodiment: EmbodimentSpec) -> None:
         """Wait until the next command of a stop is due: not sooner after the last than usual."""
@@ -126,7 +126,7 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Ar
     return target
 
 
-def way_to_hold(
+def braking_commands(
     embodiment: EmbodimentSpec, last: Array, before: Array, seconds: float, target: Array
 ) -> Array:
     """Commands from the last one to rest, within the limits of the embodiment.

@@ -46,7 +46,7 @@ _KEPT = 256 << 20
 
 
 def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
-    """The module ``rclpy``.
+    """Import ``rclpy``; returns the module.
 
     Raises:
         LoadFailed: it cannot be imported, or the middleware that the environment asks for cannot
@@ -135,9 +135,9 @@ class Connection:
         depth: int = 1,
         latched: bool = False,
     ) -> Any:
-        """A publisher; as it stands fit for commands: RELIABLE matches every subscription, and a
-        command that was overtaken by a newer one must never be sent again. What is ``latched`` is
-        also told to those who ask for it when they come later."""
+        """A publisher, by default for commands: RELIABLE matches every subscription, and with a
+        depth of 1 a command that was overtaken by a newer one is never sent again. ``latched``
+        (transient local) also sends the last messages to subscribers that come later."""
         return self.node.create_publisher(message, topic, qos.profile(reliability, depth, latched))
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
@@ -152,7 +152,7 @@ class Connection:
         self._watchers.append(callback)
 
     def check(self) -> None:
-        """Nothing, while the connection is open and its thread runs.
+        """Return while the connection is open and its thread runs.
 
         Raises:
             Faulted: it was closed, or a callback ended its thread; carries that error.
@@ -179,7 +179,7 @@ class Connection:
             callback()
 
     def _spin(self) -> None:
-        # Whoever sends commands waits for the interpreter while this thread has it.
+        # The thread that sends commands waits for the interpreter lock while this one has it.
         priority.second()
         main = threading.main_thread()
         try:
@@ -197,13 +197,13 @@ class Connection:
 
 
 def _check_domain(domain_id: int | None) -> None:
-    said: object = domain_id if domain_id is not None else os.environ.get("ROS_DOMAIN_ID") or 0
+    given: object = domain_id if domain_id is not None else os.environ.get("ROS_DOMAIN_ID") or 0
     try:
-        number = int(str(said))
+        number = int(str(given))
     except ValueError:
         number = -1
     if not 0 <= number <= _MAX_DOMAIN:
-        raise ConfigError(f"a ROS domain is a number from 0 to {_MAX_DOMAIN}, got {said!r}")
+        raise ConfigError(f"a ROS domain is a number from 0 to {_MAX_DOMAIN}, got {given!r}")
 
 
 @functools.cache

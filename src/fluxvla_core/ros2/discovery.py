@@ -1,4 +1,4 @@
-"""What the ROS graph shows, in words: missing topics, wrong types, other commanders."""
+"""Queries of the ROS graph, and the errors for what is missing, silent or wrong on it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from fluxvla_core.errors import NotReady, Rejected
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.sync import Stale
 
-# Every node has these; they say nothing about which robot is there.
-_PLUMBING = frozenset({"/rosout", "/parameter_events"})
+# Every node has these; they do not show which robot is there.
+_OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _SHOWN = 20
 # How long DDS keeps a participant that was killed (Fast DDS's lease).
 _LEASE_S = 20
@@ -23,7 +23,7 @@ def published(node: Any, own_node: str) -> list[str]:
     return [
         topic
         for topic, _ in node.get_topic_names_and_types()
-        if topic not in _PLUMBING
+        if topic not in _OF_EVERY_NODE
         and other_publishers(node.get_publishers_info_by_topic(topic), own_node)
     ]
 
@@ -56,7 +56,7 @@ def missing(
         step = step or "start the driver, or set the operator's topic names"
     else:
         lines.append(f"nobody publishes anything on ROS domain {domain}")
-        cause, step = _nobody(domain, environ)
+        cause, step = _advice_on_domain(domain, environ)
     return NotReady("; ".join(lines), cause=cause, next=step)
 
 
@@ -93,7 +93,7 @@ def nobody_listens(topics: Iterable[str]) -> NotReady:
 def silent_streams(
     connection: Connection, silent: Mapping[str, float | None], max_age_s: float, whole: bool
 ) -> Stale:
-    """Which topics are silent and since when; a frozen device, a dead driver, or the network.
+    """The error for streams that were received before and fell silent.
 
     Args:
         silent: stream -> its age in seconds, as ``sync.silent`` gives them.
@@ -158,7 +158,7 @@ def contested(topics: Mapping[str, Sequence[str]]) -> Rejected:
     )
 
 
-def _nobody(domain: int, environ: Mapping[str, str]) -> tuple[str, str]:
+def _advice_on_domain(domain: int, environ: Mapping[str, str]) -> tuple[str, str]:
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     alone = environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
     cause = "the robot is on another domain"

@@ -93,7 +93,7 @@ class RosOperator(Operator):
         self._motion = Motion()
         self._fault: FluxError | None = None
 
-    # What a subclass says.
+    # What a subclass defines.
 
     @abstractmethod
     def streams(self) -> Sequence[StreamSpec]:
@@ -139,7 +139,7 @@ class RosOperator(Operator):
 
         Raises:
             LoadFailed: no ROS 2, or a message package is missing.
-            NotReady: a topic has no publisher (names those that are there), bears another type,
+            NotReady: a topic has no publisher (names those that are there), has another type,
                 stays silent, or loses most messages; nobody listens for commands.
             Rejected: another node publishes commands.
             Faulted: what arrives is not what the embodiment describes.
@@ -255,12 +255,12 @@ class RosOperator(Operator):
         with self._lock:
             if self._connection is None:
                 return
-            way, self._moving = self._way_to_hold(), False
-            if way:
+            commands, self._moving = self._stop_commands(), False
+            if commands:
                 self._motion.wait(self.embodiment)
-                self._hold(way[0])
+                self._hold(commands[0])
             attempt(self.embodiment.name, self.on_stop)
-        for before, command in itertools.pairwise(way):
+        for before, command in itertools.pairwise(commands):
             self._motion.wait(self.embodiment)
             with self._lock:
                 # Closed, or commanded by somebody else meanwhile.
@@ -350,7 +350,7 @@ class RosOperator(Operator):
             self._fault = None
             return
         error = discovery.contested(others)
-        # Whoever commands the arm is told by the refusal of the next command.
+        # While the arm is commanded, the refusal of the next command reports it.
         if self._fault is None and not self._moving:
             log.error("%s", error.what)
         with self._lock:
@@ -374,7 +374,7 @@ class RosOperator(Operator):
         state = self.read_state({name: found.message for name, found in messages.items()})
         return state, min(found.receipt for found in messages.values())
 
-    def _way_to_hold(self) -> list[Array]:
+    def _stop_commands(self) -> list[Array]:
         """The commands of a stop; none for an arm that rests, or is somebody else's."""
         if not self._moving or self._last is None:
             return []
@@ -384,7 +384,7 @@ class RosOperator(Operator):
             measured = self._state_of(readings.states(-1)), self._state_of(readings.states(-2))
         except FluxError:
             measured = None  # Its last command is where it goes or stays.
-        return self._motion.way_to_hold(self.embodiment, self._last, measured)
+        return self._motion.stop_commands(self.embodiment, self._last, measured)
 
     def _hold(self, command: Array) -> bool:
         self._last = command

@@ -72,7 +72,7 @@ class Startup:
             self._connection.check()
             self._check_losses()
             late = time.monotonic() >= until
-            problem = self._problem(hurry=not late)
+            problem = self._problem(explain=late)
             if problem is None:
                 return
             if late:
@@ -136,32 +136,36 @@ class Startup:
             ]
         )
 
-    def _problem(self, hurry: bool) -> FluxError | None:
-        """What is still wrong; ``hurry`` leaves out what only makes the message better."""
+    def _problem(self, explain: bool) -> FluxError | None:
+        """What is still wrong, None if all is there.
+
+        Args:
+            explain: look for the cause of a silent stream, which takes a while.
+        """
         quiet = [s for spec in self._specs if not (s := self._stream(spec)).newest()]
         for stream in quiet:
             stream.refresh()
         if quiet:
-            if hurry:
+            if not explain:
                 return NotReady("waiting")
-            error = self._why(quiet)
+            error = self._explain_silence(quiet)
             known = {spec.name: spec.unheard for spec in self._specs}
             causes = [known[stream.name] for stream in quiet]
             if all(causes):
                 error.cause = "; ".join(causes)
             return error
-        # Not the graph's word for it: until the two have found each other, commands are lost, and
-        # the first one that arrives would be a jump.
-        deaf = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
-        if deaf:
-            return discovery.nobody_listens(deaf)
+        # The publisher's own count: a subscriber that is on the graph may not be matched yet, and
+        # until then commands are lost, so that the first one that arrives would be a jump.
+        unheard = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
+        if unheard:
+            return discovery.nobody_listens(unheard)
         return self._contested()
 
     def _contested(self) -> FluxError | None:
         others = discovery.commanders(self._node, self._exclusive, self._connection.name)
         return discovery.contested(others) if others else None
 
-    def _why(self, quiet: Sequence[Stream]) -> FluxError:
+    def _explain_silence(self, quiet: Sequence[Stream]) -> FluxError:
         published = discovery.published(self._node, self._connection.name)
         missing = {s.name: s.topic for s in quiet if s.topic not in published}
         if missing:
@@ -215,8 +219,8 @@ class Reception:
     @property
     def wanted(self) -> float:
         """Messages that should have arrived."""
-        told = float(self.received + self.lost)
-        return max(told, (self.expected_hz or 0.0) * self.seconds)
+        counted = float(self.received + self.lost)
+        return max(counted, (self.expected_hz or 0.0) * self.seconds)
 
     @property
     def share(self) -> float:

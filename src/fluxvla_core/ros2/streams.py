@@ -40,8 +40,8 @@ class StreamSpec:
         depth: how many messages are kept.
         expected_hz: messages a second that should come; None: as many as are sent.
         camera: size of the pictures, for ``camera`` and ``depth``.
-        required: whether ``connect`` waits for it; only ``side`` streams need not be. Without, it
-            warns if nobody publishes it. What has spoken once must go on in either case.
+        required: whether ``connect`` waits for it; only ``side`` streams need not be. Otherwise it
+            warns if nobody publishes it. Once a message arrived, more must come in either case.
         latched: ask for the last message that was sent before, where publishers keep it. It is sent
             when something changes, so that silence means nothing.
         unheard: the likely cause where it is not heard, for messages.
@@ -65,16 +65,16 @@ class StreamSpec:
 
 
 def depth_stream(camera: str) -> str:
-    """What the stream of a camera's distances is called."""
+    """The name of the stream of a camera's depth pictures."""
     return f"{camera}_depth"
 
 
 def camera_stream(
     camera: Camera, topic: str, expected_hz: float | None = None, depth: bool = False
 ) -> StreamSpec:
-    """The stream of a camera's pictures; of its distances (named ``<camera>_depth``) if ``depth``.
+    """The stream of a camera's pictures; of its depth (named ``<camera>_depth``) if ``depth``.
 
-    A topic that ends in ``/compressed`` or ``/compressedDepth`` bears ``CompressedImage``, as
+    A topic that ends in ``/compressed`` or ``/compressedDepth`` carries ``CompressedImage``, as
     image_transport names them.
     """
     packed = topic.rstrip("/").rpartition("/")[2] in ("compressed", "compressedDepth")
@@ -109,7 +109,7 @@ class Received:
     """One message.
 
     ``receipt`` is seconds on this process's monotonic clock; ``stamp`` seconds on the sender's
-    clock, None if the message bears none.
+    clock, None if the message has none.
     """
 
     receipt: float
@@ -242,7 +242,7 @@ class Stream:
         try:
             return subscribe(event_callbacks=events)
         except unsupported:
-            # Not every middleware tells; then only an expected rate can show a loss.
+            # Not every middleware reports losses; then only an expected rate can show a loss.
             return subscribe()
 
 

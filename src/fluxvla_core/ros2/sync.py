@@ -86,12 +86,12 @@ def match(
     times = {name: _time(message, by) for name, message in chosen.items()}
     skew = max(times.values()) - min(times.values())
     if skew > max_skew:
-        error = _apart(chosen, times, skew, max_skew, by)
+        error = _too_far_apart(chosen, times, skew, max_skew, by)
         if by == "stamp":
             first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
             delays = {name: _delay(streams[name]) for name in (first, last)}
             if abs(delays[first] - delays[last]) > STEP:
-                error.cause, error.next = _off(delays, wall), _CLOCKS
+                error.cause, error.next = _wrong_clock(delays, wall), _CLOCKS
         raise error
     return Matched(chosen, skew, slowest)
 
@@ -119,7 +119,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
         raise Stale(
             f"{first} is stamped {apart:.3f} s before {last}, with which it arrives; "
             f"at most {max_skew:g} s is allowed",
-            cause=_off({name: delays[name] for name in (first, last)}, wall),
+            cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall),
             next=f"{_CLOCKS}; max_skew_s sets what is allowed",
         )
 
@@ -149,7 +149,7 @@ def _delay(items: Sequence[Received]) -> float:
     return min((m.receipt - m.stamp for m in items[-_FEW:] if m.stamp is not None), default=0.0)
 
 
-def _off(delays: Mapping[str, float], wall: float | None) -> str:
+def _wrong_clock(delays: Mapping[str, float], wall: float | None) -> str:
     """Whose clock is off, of two streams whose stamps are."""
     slow, fast = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
     # By this machine's wall clock; a stamp in the future cannot be a message that is late.
@@ -178,7 +178,7 @@ def _time(message: Received, by: str) -> float:
     return message.receipt
 
 
-def _apart(
+def _too_far_apart(
     chosen: Mapping[str, Received],
     times: Mapping[str, float],
     skew: float,

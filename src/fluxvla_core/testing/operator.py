@@ -1,4 +1,4 @@
-"""What every operator must do, as tests that a plugin inherits.
+"""Conformance tests for operators, which a plugin inherits.
 
     from fluxvla_core.testing import OperatorConformance
 

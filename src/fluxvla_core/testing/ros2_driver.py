@@ -1,10 +1,10 @@
-"""A robot's ROS 2 side without the robot: a process that publishes, listens, and falls ill.
+"""A stand-in for a robot's ROS 2 drivers: a process that publishes, subscribes, injects faults.
 
     python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
 
-``Driver`` starts that process from a test, tells it what to do and reads what it heard. It is a
-process of its own because that is what drivers are: what one process does to another through DDS
-(lost pictures, killed publishers, other settings after a restart) happens between processes only.
+``Driver`` starts that process from a test, gives it orders and keeps what it received. It is a
+process of its own because drivers are: lost pictures, killed publishers and other settings after a
+restart happen between processes only.
 Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
 """
 

@@ -12,13 +12,10 @@ from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
 from fluxvla_sim.aloha.world import CUBE
-from fluxvla_sim.ros2.base import Base
-from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
-from fluxvla_sim.ros2.clock import SlowedClock
-from fluxvla_sim.ros2.judge import Judge
-from fluxvla_sim.ros2.node import NodeSettings
-from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
-from fluxvla_sim.ros2.streams import stream_latency, timed_fault
+from fluxvla_sim.ros2.bodies import AlohaBody, Base, URBody, command_values
+from fluxvla_sim.ros2.node import Judge
+from fluxvla_sim.ros2.operators import AlohaSimROSOperator, SlowedClock, URSimROSOperator
+from fluxvla_sim.ros2.settings import NodeSettings, stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import ConfigError, NotReady, UsageError

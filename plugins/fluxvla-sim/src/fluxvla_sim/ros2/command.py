@@ -107,7 +107,7 @@ class SimCommand:
     def run(self, args: Any) -> int:
         from fluxvla_core.commands import make_reporter
         from fluxvla_core.ros2 import require_rclpy
-        from fluxvla_sim.ros2.streams import stream_latency, timed_fault
+        from fluxvla_sim.ros2.settings import stream_latency, timed_fault
 
         if not args.ros2:
             raise UsageError(
@@ -128,8 +128,8 @@ class SimCommand:
         self, args: Any, faults: list[Any], latencies: dict[str, float], reporter: Any
     ) -> int:
         from fluxvla_sim.environment import ENVIRONMENTS
-        from fluxvla_sim.ros2.node import NodeSettings, simulate
-        from fluxvla_sim.ros2.streams import check_fault, check_stream
+        from fluxvla_sim.ros2.node import simulate
+        from fluxvla_sim.ros2.settings import NodeSettings, check_fault, check_stream
 
         robot = ENVIRONMENTS[args.robot].robot
         world, _ = robot.find(args.task or robot.default_tasks[0])

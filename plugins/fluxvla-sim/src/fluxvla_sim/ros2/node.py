@@ -16,18 +16,17 @@ then lives that much slower, its rates with it, and whoever drives it follows th
 from __future__ import annotations
 
 import json
-import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from fluxvla_mujoco import divergence
 
 from fluxvla_core.commands import Reporter
-from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation import Diverged
 from fluxvla_core.ros2 import (
     IMAGE,
@@ -41,8 +40,7 @@ from fluxvla_core.ros2 import (
 )
 from fluxvla_sim.ros2.bodies import Body
 from fluxvla_sim.ros2.cameras import Cameras
-from fluxvla_sim.ros2.judge import Judge
-from fluxvla_sim.ros2.streams import check_fault, depths
+from fluxvla_sim.ros2.settings import NodeSettings, check_fault, depths
 from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, World
 
 _FACTS_EVERY = 5
@@ -54,68 +52,6 @@ _WELL = "well"
 # Commands that may wait while this process is kept from running: a UR ignores what comes after a
 # gap, and a simulation's stall is none of the commander's.
 _WAITING = 200
-# Of a product of two rates; a billion parts are months.
-_ROUNDING = 1e-9
-
-
-@dataclass(frozen=True)
-class NodeSettings:
-    """How a simulated robot presents itself.
-
-    Args:
-        name: of the robot; ``sim_`` before it names the node.
-        seed: of the first scene.
-        real_time_factor: simulated seconds in a second.
-        state_hz: states a simulated second, of every stream of them. Above ``CONTROL_HZ`` the
-            physics goes in smaller parts of a control period, down to its own 2 ms.
-        camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
-            nobody listens to is not drawn.
-        latencies: stream -> simulated seconds that its messages are under way, with true stamps.
-        height, width: of every picture, in pixels.
-        best_effort: offer pictures as camera drivers do by default, not reliably.
-        faults: (seconds after the start, stream, fault), what falls ill by itself.
-        domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
-    """
-
-    name: str
-    seed: int = 0
-    real_time_factor: float = 1.0
-    state_hz: float = CONTROL_HZ
-    camera_hz: float = 30.0
-    latencies: Mapping[str, float] = field(default_factory=dict)
-    height: int = 480
-    width: int = 640
-    best_effort: bool = False
-    faults: Sequence[tuple[float, str, Fault]] = ()
-    domain_id: int | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.real_time_factor <= 1:
-            raise ConfigError(
-                f"the real-time factor must be above 0 and at most 1, got {self.real_time_factor:g}"
-            )
-        if not 0 < self.camera_hz <= 1000:
-            raise ConfigError(f"cameras need a rate from 0 to 1000 Hz, got {self.camera_hz:g}")
-        most = CONTROL_HZ * SUBSTEPS
-        if not 0 < self.state_hz <= most:
-            raise ConfigError(
-                f"states need a rate from 0 to {most:g} Hz, as the physics is stepped; "
-                f"got {self.state_hz:g}"
-            )
-
-    @property
-    def parts(self) -> int:
-        """Into how many parts a control period is divided: as few as ``state_hz`` allows."""
-        whole = (n for n in range(1, SUBSTEPS + 1) if SUBSTEPS % n == 0)
-        return next(n for n in whole if CONTROL_HZ * n >= self.state_hz)
-
-    def states_by(self, part: int) -> int:
-        """How many states are said by the end of so many parts of control periods."""
-        return math.floor(part * self.state_hz / (CONTROL_HZ * self.parts) + _ROUNDING)
-
-    def latency_s(self, stream: str) -> float:
-        """How long a stream's messages are under way, in seconds of the wall clock."""
-        return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
 @dataclass
@@ -127,6 +63,45 @@ class Counts:
     pictures: int = 0
     commands: int = 0
     refused: dict[str, int] = field(default_factory=dict)
+
+
+class Judge:
+    """Keeps the facts of one episode after the other, and judges every task of the world.
+
+    An episode's steps begin with its first command, as in an evaluation: until then nothing can
+    have been done. After the world's ``max_steps`` its outcome is settled.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._facts = world.begin()
+        self._seed = 0
+        self._resets = 0
+
+    def reset(self, seed: int) -> None:
+        """An episode begins."""
+        self._facts = self._world.begin()
+        self._seed = seed
+        self._resets += 1
+
+    def after(self, scene: Scene) -> None:
+        """One more control period has passed since the first command."""
+        if self._facts.steps < self._world.max_steps:
+            self._facts = self._facts.after(scene)
+
+    def tell(self) -> dict[str, Any]:
+        """JSON values: ``seed``, ``resets`` (how many episodes began), ``steps`` and ``tasks``:
+        name -> ``instruction``, ``success``, ``done``."""
+        tasks = {
+            task.name: {
+                "instruction": task.instruction,
+                "success": task.success(self._facts),
+                "done": task.done(self._facts) or self._facts.steps >= self._world.max_steps,
+            }
+            for task in self._world.tasks
+        }
+        steps = self._facts.steps
+        return {"seed": self._seed, "resets": self._resets, "steps": steps, "tasks": tasks}
 
 
 class RobotNode:

@@ -33,7 +33,6 @@ from fluxvla_core.ros2 import (
     message_class,
 )
 from fluxvla_sim.operators import check_arms
-from fluxvla_sim.ros2.clock import SlowedClock
 
 log = logging.getLogger("fluxvla.sim")
 
@@ -44,6 +43,28 @@ RESET_S = 10.0
 _LOOK_S = 0.01
 _SETTLE_S = 0.2
 _KEPT = 0.95
+
+
+class SlowedClock:
+    """The monotonic clock at ``factor`` of its speed: what is a second here takes 1 / factor.
+
+    A control loop that lives by it sends 50 commands in a simulated second, whatever that takes;
+    its deadlines, watchdogs and latencies are all in the robot's time. A policy so has more time to
+    think than on a real robot: results must state the factor.
+    """
+
+    lockstep = False
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+
+    def now(self) -> float:
+        return time.monotonic() * self.factor
+
+    def sleep_until(self, deadline: float) -> None:
+        left = deadline / self.factor - time.monotonic()
+        if left > 0:
+            time.sleep(left)
 
 
 class InSimulation(RosOperator):

@@ -1,12 +1,78 @@
-"""The streams of a simulated robot, as people name them on a command line."""
+"""Settings of a simulated robot, and the streams and faults that its command line names."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
-from fluxvla_core.errors import UsageError
+from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.ros2 import FLOAT64, ODOMETRY, Fault, depth_stream
 from fluxvla_sim.ros2.bodies import Body
+from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS
+
+# Of a product of two rates; a billion parts are months.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """How a simulated robot presents itself.
+
+    Args:
+        name: of the robot; ``sim_`` before it names the node.
+        seed: of the first scene.
+        real_time_factor: simulated seconds in a second.
+        state_hz: states a simulated second, of every stream of them. Above ``CONTROL_HZ`` the
+            physics goes in smaller parts of a control period, down to its own 2 ms.
+        camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
+            nobody listens to is not drawn.
+        latencies: stream -> simulated seconds that its messages are under way, with true stamps.
+        height, width: of every picture, in pixels.
+        best_effort: offer pictures as camera drivers do by default, not reliably.
+        faults: (seconds after the start, stream, fault), what falls ill by itself.
+        domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
+    """
+
+    name: str
+    seed: int = 0
+    real_time_factor: float = 1.0
+    state_hz: float = CONTROL_HZ
+    camera_hz: float = 30.0
+    latencies: Mapping[str, float] = field(default_factory=dict)
+    height: int = 480
+    width: int = 640
+    best_effort: bool = False
+    faults: Sequence[tuple[float, str, Fault]] = ()
+    domain_id: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.real_time_factor <= 1:
+            raise ConfigError(
+                f"the real-time factor must be above 0 and at most 1, got {self.real_time_factor:g}"
+            )
+        if not 0 < self.camera_hz <= 1000:
+            raise ConfigError(f"cameras need a rate from 0 to 1000 Hz, got {self.camera_hz:g}")
+        most = CONTROL_HZ * SUBSTEPS
+        if not 0 < self.state_hz <= most:
+            raise ConfigError(
+                f"states need a rate from 0 to {most:g} Hz, as the physics is stepped; "
+                f"got {self.state_hz:g}"
+            )
+
+    @property
+    def parts(self) -> int:
+        """Into how many parts a control period is divided: as few as ``state_hz`` allows."""
+        whole = (n for n in range(1, SUBSTEPS + 1) if SUBSTEPS % n == 0)
+        return next(n for n in whole if CONTROL_HZ * n >= self.state_hz)
+
+    def states_by(self, part: int) -> int:
+        """How many states are said by the end of so many parts of control periods."""
+        return math.floor(part * self.state_hz / (CONTROL_HZ * self.parts) + _ROUNDING)
+
+    def latency_s(self, stream: str) -> float:
+        """How long a stream's messages are under way, in seconds of the wall clock."""
+        return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
 def depths(body: Body) -> dict[str, str]:

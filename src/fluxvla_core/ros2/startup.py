@@ -26,7 +26,7 @@ from fluxvla_core.ros2.qos import BEST_EFFORT
 from fluxvla_core.ros2.streams import CommandSpec, Stream, StreamSpec
 
 _POLL_S = 0.02
-# So many lost messages, and none received, are no bad luck.
+# So many lost messages, and none received, are not chance.
 _HOPELESS = 30
 SEGMENT_BYTES = 512 * 1024
 ENOUGH = 0.5
@@ -93,7 +93,7 @@ class Startup:
         start = time.monotonic()
         time.sleep(seconds)
         span = time.monotonic() - start
-        warnings = check(
+        warnings = check_losses(
             Reception(
                 stream.label,
                 stream.reliability,
@@ -125,11 +125,11 @@ class Startup:
         streams = [self._stream(spec) for spec in self._specs]
         lost = [s for s in streams if s.lost >= _HOPELESS and not s.newest()]
         if lost:
-            raise self._lossy(lost)
+            raise self._losses_error(lost)
 
-    def _lossy(self, lost: Sequence[Stream]) -> NotReady:
+    def _losses_error(self, lost: Sequence[Stream]) -> NotReady:
         span = time.monotonic() - self._since
-        return lossy(
+        return losses_error(
             [
                 Reception(s.label, s.reliability, span, 0, s.lost, 0, None, s.from_fast_dds)
                 for s in lost
@@ -178,7 +178,7 @@ class Startup:
                 return discovery.wrong_type(stream.label, stream.topic, wanted, types)
         lost = [s for s in quiet if s.lost]
         if lost:
-            return self._lossy(lost)
+            return self._losses_error(lost)
         return discovery.silent_publishers([s.label for s in quiet])
 
     def _stream(self, spec: StreamSpec) -> Stream:
@@ -231,7 +231,7 @@ class Reception:
         return f"{self.label}: {self.received} of {self.wanted:.0f} messages arrived"
 
 
-def check(receptions: Iterable[Reception]) -> list[str]:
+def check_losses(receptions: Iterable[Reception]) -> list[str]:
     """Warnings for streams that lose some messages.
 
     Raises:
@@ -240,11 +240,11 @@ def check(receptions: Iterable[Reception]) -> list[str]:
     everything = list(receptions)
     bad = [r for r in everything if r.share < ENOUGH]
     if bad:
-        raise lossy(bad)
+        raise losses_error(bad)
     return [f"{r} in {r.seconds:.1f} s" for r in everything if r.share < GOOD]
 
 
-def lossy(bad: list[Reception]) -> NotReady:
+def losses_error(bad: list[Reception]) -> NotReady:
     """The error for streams that lose most of their messages."""
     what = "; ".join(f"{r} in {r.seconds:.1f} s" for r in bad)
     if any(is_trap(r) and r.from_fast_dds for r in bad):

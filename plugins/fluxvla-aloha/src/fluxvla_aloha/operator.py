@@ -70,7 +70,7 @@ class AlohaOperator(RosOperator):
         embodiment: in place of ``arms``, the spec of others (as ``EmbodimentSpec.to_dict`` gives
             it), with seven joints an arm, left first, gripper last.
         domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.operator.RosOperator``.
+            ``fluxvla_core.ros2.RosOperator``.
         context: what the run knows (injected).
 
     Raises:

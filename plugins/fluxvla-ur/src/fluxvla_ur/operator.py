@@ -84,7 +84,7 @@ class UROperator(RosOperator):
         trajectory_time_s: with a trajectory controller, how far ahead each target is set.
         camera_rate_hz: pictures a second that should come; None: as many as are sent.
         domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.operator.RosOperator``.
+            ``fluxvla_core.ros2.RosOperator``.
 
     Raises:
         ConfigError: an unknown model or controller, or a value out of its range.

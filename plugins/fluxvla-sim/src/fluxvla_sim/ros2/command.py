@@ -133,12 +133,12 @@ class SimCommand:
 
         robot = ENVIRONMENTS[args.robot].robot
         world, _ = robot.find(args.task or robot.default_tasks[0])
-        body = _aloha(args) if args.robot == "aloha" else _ur(args)
-        _some_cameras(body, args.cameras)
+        driver = _aloha(args) if args.robot == "aloha" else _ur(args)
+        _some_cameras(driver, args.cameras)
         for _, stream, fault in faults:
-            check_fault(body, stream, fault)
+            check_fault(driver, stream, fault)
         for stream in latencies:
-            check_stream(body, stream)
+            check_stream(driver, stream)
         settings = NodeSettings(
             name=args.robot,
             seed=args.seed,
@@ -152,7 +152,7 @@ class SimCommand:
             faults=faults,
             domain_id=args.domain_id,
         )
-        simulate(body, world, settings, reporter, args.render, args.seconds)
+        simulate(driver, world, settings, reporter, args.render, args.seconds)
         return 0
 
 
@@ -163,35 +163,35 @@ def _modes() -> str:
     return "; ".join(f"{names[mode]}: {what}" for mode, what in MODES.items())
 
 
-def _some_cameras(body: Any, names: list[str] | None) -> None:
-    unknown = [name for name in names or () if name not in body.cameras]
+def _some_cameras(driver: Any, names: list[str] | None) -> None:
+    unknown = [name for name in names or () if name not in driver.cameras]
     if unknown:
         raise UsageError(
-            f"no camera {', '.join(map(repr, unknown))}; there are {', '.join(body.cameras)}"
+            f"no camera {', '.join(map(repr, unknown))}; there are {', '.join(driver.cameras)}"
         )
     if names:
-        body.cameras = {name: body.cameras[name] for name in names}
+        driver.cameras = {name: driver.cameras[name] for name in names}
 
 
 def _aloha(args: Any) -> Any:
     from fluxvla_aloha.presets import PRESETS
 
-    from fluxvla_sim.ros2.bodies import AlohaBody
+    from fluxvla_sim.ros2.drivers import AlohaDriver
 
     if args.preset not in PRESETS:
         raise UsageError(f"unknown preset {args.preset!r}; known are {', '.join(PRESETS)}")
     if args.speed_scaling is not None:
         raise UsageError("an ALOHA has no speed slider: --speed-scaling is for a UR")
-    return AlohaBody(PRESETS[args.preset])
+    return AlohaDriver(PRESETS[args.preset])
 
 
 def _ur(args: Any) -> Any:
     from fluxvla_ur.operator import CONTROLLERS
 
-    from fluxvla_sim.ros2.bodies import URBody
+    from fluxvla_sim.ros2.drivers import URDriver
 
     if args.controller not in CONTROLLERS:
         raise UsageError(
             f"unknown controller {args.controller!r}; known are {', '.join(CONTROLLERS)}"
         )
-    return URBody(args.controller, 100.0 if args.speed_scaling is None else args.speed_scaling)
+    return URDriver(args.controller, 100.0 if args.speed_scaling is None else args.speed_scaling)

@@ -1,8 +1,8 @@
-"""Real robots' operators that know that their robot is simulated.
+"""Operators for robots that ``fluxvla sim`` simulates behind ROS 2.
 
 ``AlohaSimROSOperator`` is ``AlohaOperator``, ``URSimROSOperator`` is ``UROperator``: the same
-topics, messages and checks, and three things more that only a simulation can do. It begins an
-episode from a seed, it tells whether the task is done, and it may live slower than real time.
+topics, messages and checks. A simulation can do three things more: begin an episode from a seed,
+report whether the task is done, and run slower than real time.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class InSimulation(RosOperator):
         Raises:
             NotReady: there was none yet.
         """
-        return self._told()[0]
+        return self._newest_facts()[0]
 
     def episode_facts(self) -> dict[str, Any]:
         """JSON values about how the last episode was simulated, for whoever reports its outcome.
@@ -219,10 +219,10 @@ class InSimulation(RosOperator):
 
     def _simulated(self) -> tuple[float, float]:
         """Simulated seconds of the newest facts, and when they came (monotonic)."""
-        facts, receipt = self._told()
+        facts, receipt = self._newest_facts()
         return float(facts["time"]), receipt
 
-    def _told(self) -> tuple[Mapping[str, Any], float]:
+    def _newest_facts(self) -> tuple[Mapping[str, Any], float]:
         received = self.newest("facts")
         if received is None:
             raise NotReady(f"the simulator ({FACTS}) has said nothing yet")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.ros2 import FLOAT64, ODOMETRY, Fault, depth_stream
-from fluxvla_sim.ros2.bodies import Body
+from fluxvla_sim.ros2.drivers import Driver
 from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS
 
 # Of a product of two rates; a billion parts are months.
@@ -30,7 +30,7 @@ class NodeSettings:
         latencies: stream -> simulated seconds that its messages are under way, with true stamps.
         height, width: of every picture, in pixels.
         best_effort: offer pictures as camera drivers do by default, not reliably.
-        faults: (seconds after the start, stream, fault), what falls ill by itself.
+        faults: (seconds after the start, stream, fault), faults that begin by themselves.
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
     """
 
@@ -75,37 +75,37 @@ class NodeSettings:
         return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
-def depths(body: Body) -> dict[str, str]:
+def depths(driver: Driver) -> dict[str, str]:
     """Stream -> topic of the depth pictures of those cameras that a robot has."""
-    return {depth_stream(c): body.depths[c] for c in body.cameras if c in body.depths}
+    return {depth_stream(c): driver.depths[c] for c in driver.cameras if c in driver.depths}
 
 
-def check_stream(body: Body, stream: str) -> None:
+def check_stream(driver: Driver, stream: str) -> None:
     """Refuse what is no stream of a robot's.
 
     Raises:
         UsageError: there is no such stream; names those that there are.
     """
-    known = [*body.states, *body.cameras, *depths(body)]
+    known = [*driver.states, *driver.cameras, *depths(driver)]
     if stream not in known:
         raise UsageError(f"the robot has no stream {stream!r}; it has {', '.join(known)}")
 
 
-def check_fault(body: Body, stream: str, fault: Fault) -> None:
+def check_fault(driver: Driver, stream: str, fault: Fault) -> None:
     """Refuse a fault that a robot's stream cannot have.
 
     Raises:
         UsageError: there is no such stream (names those that there are), or its messages have
             nothing that could be wrong in this way.
     """
-    if stream in body.latched:
+    if stream in driver.latched:
         raise UsageError(f"{stream} is said once, at the start: it can have no fault")
-    check_stream(body, stream)
-    if fault.mode == "nan" and stream not in body.states:
+    check_stream(driver, stream)
+    if fault.mode == "nan" and stream not in driver.states:
         raise UsageError(f"{stream} is a camera: a picture's numbers cannot be NaN")
-    if fault.mode == "nan" and body.states[stream][1] == ODOMETRY:
+    if fault.mode == "nan" and driver.states[stream][1] == ODOMETRY:
         raise UsageError(f"{stream} is odometry: only joints and bare numbers are made NaN")
-    if fault.mode == "clock" and stream in body.states and body.states[stream][1] == FLOAT64:
+    if fault.mode == "clock" and stream in driver.states and driver.states[stream][1] == FLOAT64:
         raise UsageError(f"{stream} is a bare number: it bears no stamp that could be wrong")
 
 

@@ -70,7 +70,7 @@ def match(
         streams: name -> messages, newest last; none empty.
         max_skew: seconds that the chosen messages may be apart.
         by: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived (for senders
-            whose clocks differ). Where any stream bears no stamps, ``receipt`` is used.
+            whose clocks differ). Where any stream has no stamps, ``receipt`` is used.
         wall: what to add to receipts for this machine's wall clock, which tells whose clock is off.
 
     Raises:
@@ -104,7 +104,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
     take longer than joint states, and are matched by their stamps instead.
 
     Args:
-        streams: those that make up the state; where one bears no stamps, nothing can be said.
+        streams: those that make up the state; where one has no stamps, nothing is checked.
         max_skew, wall: see ``match``.
 
     Raises:

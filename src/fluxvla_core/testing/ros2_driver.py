@@ -37,7 +37,7 @@ class Driver:
             (Image), ``format`` (CompressedImage: ``jpeg`` or ``png``), ``data`` (std_msgs),
             ``follows`` (a sink's topic: the last command there is where its joints are, in the
             order of ``command_names`` if it has none);
-            ``best_effort`` and ``latched`` say how; ``stamped: false`` leaves stamps at zero.
+            ``best_effort`` and ``latched`` set its QoS; ``stamped: false`` leaves stamps at zero.
         sinks: what it listens to: ``topic`` and ``message``. What arrives is in ``heard``.
         name: of its node.
         environment: of the process; this one's by default.
@@ -200,21 +200,21 @@ def _orders() -> queue.Queue[dict[str, Any] | None]:
     return orders
 
 
-def _listen(
-    connection: Connection, sinks: Sequence[Mapping[str, Any]], say: Callable[..., None]
+def _subscribe(
+    connection: Connection, sinks: Sequence[Mapping[str, Any]], write: Callable[..., None]
 ) -> dict[str, Any]:
     commands: dict[str, Any] = {}
 
-    def hear(topic: str) -> Callable[[Any], None]:
+    def receiver(topic: str) -> Callable[[Any], None]:
         def store(message: Any) -> None:
             commands[topic] = message
-            say(topic=topic, at=time.monotonic(), **_plain(message))
+            write(topic=topic, at=time.monotonic(), **_plain(message))
 
         return store
 
     for sink in sinks:
         connection.node.create_subscription(
-            message_class(sink["message"]), sink["topic"], hear(sink["topic"]), 50
+            message_class(sink["message"]), sink["topic"], receiver(sink["topic"]), 50
         )
     return commands
 
@@ -255,15 +255,15 @@ def run(spec: Mapping[str, Any]) -> None:
     connection = Connection(spec.get("name", "driver"))
     lock = threading.Lock()
 
-    def say(**fields: Any) -> None:
+    def write(**fields: Any) -> None:
         with lock:
             print(json.dumps(fields), flush=True)
 
     try:
-        commands = _listen(connection, spec["sinks"], say)
+        commands = _subscribe(connection, spec["sinks"], write)
         publishers = [_Publisher(connection, dict(stream)) for stream in spec["streams"]]
         orders, faults = _orders(), Faults()
-        say(ready=True)
+        write(ready=True)
         _publish(connection, publishers, commands, orders, faults)
     finally:
         connection.close()

@@ -15,7 +15,7 @@ from fluxvla_sim.ros2.settings import NodeSettings
 class Cameras(threading.Thread):
     """Draws each camera at its own time; ``check`` raises what ended the thread.
 
-    Colours and distances of a camera come from one drawing and bear one stamp, as an RGB-D camera's
+    Colours and distances of a camera come from one drawing and have one stamp, as an RGB-D camera's
     do. What nobody listens to is not drawn.
 
     Args:

@@ -32,7 +32,7 @@ class SimCommand:
             default=1.0,
             metavar="F",
             help="simulated seconds in a second, for a machine that is too slow; default 1. The "
-            "operator must be told the same",
+            "operator needs the same real_time_factor",
         )
         parser.add_argument(
             "--camera-hz",
@@ -90,7 +90,7 @@ class SimCommand:
             action="append",
             default=[],
             metavar="STREAM=MODE[:AMOUNT][@S]",
-            help="make a stream ill, S seconds after the start (also at any time, as text on "
+            help="give a stream a fault, S seconds after the start (also at any time, as text on "
             f"/sim/fault; STREAM=well ends it). {_modes()}. Streams of aloha: 'left arm', 'right "
             "arm', base, top, left_wrist, right_wrist; of ur5e: arm, gripper, 'speed scaling', "
             "front, wrist; a camera's distances: top_depth, …",

@@ -106,7 +106,7 @@ def check_fault(driver: Driver, stream: str, fault: Fault) -> None:
     if fault.mode == "nan" and driver.states[stream][1] == ODOMETRY:
         raise UsageError(f"{stream} is odometry: only joints and bare numbers are made NaN")
     if fault.mode == "clock" and stream in driver.states and driver.states[stream][1] == FLOAT64:
-        raise UsageError(f"{stream} is a bare number: it bears no stamp that could be wrong")
+        raise UsageError(f"{stream} is a bare number: it has no stamp that could be wrong")
 
 
 def timed_fault(text: str) -> tuple[float, str, Fault]:

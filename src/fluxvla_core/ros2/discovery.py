@@ -28,12 +28,7 @@ def published(node: Any, own_node: str) -> list[str]:
     ]
 
 
-def missing(
-    wanted: Mapping[str, str],
-    published: Iterable[str],
-    domain: int,
-    environ: Mapping[str, str] = os.environ,
-) -> NotReady:
+def missing(wanted: Mapping[str, str], published: Iterable[str], domain: int) -> NotReady:
     """The error for topics that nobody publishes.
 
     Args:
@@ -56,7 +51,7 @@ def missing(
         step = step or "start the driver, or set the operator's topic names"
     else:
         lines.append(f"nobody publishes anything on ROS domain {domain}")
-        cause, step = _advice_on_domain(domain, environ)
+        cause, step = _advice_on_domain(domain)
     return NotReady("; ".join(lines), cause=cause, next=step)
 
 
@@ -158,9 +153,10 @@ def contested(topics: Mapping[str, Sequence[str]]) -> Rejected:
     )
 
 
-def _advice_on_domain(domain: int, environ: Mapping[str, str]) -> tuple[str, str]:
-    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
-    alone = environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
+def _advice_on_domain(domain: int) -> tuple[str, str]:
+    """Cause and next step where nobody publishes anything."""
+    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    alone = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
     cause = "the robot is on another domain"
     if alone:
         cause += ", or on another machine (discovery is limited to this one)"

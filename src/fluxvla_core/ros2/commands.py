@@ -52,7 +52,7 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
 
 
 class Motion:
-    """What an arm was sent last and how fast it moves by that: what a stop goes on from."""
+    """The last commands of an arm and their times: the motion that a stop has to brake."""
 
     def __init__(self) -> None:
         self._last: Array | None = None
@@ -63,24 +63,23 @@ class Motion:
     def sent(self, command: Array) -> None:
         """A ``(dim,)`` command was sent now."""
         now = time.monotonic()
-        apart = now - self._at
-        known = self._last is not None and apart < _APART_S
-        self._before = (self._last, apart) if known and self._last is not None else None
+        last, apart = self._last, now - self._at
+        self._before = (last, apart) if last is not None and apart < _APART_S else None
         self._last, self._at = command, now
 
     def stop_commands(
         self, embodiment: EmbodimentSpec, last: Array, measured: tuple[Measured, Measured] | None
     ) -> list[Array]:
-        """The commands of a stop, after which what was sent is no motion any more.
+        """The commands of a stop, one at least; the motion before it is forgotten.
 
         Args:
             embodiment: whose limits, and whose rate.
             last: ``(dim,)`` the last command.
-            measured: the arm's newest state and the one before it; None where it does not say.
+            measured: the arm's newest state and the one before it; None if unknown.
         """
         period = 1.0 / embodiment.rate_hz
         before, apart = self._before or (last, period)
-        # Commands come at a beat, however late a single one is.
+        # Commands come at a fixed rate, however late a single one is.
         seconds = max(round(apart / period), 1) * period
         moving = time.monotonic() - self._at <= 2.5 * seconds
         self._last = self._before = None

@@ -326,7 +326,7 @@ class RosOperator(Operator):
         }
         startup = Startup(connection, self._specs, commands, self._publishers)
         startup.wait(self.connect_timeout_s)
-        for warning in [*startup.count(self.rate_window_s), *startup.unheard()]:
+        for warning in [*startup.count(self.rate_window_s), *startup.missing_optional()]:
             log.warning("%s", warning)
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))

@@ -61,7 +61,7 @@ class Startup:
         self._since = time.monotonic()
 
     def wait(self, timeout_s: float) -> None:
-        """Return when every stream has spoken, commands have a listener and no other commander.
+        """Wait until all streams have a message, all commands a subscriber and no other publisher.
 
         Raises:
             NotReady, Rejected: not within ``timeout_s``; names the first thing that is wrong.
@@ -111,8 +111,8 @@ class Startup:
             raise contested
         return warnings
 
-    def unheard(self) -> list[str]:
-        """Warnings about streams that nobody publishes, and that need not be."""
+    def missing_optional(self) -> list[str]:
+        """Warnings about streams that nobody publishes and that are not required."""
         published = discovery.published(self._node, self._connection.name)
         return [
             f"nobody publishes {spec.label}" + (f": {spec.unheard}" if spec.unheard else "")
@@ -121,7 +121,7 @@ class Startup:
         ]
 
     def _check_losses(self) -> None:
-        """Waiting longer does not help a stream of which so much was sent and nothing arrived."""
+        """Refuse streams that lost many messages and received none: waiting does not help them."""
         streams = [self._stream(spec) for spec in self._specs]
         lost = [s for s in streams if s.lost >= _HOPELESS and not s.newest()]
         if lost:
@@ -156,9 +156,9 @@ class Startup:
             return error
         # The publisher's own count: a subscriber that is on the graph may not be matched yet, and
         # until then commands are lost, so that the first one that arrives would be a jump.
-        unheard = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
-        if unheard:
-            return discovery.nobody_listens(unheard)
+        unmatched = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
+        if unmatched:
+            return discovery.nobody_listens(unmatched)
         return self._contested()
 
     def _contested(self) -> FluxError | None:

@@ -68,7 +68,7 @@ class SlowedClock:
 
 
 class InSimulation(RosOperator):
-    """Put before a robot's operator among the bases of a class.
+    """Mixin for the operator of a robot that ``fluxvla sim`` simulates; first of the bases.
 
     Args:
         seed: places the objects in the first episode; each later one adds 1.

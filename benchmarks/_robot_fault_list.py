@@ -28,7 +28,7 @@ from benchmarks._robot_faults import (
     Stage,
 )
 from fluxvla_core.errors import LoadFailed
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
+from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.testing.ros2_driver import Driver
 
 CAM = "/cam/image"

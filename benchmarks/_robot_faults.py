@@ -24,11 +24,17 @@ import numpy.typing as npt
 
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import FluxError, NotReady
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, CommandSpec, StreamSpec, camera_stream
+from fluxvla_core.ros2 import (
+    IMAGE,
+    JOINT_STATE,
+    CommandSpec,
+    Connection,
+    RosOperator,
+    StreamSpec,
+    camera_stream,
+    joints,
+    message_class,
+)
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain

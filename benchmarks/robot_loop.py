@@ -53,8 +53,8 @@ from benchmarks import _results
 from fluxvla_core.build import RunContext
 from fluxvla_core.robot.control import priority
 from fluxvla_core.robot.recording.recorded import open_recording
-from fluxvla_core.ros2.rates import large_frames_profile
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
+from fluxvla_core.ros2 import IMAGE, JOINT_STATE
+from fluxvla_core.ros2.startup import large_frames_profile
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 

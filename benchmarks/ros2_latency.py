@@ -30,8 +30,8 @@ from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC
 
 from benchmarks import _results
-from fluxvla_core.ros2.rates import large_frames_profile
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE
+from fluxvla_core.ros2 import IMAGE, JOINT_STATE
+from fluxvla_core.ros2.startup import large_frames_profile
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 

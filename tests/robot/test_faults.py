@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import Faulted, FluxError, NotReady, RunFailed, SafetyStop
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.ros2 import Stale
 
 
 def spoil(row: int, column: int, value: float):

@@ -20,9 +20,7 @@ class Somebody:
     """A node that says tasks, and hears what becomes of them."""
 
     def __init__(self):
-        from fluxvla_core.ros2 import qos
-        from fluxvla_core.ros2.connection import Connection
-        from fluxvla_core.ros2.require import message_class
+        from fluxvla_core.ros2 import Connection, message_class, qos
 
         self.string = message_class("std_msgs.msg:String")
         self.connection = Connection("somebody")

@@ -18,7 +18,7 @@ from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.control.filters import LowPass, SnapGripper
 from fluxvla_core.robot.control.joiners import METHODS
 from fluxvla_core.robot.control.tracking import HOLD_REACH
-from fluxvla_core.ros2.holding import PATIENCE_S, hold_target, way_to_hold
+from fluxvla_core.ros2.commands import PATIENCE_S, braking_commands, hold_target
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
@@ -112,7 +112,7 @@ class Arm:
         before = last if self.before is None else self.before
         moved = (self.pose - self.was) * PATIENCE_S * ARM.rate_hz
         target = hold_target(ARM, last, self.pose, moved)
-        for command in way_to_hold(ARM, last, before, 1 / ARM.rate_hz, target):
+        for command in braking_commands(ARM, last, before, 1 / ARM.rate_hz, target):
             self._follow(command)
 
     def close(self) -> None:

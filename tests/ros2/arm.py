@@ -7,11 +7,17 @@ import time
 import pytest
 
 from fluxvla_core.errors import Faulted, NotReady, Rejected
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.operator import RosOperator
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import IMAGE, JOINT_STATE, CommandSpec, StreamSpec, camera_stream
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.ros2 import (
+    IMAGE,
+    JOINT_STATE,
+    CommandSpec,
+    RosOperator,
+    Stale,
+    StreamSpec,
+    camera_stream,
+    joints,
+    message_class,
+)
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 NAMES = ("elbow", "wrist", "grip")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import Rejected
-from fluxvla_core.ros2.actions import checked_action
+from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(

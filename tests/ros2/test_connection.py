@@ -12,10 +12,8 @@ import time
 import pytest
 
 from fluxvla_core.errors import ConfigError, Faulted
+from fluxvla_core.ros2 import Connection, joints, message_class
 from fluxvla_core.ros2 import connection as room
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.require import message_class
 
 pytestmark = pytest.mark.usefixtures("ros_domain")
 

@@ -1,16 +1,17 @@
-"""What the graph shows, in words; and rates."""
+"""Errors about the ROS graph."""
 
 from __future__ import annotations
 
-import os
 from types import SimpleNamespace
+
+import pytest
 
 from fluxvla_core.ros2 import discovery
 
 
 def test_missing_topics_are_named_with_those_that_exist_and_a_guess():
     error = discovery.missing(
-        {"left": "/puppet/joint_left"}, ["/puppet/left_joint", "/puppet/joint_lef"], 7, {}
+        {"left": "/puppet/joint_left"}, ["/puppet/left_joint", "/puppet/joint_lef"], 7
     )
 
     assert str(error) == (
@@ -22,34 +23,37 @@ def test_missing_topics_are_named_with_those_that_exist_and_a_guess():
 
 
 def test_without_a_near_name_the_next_step_is_the_driver():
-    error = discovery.missing({"cam": "/camera"}, ["/zzz"], 0, {})
+    error = discovery.missing({"cam": "/camera"}, ["/zzz"], 0)
 
     assert error.next == "start the driver, or set the operator's topic names"
 
 
 def test_a_long_graph_is_cut():
-    error = discovery.missing({"cam": "/camera"}, [f"/t{i:02}" for i in range(30)], 0, {})
+    error = discovery.missing({"cam": "/camera"}, [f"/t{i:02}" for i in range(30)], 0)
 
     assert "/t19, …" in error.what
     assert "/t20" not in error.what
 
 
-def test_an_empty_domain_is_named_with_its_number():
-    error = discovery.missing({"cam": "/camera"}, [], 42, {})
+def test_an_empty_domain_is_named_with_its_number(monkeypatch):
+    for variable in ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(variable, raising=False)
+    error = discovery.missing({"cam": "/camera"}, [], 42)
 
     assert "nobody publishes anything on ROS domain 42" in error.what
     assert error.cause == "the robot is on another domain"
     assert "(now 42)" in error.next
 
 
-def test_discovery_limited_to_this_machine_is_a_likely_cause():
-    for environ in ({"ROS_LOCALHOST_ONLY": "1"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}):
-        error = discovery.missing({"cam": "/camera"}, [], 0, environ)
-        assert "or on another machine (discovery is limited to this one)" in error.cause
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [("ROS_LOCALHOST_ONLY", "1"), ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")],
+)
+def test_discovery_limited_to_this_machine_is_a_likely_cause(monkeypatch, variable, value):
+    monkeypatch.setenv(variable, value)
+    error = discovery.missing({"cam": "/camera"}, [], 0)
 
-
-def test_the_environment_is_that_of_the_process():
-    assert discovery.missing.__defaults__ == (os.environ,)
+    assert "or on another machine (discovery is limited to this one)" in error.cause
 
 
 def test_another_type_is_named():

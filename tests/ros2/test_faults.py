@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.ros2.faults import Fault, Faults, Outbox
+from fluxvla_core.ros2 import Fault, Faults, Outbox
 
 
 def message(number, sec=10, nanosec=500_000_000):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluxvla_core.ros2.holding import Motion, hold_target, way_to_hold
+from fluxvla_core.ros2.commands import Motion, braking_commands, hold_target
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
@@ -72,7 +72,7 @@ def test_a_joint_at_rest_is_led_to_where_it_is_within_the_limits():
     last = np.array([0.5, -0.5, 0.0])
     target = np.array([0.3, -0.5, 0.0])
 
-    way = way_to_hold(SPEC, last, last, 0.02, target)
+    way = braking_commands(SPEC, last, last, 0.02, target)
 
     np.testing.assert_array_equal(way[-1], target)
     assert_kept(np.vstack([last, last, way, way[-1], way[-1]]))
@@ -82,14 +82,14 @@ def test_a_joint_at_rest_is_led_to_where_it_is_within_the_limits():
 def test_an_arm_at_rest_that_follows_is_sent_its_last_command_once():
     last = np.array([0.5, -0.5, 0.0])
 
-    np.testing.assert_array_equal(way_to_hold(SPEC, last, last, 0.02, last), [last])
+    np.testing.assert_array_equal(braking_commands(SPEC, last, last, 0.02, last), [last])
 
 
 def test_an_arm_in_motion_brakes_and_a_blocked_joint_is_not_pushed_on():
     before, last = np.array([0.0, 0.0, 0.5]), np.array([0.01, 0.01, 0.51])
     target = np.array([-0.3, 0.01, 0.51])
 
-    way = way_to_hold(SPEC, last, before, 0.02, target)
+    way = braking_commands(SPEC, last, before, 0.02, target)
 
     assert_kept(np.vstack([before, last, way, way[-1], way[-1]])[:, 1:], SPEC.joints[1:])
     assert way[-1, 1] > 0.1
@@ -102,7 +102,7 @@ def test_commands_that_came_one_by_one_are_no_motion():
     motion = Motion()
     motion.sent(np.zeros(3))
 
-    (way,) = motion.way_to_hold(SPEC, np.zeros(3), None)
+    (way,) = motion.stop_commands(SPEC, np.zeros(3), None)
 
     np.testing.assert_array_equal(way, np.zeros(3))
 
@@ -111,15 +111,15 @@ def test_commands_that_came_one_by_one_are_no_motion():
 def test_a_motion_is_gone_on_from_at_the_speed_that_it_has(monkeypatch, late_s):
     """However late a single command was, those of a beat are a beat apart."""
     now = [100.0]
-    monkeypatch.setattr("fluxvla_core.ros2.holding.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("fluxvla_core.ros2.commands.time.monotonic", lambda: now[0])
     motion, sent = Motion(), [np.full(3, 0.5), np.full(3, 0.51)]
     motion.sent(sent[0])
     now[0] += 0.02 + late_s
     motion.sent(sent[1])
     now[0] += 0.02
 
-    way = motion.way_to_hold(SPEC, sent[1], None)
+    way = motion.stop_commands(SPEC, sent[1], None)
 
     assert_kept(np.vstack([*sent, way, way[-1]]))
     assert len(way) > 20
-    assert len(motion.way_to_hold(SPEC, way[-1], None)) == 1, "it was stopped"
+    assert len(motion.stop_commands(SPEC, way[-1], None)) == 1, "it was stopped"

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import LoadFailed
-from fluxvla_core.ros2 import images
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2 import BadMessage, images
 
 
 def message(pixels, encoding, pad=0, bigendian=0):

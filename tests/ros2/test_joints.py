@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2 import BadMessage, joints
 
 
 def message(names, values):

@@ -18,10 +18,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import FluxError
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import JOINT_STATE
+from fluxvla_core.ros2 import JOINT_STATE, Connection, joints, message_class
 from fluxvla_core.testing.ros2_driver import Driver
 from tests.ros2.adversarial import ARM, CHUNKS, FILTERS, SCRIPTS, SETTINGS, Adversary, arm_of
 

@@ -11,7 +11,7 @@ import pytest
 FAULTS = """
 import resource, sys
 import numpy as np
-from fluxvla_core.ros2.memory import keep_large_blocks
+from fluxvla_core.ros2.connection import keep_large_blocks
 
 if sys.argv[1] == "kept":
     assert keep_large_blocks()

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import Faulted, NotReady, Rejected
-from fluxvla_core.ros2 import joints
-from fluxvla_core.ros2.streams import JOINT_STATE, StreamSpec
-from fluxvla_core.ros2.trouble import BadMessage, Stale
+from fluxvla_core.ros2 import JOINT_STATE, BadMessage, Stale, StreamSpec, joints
 from tests.ros2.arm import (
     COMMANDS,
     NAMES,
@@ -46,8 +44,9 @@ def lasting_robot(lasting_drivers):
 
 def settled(robot):
     """The last test's operator held its arm when it was closed; that too has arrived."""
-    before = None
+    before, until = None, time.monotonic() + 30.0
     while len(robot.heard) != before:
+        assert time.monotonic() < until, f"commands still arrive: {before} by now"
         before = len(robot.heard)
         time.sleep(0.15)
 

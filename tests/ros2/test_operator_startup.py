@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, NotReady
-from fluxvla_core.ros2.streams import JOINT_STATE, StreamSpec, camera_stream
+from fluxvla_core.ros2 import JOINT_STATE, StreamSpec, camera_stream
 from tests.ros2.arm import (
     CAM,
     COMMANDS,
@@ -122,7 +122,8 @@ def test_stop_does_not_wait_for_a_connection_that_does_not_come(operators):
 
     assert time.monotonic() - before < 1.0
     assert connecting.is_alive()
-    connecting.join()
+    connecting.join(10.0)
+    assert not connecting.is_alive()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.errors import NotReady
-from fluxvla_core.ros2.rates import SEGMENT_BYTES, Reception, check, large_frames_profile
+from fluxvla_core.ros2.startup import SEGMENT_BYTES, Reception, check_losses, large_frames_profile
 
 VGA = 640 * 480 * 3
 
@@ -18,22 +18,24 @@ def reception(received, lost=0, size=VGA, reliability="best_effort", expected_hz
 
 
 def test_what_arrives_whole_is_fine():
-    assert check([reception(60), reception(60, expected_hz=30.0), reception(0)]) == []
+    assert check_losses([reception(60), reception(60, expected_hz=30.0), reception(0)]) == []
 
 
 def test_some_loss_is_a_warning():
-    assert check([reception(50, lost=10)]) == ["cam (/c): 50 of 60 messages arrived in 2.0 s"]
+    assert check_losses([reception(50, lost=10)]) == [
+        "cam (/c): 50 of 60 messages arrived in 2.0 s"
+    ]
 
 
 def test_a_lower_rate_than_expected_counts_as_loss():
-    assert check([reception(50, expected_hz=30.0)]) == [
+    assert check_losses([reception(50, expected_hz=30.0)]) == [
         "cam (/c): 50 of 60 messages arrived in 2.0 s"
     ]
 
 
 def test_the_shared_memory_trap_is_named_with_the_file_that_mends_it():
     with pytest.raises(NotReady) as caught:
-        check([reception(60), reception(1, lost=59)])
+        check_losses([reception(60), reception(1, lost=59)])
 
     error = caught.value
     assert error.what == "cam (/c): 1 of 60 messages arrived in 2.0 s"
@@ -43,14 +45,14 @@ def test_the_shared_memory_trap_is_named_with_the_file_that_mends_it():
 
 def test_the_trap_is_named_even_when_nothing_ever_arrived():
     with pytest.raises(NotReady, match="0 of 50") as caught:
-        check([reception(0, lost=50, size=0)])
+        check_losses([reception(0, lost=50, size=0)])
 
     assert "512 KB" in caught.value.cause
 
 
 def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
     with pytest.raises(NotReady) as caught:
-        check([reception(1, lost=59, fast=False)])
+        check_losses([reception(1, lost=59, fast=False)])
 
     error = caught.value
     assert "do not share Fast DDS's memory" in error.cause
@@ -68,7 +70,7 @@ def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
 )
 def test_other_losses_are_not_blamed_on_it(bad):
     with pytest.raises(NotReady) as caught:
-        check([bad])
+        check_losses([bad])
 
     assert "512 KB" not in caught.value.cause
     assert "slower than expected" in caught.value.cause

@@ -9,8 +9,8 @@ import sys
 import pytest
 
 from fluxvla_core.errors import ConfigError, LoadFailed
-from fluxvla_core.ros2 import require
-from fluxvla_core.ros2.require import message_class, require_rclpy, type_name
+from fluxvla_core.ros2 import connection, message_class, require_rclpy
+from fluxvla_core.ros2.messages import type_name
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def no_rclpy(monkeypatch):
                 raise error
             return real(name, *args)
 
-        monkeypatch.setattr(require.importlib, "import_module", find)
+        monkeypatch.setattr(connection.importlib, "import_module", find)
 
     return hide
 
@@ -66,7 +66,7 @@ def test_without_ros_the_message_says_how_to_get_it(no_rclpy):
 )
 def test_the_likely_cause_is_named(no_rclpy, monkeypatch, error, environ, cause):
     no_rclpy(ImportError(error))
-    monkeypatch.setattr(require.sys, "version_info", (3, 99, 0))
+    monkeypatch.setattr(connection.sys, "version_info", (3, 99, 0))
 
     with pytest.raises(LoadFailed) as caught:
         require_rclpy(environ)
@@ -75,7 +75,7 @@ def test_the_likely_cause_is_named(no_rclpy, monkeypatch, error, environ, cause)
 
 
 def test_a_middleware_that_is_not_there_is_refused_before_it_ends_the_process(monkeypatch):
-    monkeypatch.setattr(require.importlib, "import_module", lambda name: sys)
+    monkeypatch.setattr(connection.importlib, "import_module", lambda name: sys)
 
     with pytest.raises(LoadFailed, match="RMW_IMPLEMENTATION is 'rmw_nothing_cpp'") as caught:
         require_rclpy({"RMW_IMPLEMENTATION": "rmw_nothing_cpp"})

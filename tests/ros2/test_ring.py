@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from fluxvla_core.ros2.ring import Received, Ring, stamp_of
+from fluxvla_core.ros2.messages import stamp_of
+from fluxvla_core.ros2.streams import Received, Ring
 
 
 def fed(stamps, depth=8, period=0.1):

@@ -7,10 +7,8 @@ from importlib import metadata, util
 
 import pytest
 
-from fluxvla_core.ros2 import rates
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.streams import COMPRESSED_IMAGE, IMAGE, camera_stream
+from fluxvla_core.ros2 import COMPRESSED_IMAGE, IMAGE, Connection, camera_stream, message_class
+from fluxvla_core.ros2.startup import Reception, is_trap, large_frames_profile
 from fluxvla_core.spec.embodiment import Camera
 
 CAMERA = {"topic": "/cam", "message": IMAGE, "hz": 30, "height": 480, "width": 640}
@@ -49,14 +47,14 @@ def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(pictures, dri
 
 
 def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
-    """If this fails because all arrive, Fast DDS was mended and ``rates`` can go."""
+    """If this fails because all arrive, Fast DDS was mended and ``Reception`` can go."""
     drivers([{**CAMERA, "height": 1536, "width": 2048, "best_effort": True}])
     wait_for(lambda: pictures.lost > 0)
     received, lost = count(pictures, 1.0)
-    reception = rates.Reception("cam", pictures.reliability, 1.0, received, lost, 0)
+    reception = Reception("cam", pictures.reliability, 1.0, received, lost, 0)
 
     assert pictures.reliability == "best_effort"
-    assert rates.is_trap(reception)
+    assert is_trap(reception)
 
 
 @pytest.mark.skipif(
@@ -64,7 +62,7 @@ def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
     reason="Jazzy overrides a profile's transports while discovery is limited to this machine",
 )
 def test_the_profile_in_the_publisher_springs_the_trap(pictures, drivers, monkeypatch):
-    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", rates.large_frames_profile())
+    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", large_frames_profile())
     drivers([{**CAMERA, "best_effort": True}])
     wait_for(pictures.newest)
     received, lost = count(pictures, 1.0)

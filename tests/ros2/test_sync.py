@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2 import Stale
+from fluxvla_core.ros2.streams import Received
 from fluxvla_core.ros2.sync import check_age, check_together, match, silent
-from fluxvla_core.ros2.trouble import Stale
 
 
 def stream(*stamps, latency=0.0, clock=0.0):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 
 import pytest
+
+from fluxvla_core.testing import OperatorConformance
 
 GOOD = """
 import time
@@ -152,3 +155,15 @@ def test_a_right_operator_passes_every_check(outcomes, specimen):
 def test_a_wrong_operator_fails_its_own_check(outcomes, check):
     number = list(BROKEN).index(check)
     assert outcomes[f"specimen_{number}.py::{check}"] == "FAILED"
+
+
+def test_commands_that_never_end_are_reported():
+    class Endless(OperatorConformance):
+        ready_within_s = 0.5
+        count = itertools.count()
+
+        def commands_heard(self, operator):
+            return next(self.count)
+
+    with pytest.raises(AssertionError, match=r"commands still arrive after 0\.5 s"):
+        Endless().settled(None)

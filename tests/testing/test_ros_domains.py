@@ -42,7 +42,7 @@ def test_other_processes_count_until_they_end_however_they_do(tmp_path, monkeypa
     with pytest.raises(RuntimeError, match="all 1 ROS domains are taken; their locks are in"):
         claimed_domain(tmp_path).__enter__()
     other.kill()
-    other.communicate()
+    other.communicate(timeout=10.0)
 
     with claimed_domain(tmp_path) as ours:
         assert ours == theirs

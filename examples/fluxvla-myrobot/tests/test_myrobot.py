@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import subprocess
 import sys
 import time
@@ -20,6 +22,9 @@ pytest.importorskip("fluxvla_myrobot", reason="pip install ./examples/fluxvla-my
 
 __all__ = ["ros_domain"]
 
+END_S = 30.0
+"""How long a simulated robot may take to end after SIGTERM."""
+
 
 class OnASimulatedRobot(OperatorConformance):
     """With the robot in a process of its own, and somebody who counts its commands."""
@@ -30,14 +35,16 @@ class OnASimulatedRobot(OperatorConformance):
     @pytest.fixture(scope="class", autouse=True)
     @classmethod
     def simulated(cls, ros_domain):
-        words = [sys.executable, "-m", "fluxvla_myrobot.sim", cls.robot]
+        words = [sys.executable, "-X", "faulthandler", "-m", "fluxvla_myrobot.sim", cls.robot]
         ears = Connection("ears")
-        with subprocess.Popen(words, stdout=subprocess.DEVNULL) as process:
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+        try:
             topic = cls.arguments["joint_cmd_topic"]
             cls.heard = ears.subscribe("commands", topic, message_class(JOINT_STATE), 1)
             yield
-            process.terminate()
-        ears.close()
+        finally:
+            ears.close()
+            end(process)
 
     @pytest.fixture
     def connected(self, operator):
@@ -48,12 +55,26 @@ class OnASimulatedRobot(OperatorConformance):
         (sender,) = (p for p in operator._connection.node.publishers if p.topic_name == topic)
         deadline = time.monotonic() + self.ready_within_s
         while sender.get_subscription_count() < 2:
-            assert time.monotonic() < deadline, "nobody listens"
+            assert time.monotonic() < deadline, f"not both listeners found {topic}"
             time.sleep(0.01)
         return operator
 
     def commands_heard(self, operator):
         return self.heard.ring.received
+
+
+def end(process):
+    """End the simulated robot; one that hangs shows its threads' stacks, and the test fails."""
+    process.terminate()
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # faulthandler writes the stacks to standard error
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(5.0)
+        process.kill()
+        process.wait(5.0)
+        pytest.fail(f"the simulated robot still ran {END_S:g} s after SIGTERM; its stacks: stderr")
 
 
 class TestMyRobotOperator(OnASimulatedRobot):

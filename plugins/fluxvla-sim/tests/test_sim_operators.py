@@ -266,7 +266,7 @@ def test_pictures_can_be_taken_from_any_thread(aloha):
     seen = []
     thread = threading.Thread(target=lambda: seen.append(aloha.get_frame().images["top"]))
     thread.start()
-    thread.join()
+    thread.join(30.0)
     np.testing.assert_array_equal(seen[0], first)
     np.testing.assert_array_equal(aloha.get_frame().images["top"], first)
 

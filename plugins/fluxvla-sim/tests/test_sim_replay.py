@@ -136,7 +136,7 @@ def record_in_real_time(root: Path, robot: str, joining: str) -> Path:
         )  # fmt: skip
     finally:
         simulator.kill()
-        simulator.wait()
+        simulator.wait(30.0)
     return root / "001-1"
 
 

@@ -60,7 +60,7 @@ def simulate(ros_domain):
     yield start
     for process in started:
         process.kill()
-        process.communicate()
+        process.communicate(timeout=30.0)
 
 
 @pytest.fixture

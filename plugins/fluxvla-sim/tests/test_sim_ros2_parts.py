@@ -1,4 +1,4 @@
-"""A simulated robot over ROS 2 without the network: judge, clock, bodies, command line."""
+"""A simulated robot over ROS 2 without the network: judge, clock, drivers, command line."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ from fluxvla_sim.aloha.arms import HOME
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
 from fluxvla_sim.aloha.world import CUBE
-from fluxvla_sim.ros2.base import Base
-from fluxvla_sim.ros2.bodies import AlohaBody, URBody, command_values
-from fluxvla_sim.ros2.clock import SlowedClock
-from fluxvla_sim.ros2.judge import Judge
-from fluxvla_sim.ros2.node import NodeSettings
-from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
-from fluxvla_sim.ros2.streams import stream_latency, timed_fault
+from fluxvla_sim.ros2.drivers import AlohaDriver, MobileBase, URDriver, command_values
+from fluxvla_sim.ros2.node import Judge
+from fluxvla_sim.ros2.operators import AlohaSimROSOperator, SlowedClock, URSimROSOperator
+from fluxvla_sim.ros2.settings import NodeSettings, stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import ConfigError, NotReady, UsageError
@@ -88,22 +85,22 @@ class TestJudge:
         scene.reset(7)
         for _ in range(299):
             judge.after(scene)
-        told = judge.tell()
+        told = judge.facts()
         assert (told["seed"], told["resets"], told["steps"]) == (7, 1, 299)
         assert not told["tasks"]["lift_hold"]["done"]
         for _ in range(5):
             judge.after(scene)
-        told = judge.tell()
+        told = judge.facts()
         assert told["steps"] == 300
         assert [t["done"] for t in told["tasks"].values()] == [True, True]
         assert [t["success"] for t in told["tasks"].values()] == [False, False]
         for command in Expert(scene.model).plan("lift_hold", sample_cube(8)):
-            if judge.tell()["seed"] != 8:
+            if judge.facts()["seed"] != 8:
                 scene.reset(8)
                 judge.reset(8)
             scene.step(command)
             judge.after(scene)
-        told = judge.tell()["tasks"]
+        told = judge.facts()["tasks"]
         assert told["lift_hold"] == {
             "instruction": "pick up the cube with the right arm and hold it",
             "success": True,
@@ -111,7 +108,7 @@ class TestJudge:
         }
         assert not told["transfer_cube"]["success"]
         judge.reset(9)
-        assert (judge.tell()["resets"], judge.tell()["steps"]) == (3, 0)
+        assert (judge.facts()["resets"], judge.facts()["steps"]) == (3, 0)
 
 
 def test_a_slowed_clock_is_slower():
@@ -133,72 +130,74 @@ def trajectory(controller, goal, seconds=0, nanosec=0):
 
 class TestBodies:
     def test_aloha_commands_are_taken_by_name_with_raw_grippers(self):
-        body = AlohaBody(COBOT_MAGIC)
-        body.reset(HOME)
+        driver = AlohaDriver(COBOT_MAGIC)
+        driver.reset(HOME)
         names = list(reversed(COBOT_MAGIC.joints))
         raw = COBOT_MAGIC.gripper_open
         left = SimpleNamespace(name=names, position=[raw, 6, 5, 4, 3, 2, 1])
-        body.hear("/master/joint_left", left, 0.0)
+        driver.receive("/master/joint_left", left, 0.0)
 
-        np.testing.assert_allclose(body.target(0.0), [1, 2, 3, 4, 5, 6, 1.0, *HOME[7:]])
+        np.testing.assert_allclose(driver.target(0.0), [1, 2, 3, 4, 5, 6, 1.0, *HOME[7:]])
 
     def test_interbotix_has_grippers_of_its_own(self):
-        body = AlohaBody(INTERBOTIX)
-        body.reset(HOME)
+        driver = AlohaDriver(INTERBOTIX)
+        driver.reset(HOME)
         arm, gripper = (
             SimpleNamespace(cmd=[1.0] * 6),
             SimpleNamespace(cmd=INTERBOTIX.gripper_closed),
         )
-        body.hear("/follower_right/commands/joint_group", arm, 0.0)
-        body.hear("/follower_right/commands/joint_single", gripper, 0.0)
+        driver.receive("/follower_right/commands/joint_group", arm, 0.0)
+        driver.receive("/follower_right/commands/joint_single", gripper, 0.0)
 
-        np.testing.assert_allclose(body.target(0.0), [*HOME[:7], *[1.0] * 6, 0.0], atol=1e-9)
+        np.testing.assert_allclose(driver.target(0.0), [*HOME[:7], *[1.0] * 6, 0.0], atol=1e-9)
 
     def test_trajectories_take_their_time(self):
-        body = URBody("scaled_joint_trajectory_controller")
-        body.reset(np.zeros(7))
-        body.hear(*trajectory("scaled_joint_trajectory_controller", 1.0, nanosec=5 * 10**8), 10.0)
+        driver = URDriver("scaled_joint_trajectory_controller")
+        driver.reset(np.zeros(7))
+        driver.receive(
+            *trajectory("scaled_joint_trajectory_controller", 1.0, nanosec=5 * 10**8), 10.0
+        )
 
-        assert [body.target(t)[0] for t in (10.0, 10.25, 10.5, 11.0)] == [0.0, 0.5, 1.0, 1.0]
+        assert [driver.target(t)[0] for t in (10.0, 10.25, 10.5, 11.0)] == [0.0, 0.5, 1.0, 1.0]
 
     def test_streamed_positions_that_are_too_far_are_ignored(self):
-        body, topic = URBody(), "/forward_position_controller/commands"
-        body.reset(np.zeros(7))
+        driver, topic = URDriver(), "/forward_position_controller/commands"
+        driver.reset(np.zeros(7))
         for position in (0.04, 0.08):
-            body.hear(topic, SimpleNamespace(data=[position] * 6), 0.0)
+            driver.receive(topic, SimpleNamespace(data=[position] * 6), 0.0)
         with pytest.raises(BadMessage, match=r"more than 0\.04 rad from the last one and from the"):
-            body.hear(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
-        assert body.target(0.0)[0] == 0.08
+            driver.receive(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
+        assert driver.target(0.0)[0] == 0.08
 
-        body.say(np.full(7, 0.1), 0.0)
-        body.hear(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
-        assert body.target(0.0)[0] == 0.13
+        driver.messages(np.full(7, 0.1), 0.0)
+        driver.receive(topic, SimpleNamespace(data=[0.13] * 6), 0.0)
+        assert driver.target(0.0)[0] == 0.13
 
     def test_a_speed_slider_slows_down_what_is_left_of_a_trajectory(self):
-        body = URBody("scaled_joint_trajectory_controller", speed_scaling=50.0)
-        body.reset(np.zeros(7))
-        body.hear(*trajectory("scaled_joint_trajectory_controller", 1.0, seconds=1), 10.0)
+        driver = URDriver("scaled_joint_trajectory_controller", speed_scaling=50.0)
+        driver.reset(np.zeros(7))
+        driver.receive(*trajectory("scaled_joint_trajectory_controller", 1.0, seconds=1), 10.0)
 
-        assert [body.target(t)[0] for t in (10.0, 11.0)] == [0.0, 0.5]
-        body.hear("/sim/speed_scaling", SimpleNamespace(data=0.0), 11.0)
-        assert body.target(20.0)[0] == 0.5
-        body.hear("/sim/speed_scaling", SimpleNamespace(data=100.0), 20.0)
-        assert [body.target(t)[0] for t in (20.0, 20.25, 20.5, 30.0)] == [0.5, 0.75, 1.0, 1.0]
+        assert [driver.target(t)[0] for t in (10.0, 11.0)] == [0.0, 0.5]
+        driver.receive("/sim/speed_scaling", SimpleNamespace(data=0.0), 11.0)
+        assert driver.target(20.0)[0] == 0.5
+        driver.receive("/sim/speed_scaling", SimpleNamespace(data=100.0), 20.0)
+        assert [driver.target(t)[0] for t in (20.0, 20.25, 20.5, 30.0)] == [0.5, 0.75, 1.0, 1.0]
 
     def test_a_speed_slider_means_nothing_to_other_controllers(self):
-        body = URBody("joint_trajectory_controller", speed_scaling=10.0)
-        body.reset(np.zeros(7))
-        body.hear(*trajectory("joint_trajectory_controller", 1.0, seconds=1), 10.0)
+        driver = URDriver("joint_trajectory_controller", speed_scaling=10.0)
+        driver.reset(np.zeros(7))
+        driver.receive(*trajectory("joint_trajectory_controller", 1.0, seconds=1), 10.0)
 
-        assert body.target(10.5)[0] == 0.5
+        assert driver.target(10.5)[0] == 0.5
 
     @pytest.mark.parametrize("percent", [-1.0, 101.0, float("nan")])
     def test_a_speed_slider_has_ends(self, percent):
-        body = URBody()
+        driver = URDriver()
         with pytest.raises(BadMessage, match="/sim/speed_scaling: a speed slider goes from 0 to"):
-            body.hear("/sim/speed_scaling", SimpleNamespace(data=percent), 0.0)
+            driver.receive("/sim/speed_scaling", SimpleNamespace(data=percent), 0.0)
         with pytest.raises(ConfigError, match="a speed slider goes from 0 to 100 %"):
-            URBody(speed_scaling=percent)
+            URDriver(speed_scaling=percent)
 
     @pytest.mark.parametrize(
         ("message", "what"),
@@ -216,7 +215,7 @@ class TestBodies:
 
 @pytest.fixture
 def base(ros_domain):
-    return Base()
+    return MobileBase()
 
 
 def speed(forward, turning):
@@ -227,7 +226,7 @@ class TestBase:
     """Driven at times that the test makes up."""
 
     def told(self, base, now):
-        message = base.say(now)
+        message = base.odometry(now)
         pose, twist = message.pose.pose, message.twist.twist
         heading = 2 * np.arctan2(pose.orientation.z, pose.orientation.w)
         where = pose.position.x, pose.position.y, heading
@@ -235,34 +234,34 @@ class TestBase:
 
     def test_it_drives_while_it_is_asked_to(self, base):
         for now in np.arange(5.0, 7.0, 0.1):
-            base.hear(speed(0.3, 0.0), "/cmd_vel", now)
+            base.drive(speed(0.3, 0.0), "/cmd_vel", now)
         assert self.told(base, 7.0) == ([0.6, 0.0, 0.0], (0.3, 0.0))
-        base.hear(speed(0.0, 0.0), "/cmd_vel", 7.0)
+        base.drive(speed(0.0, 0.0), "/cmd_vel", 7.0)
         assert self.told(base, 9.0) == ([0.6, 0.0, 0.0], (0.0, 0.0))
 
     def test_a_speed_that_is_not_asked_for_again_ends(self, base):
-        base.hear(speed(0.2, 0.0), "/cmd_vel", 5.0)
+        base.drive(speed(0.2, 0.0), "/cmd_vel", 5.0)
         assert self.told(base, 5.4) == ([0.08, 0.0, 0.0], (0.2, 0.0))
         assert self.told(base, 60.0) == ([0.1, 0.0, 0.0], (0.0, 0.0))
 
     def test_it_turns_on_a_circle(self, base):
         for now in np.arange(0.0, np.pi, 0.01):
-            base.hear(speed(1.0, 1.0), "/cmd_vel", now)
+            base.drive(speed(1.0, 1.0), "/cmd_vel", now)
         (x, y, heading), _ = self.told(base, np.pi)
         assert (x, y) == pytest.approx((0.0, 2.0), abs=1e-3)
         assert abs(heading) == pytest.approx(np.pi, abs=1e-3)
 
     def test_an_episode_begins_where_odometry_does(self, base):
-        body = AlohaBody(COBOT_MAGIC)
-        body.hear("/cmd_vel", speed(0.3, 0.1), 1.0)
-        assert body.say(HOME, 1.4)["base"].twist.twist.linear.x == 0.3
-        body.reset(HOME)
-        assert self.told(body._base, 1.5) == ([0.0, 0.0, 0.0], (0.0, 0.0))
+        driver = AlohaDriver(COBOT_MAGIC)
+        driver.receive("/cmd_vel", speed(0.3, 0.1), 1.0)
+        assert driver.messages(HOME, 1.4)["base"].twist.twist.linear.x == 0.3
+        driver.reset(HOME)
+        assert self.told(driver._base, 1.5) == ([0.0, 0.0, 0.0], (0.0, 0.0))
 
     @pytest.mark.parametrize("value", [float("nan"), float("inf")])
     def test_a_speed_that_is_no_number_is_not_taken(self, base, value):
         with pytest.raises(BadMessage, match="/cmd_vel: a speed is not finite"):
-            base.hear(speed(0.0, value), "/cmd_vel", 0.0)
+            base.drive(speed(0.0, value), "/cmd_vel", 0.0)
         assert self.told(base, 0.1)[1] == (0.0, 0.0)
 
 

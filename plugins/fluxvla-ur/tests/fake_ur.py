@@ -77,7 +77,7 @@ class FakeUR:
     def kill(self) -> None:
         """End it with SIGKILL."""
         self._process.kill()
-        self._process.wait()
+        self._process.wait(10.0)
 
     def __enter__(self) -> FakeUR:
         return self

@@ -288,7 +288,7 @@ class TestFaults:
         wait_for(lambda: len(robot.ask()["servo"]) > 5)
         assert robot.ask()["running"]
         other.kill()
-        other.communicate()
+        other.communicate(timeout=10.0)
         wait_for(lambda: not robot.ask()["running"])
 
         assert robot.ask()["ended"] == "watchdog"

@@ -109,6 +109,14 @@ class Operator(Contract):
         """
         return 1.0
 
+    @attribute
+    def domain_id(self) -> int | None:
+        """The ROS domain that the robot is on, and that tasks on a topic are taken from.
+
+        None is ``ROS_DOMAIN_ID``; a robot without ROS has no other.
+        """
+        return None
+
     def get_state(self) -> npt.NDArray[np.float64] | None:
         """The newest ``(state_dim,)`` state alone, at no cost; None where that cannot be had.
 

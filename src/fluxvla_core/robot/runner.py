@@ -26,7 +26,7 @@ from fluxvla_core.build import (
 from fluxvla_core.contracts.check import check_policy
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.contracts.robot import ActionFilter, Operator
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
@@ -387,7 +387,7 @@ class BaseInferenceRunner(Runner):
             reporter.warn(f"{hung} still hangs; its thread ends with the program")
 
     def _task_source(self) -> TaskSource:
-        domain_id = getattr(self.ros_operator, "domain_id", None)
+        domain_id = Operator.adapt(self.ros_operator).domain_id
         return task_source(
             self.context, self.task_descriptions, self.task_topic, domain_id, self.free_tasks
         )

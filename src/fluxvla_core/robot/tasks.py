@@ -290,9 +290,7 @@ class TopicTasks(TaskSource):
         Raises:
             LoadFailed: there is no ROS 2 here.
         """
-        from fluxvla_core.ros2 import qos
-        from fluxvla_core.ros2.connection import Connection
-        from fluxvla_core.ros2.require import message_class
+        from fluxvla_core.ros2 import Connection, message_class, qos
 
         self._connection = Connection("fluxvla_tasks", self._domain_id)
         self._string = message_class("std_msgs.msg:String")

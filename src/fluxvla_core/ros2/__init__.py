@@ -15,64 +15,67 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2 import images as images
     from fluxvla_core.ros2 import joints as joints
     from fluxvla_core.ros2 import qos as qos
-    from fluxvla_core.ros2.actions import checked_action as checked_action
+    from fluxvla_core.ros2.commands import checked_action as checked_action
     from fluxvla_core.ros2.connection import Connection as Connection
+    from fluxvla_core.ros2.connection import require_rclpy as require_rclpy
     from fluxvla_core.ros2.faults import AMOUNTS as AMOUNTS
     from fluxvla_core.ros2.faults import MODES as MODES
     from fluxvla_core.ros2.faults import Fault as Fault
     from fluxvla_core.ros2.faults import Faults as Faults
     from fluxvla_core.ros2.faults import Outbox as Outbox
     from fluxvla_core.ros2.frames import RobotFrame as RobotFrame
+    from fluxvla_core.ros2.messages import COMPRESSED_IMAGE as COMPRESSED_IMAGE
+    from fluxvla_core.ros2.messages import FLOAT64 as FLOAT64
+    from fluxvla_core.ros2.messages import FLOAT64_ARRAY as FLOAT64_ARRAY
+    from fluxvla_core.ros2.messages import IMAGE as IMAGE
+    from fluxvla_core.ros2.messages import JOINT_STATE as JOINT_STATE
+    from fluxvla_core.ros2.messages import ODOMETRY as ODOMETRY
+    from fluxvla_core.ros2.messages import TWIST as TWIST
+    from fluxvla_core.ros2.messages import BadMessage as BadMessage
+    from fluxvla_core.ros2.messages import message_class as message_class
     from fluxvla_core.ros2.operator import RosOperator as RosOperator
-    from fluxvla_core.ros2.require import message_class as message_class
-    from fluxvla_core.ros2.require import require_rclpy as require_rclpy
     from fluxvla_core.ros2.streams import CAMERA as CAMERA
-    from fluxvla_core.ros2.streams import COMPRESSED_IMAGE as COMPRESSED_IMAGE
     from fluxvla_core.ros2.streams import DEPTH as DEPTH
-    from fluxvla_core.ros2.streams import FLOAT64 as FLOAT64
-    from fluxvla_core.ros2.streams import FLOAT64_ARRAY as FLOAT64_ARRAY
-    from fluxvla_core.ros2.streams import IMAGE as IMAGE
-    from fluxvla_core.ros2.streams import JOINT_STATE as JOINT_STATE
-    from fluxvla_core.ros2.streams import ODOMETRY as ODOMETRY
     from fluxvla_core.ros2.streams import SIDE as SIDE
     from fluxvla_core.ros2.streams import STATE as STATE
-    from fluxvla_core.ros2.streams import TWIST as TWIST
     from fluxvla_core.ros2.streams import CommandSpec as CommandSpec
     from fluxvla_core.ros2.streams import StreamSpec as StreamSpec
     from fluxvla_core.ros2.streams import camera_stream as camera_stream
     from fluxvla_core.ros2.streams import depth_stream as depth_stream
-    from fluxvla_core.ros2.trouble import BadMessage as BadMessage
-    from fluxvla_core.ros2.trouble import Stale as Stale
+    from fluxvla_core.ros2.sync import Stale as Stale
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
     {
-        "fluxvla_core.ros2.actions": ["checked_action"],
-        "fluxvla_core.ros2.connection": ["Connection"],
+        "fluxvla_core.ros2.commands": ["checked_action"],
+        "fluxvla_core.ros2.connection": ["Connection", "require_rclpy"],
         "fluxvla_core.ros2.faults": ["AMOUNTS", "Fault", "Faults", "MODES", "Outbox"],
         "fluxvla_core.ros2.frames": ["RobotFrame"],
         "fluxvla_core.ros2.images": ["images"],
         "fluxvla_core.ros2.joints": ["joints"],
-        "fluxvla_core.ros2.operator": ["RosOperator"],
-        "fluxvla_core.ros2.qos": ["qos"],
-        "fluxvla_core.ros2.require": ["message_class", "require_rclpy"],
-        "fluxvla_core.ros2.streams": [
-            "CAMERA",
+        "fluxvla_core.ros2.messages": [
+            "BadMessage",
             "COMPRESSED_IMAGE",
-            "CommandSpec",
-            "DEPTH",
             "FLOAT64",
             "FLOAT64_ARRAY",
             "IMAGE",
             "JOINT_STATE",
             "ODOMETRY",
+            "TWIST",
+            "message_class",
+        ],
+        "fluxvla_core.ros2.operator": ["RosOperator"],
+        "fluxvla_core.ros2.qos": ["qos"],
+        "fluxvla_core.ros2.streams": [
+            "CAMERA",
+            "CommandSpec",
+            "DEPTH",
             "SIDE",
             "STATE",
             "StreamSpec",
-            "TWIST",
             "camera_stream",
             "depth_stream",
         ],
-        "fluxvla_core.ros2.trouble": ["BadMessage", "Stale"],
+        "fluxvla_core.ros2.sync": ["Stale"],
     },
 )

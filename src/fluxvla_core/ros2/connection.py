@@ -1,4 +1,4 @@
-"""One node in one context, spun by one thread, with the shutdown order that works.
+"""One ROS 2 node in one context, spun by one thread, with the shutdown order that works.
 
 A ``MultiThreadedExecutor`` loses messages and burns a core in the rclpy releases that are in use;
 one thread that only stores messages keeps up with 240 VGA pictures a second. The context is our
@@ -9,24 +9,61 @@ first, and then a last "hold" could not be published any more.
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import importlib
 import os
 import re
 import secrets
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Any
 
-from fluxvla_core.errors import ConfigError, Faulted
+from fluxvla_core.errors import ConfigError, Faulted, LoadFailed
 from fluxvla_core.robot.control import priority
 from fluxvla_core.ros2 import qos
-from fluxvla_core.ros2.memory import keep_large_blocks
-from fluxvla_core.ros2.require import require_rclpy
-from fluxvla_core.ros2.stream import Stream
+from fluxvla_core.ros2.streams import Stream
 
 WATCH_S = 0.25
 """How often the graph is looked at: publishers that come, go or change what they offer."""
 _JOIN_S = 5.0
 _MAX_DOMAIN = 232
+# Python that each distribution's packages are built for (REP 2000).
+_PYTHONS: Mapping[str, str] = {
+    "humble": "3.10",
+    "iron": "3.10",
+    "jazzy": "3.12",
+    "kilted": "3.12",
+}
+# mallopt(3), <malloc.h>.
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
+# The largest that glibc takes (DEFAULT_MMAP_THRESHOLD_MAX on 64 bits).
+_LARGEST = 32 << 20
+_KEPT = 256 << 20
+
+
+def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
+    """Import ``rclpy``; returns the module.
+
+    Raises:
+        LoadFailed: it cannot be imported, or the middleware that the environment asks for cannot
+            be loaded (``rclpy.init`` would end the process then); says how to get them.
+    """
+    try:
+        rclpy = importlib.import_module("rclpy")
+    except ImportError as error:
+        raise LoadFailed(
+            f"ROS 2 cannot be used: importing rclpy fails ({error})",
+            cause=_cause(error, environ),
+            next="on a robot, source /opt/ros/<distribution>/setup.bash and use the Python that "
+            "ROS was built for; for development (Linux, x86-64), "
+            "pip install 'fluxvla-core[ros2]'",
+        ) from error
+    _require_middleware(environ)
+    return rclpy
 
 
 class Connection:
@@ -98,9 +135,9 @@ class Connection:
         depth: int = 1,
         latched: bool = False,
     ) -> Any:
-        """A publisher; as it stands fit for commands: RELIABLE matches every subscription, and a
-        command that was overtaken by a newer one must never be sent again. What is ``latched`` is
-        also told to those who ask for it when they come later."""
+        """A publisher, by default for commands: RELIABLE matches every subscription, and with a
+        depth of 1 a command that was overtaken by a newer one is never sent again. ``latched``
+        (transient local) also sends the last messages to subscribers that come later."""
         return self.node.create_publisher(message, topic, qos.profile(reliability, depth, latched))
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
@@ -115,7 +152,7 @@ class Connection:
         self._watchers.append(callback)
 
     def check(self) -> None:
-        """Nothing, while the connection is open and its thread runs.
+        """Return while the connection is open and its thread runs.
 
         Raises:
             Faulted: it was closed, or a callback ended its thread; carries that error.
@@ -142,7 +179,7 @@ class Connection:
             callback()
 
     def _spin(self) -> None:
-        # Whoever sends commands waits for the interpreter while this thread has it.
+        # The thread that sends commands waits for the interpreter lock while this one has it.
         priority.just_below_real_time()
         main = threading.main_thread()
         try:
@@ -160,10 +197,53 @@ class Connection:
 
 
 def _check_domain(domain_id: int | None) -> None:
-    said: object = domain_id if domain_id is not None else os.environ.get("ROS_DOMAIN_ID") or 0
+    given: object = domain_id if domain_id is not None else os.environ.get("ROS_DOMAIN_ID") or 0
     try:
-        number = int(str(said))
+        number = int(str(given))
     except ValueError:
         number = -1
     if not 0 <= number <= _MAX_DOMAIN:
-        raise ConfigError(f"a ROS domain is a number from 0 to {_MAX_DOMAIN}, got {said!r}")
+        raise ConfigError(f"a ROS domain is a number from 0 to {_MAX_DOMAIN}, got {given!r}")
+
+
+@functools.cache
+def keep_large_blocks() -> bool:
+    """Let the memory of one picture serve the next, in this process; whether the C library can.
+
+    A picture is larger than what malloc keeps: each message, and each copy of one, would be asked
+    of the kernel and given back to it, page by page, which takes longer than copying the picture
+    and stops the process's other threads meanwhile. glibc keeps larger blocks if told to
+    (mallopt(3)); other C libraries are left as they are. Memory stays bounded by what was in use at
+    one time.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):
+        return False
+    return bool(mallopt(_M_MMAP_THRESHOLD, _LARGEST) and mallopt(_M_TRIM_THRESHOLD, _KEPT))
+
+
+def _cause(error: ImportError, environ: Mapping[str, str]) -> str:
+    if "cannot open shared object" in str(error):
+        return "a library of ROS 2 is missing (with wheels: ros-kilted-rmw-fastrtps-cpp)"
+    distribution = environ.get("ROS_DISTRO", "")
+    built_for = _PYTHONS.get(distribution)
+    here = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    if built_for and built_for != here:
+        return f"ROS 2 {distribution} is built for Python {built_for}, this is Python {here}"
+    if distribution:
+        return f"ROS 2 {distribution} is sourced, but this Python does not see its packages"
+    return "no ROS 2 is installed for this Python, or its setup file was not sourced"
+
+
+def _require_middleware(environ: Mapping[str, str]) -> None:
+    name = environ.get("RMW_IMPLEMENTATION")
+    if not name:
+        return
+    try:
+        ctypes.CDLL(f"lib{name}.so")
+    except OSError as error:
+        raise LoadFailed(
+            f"RMW_IMPLEMENTATION is {name!r}, and that middleware cannot be loaded ({error})",
+            next="unset RMW_IMPLEMENTATION, or install the middleware that it names",
+        ) from error

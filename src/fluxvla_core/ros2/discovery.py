@@ -1,4 +1,4 @@
-"""What the ROS graph shows, in words: missing topics, wrong types, other commanders."""
+"""Queries of the ROS graph, and the errors for what is missing, silent or wrong on it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from fluxvla_core.errors import NotReady, Rejected
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.sync import Stale
 
-# Every node has these; they say nothing about which robot is there.
-_PLUMBING = frozenset({"/rosout", "/parameter_events"})
+# Every node has these; they do not show which robot is there.
+_OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _SHOWN = 20
 # How long DDS keeps a participant that was killed (Fast DDS's lease).
 _LEASE_S = 20
@@ -21,17 +23,12 @@ def published(node: Any, own_node: str) -> list[str]:
     return [
         topic
         for topic, _ in node.get_topic_names_and_types()
-        if topic not in _PLUMBING
+        if topic not in _OF_EVERY_NODE
         and other_publishers(node.get_publishers_info_by_topic(topic), own_node)
     ]
 
 
-def missing(
-    wanted: Mapping[str, str],
-    published: Iterable[str],
-    domain: int,
-    environ: Mapping[str, str] = os.environ,
-) -> NotReady:
+def missing(wanted: Mapping[str, str], published: Iterable[str], domain: int) -> NotReady:
     """The error for topics that nobody publishes.
 
     Args:
@@ -54,7 +51,7 @@ def missing(
         step = step or "start the driver, or set the operator's topic names"
     else:
         lines.append(f"nobody publishes anything on ROS domain {domain}")
-        cause, step = _nobody(domain, environ)
+        cause, step = _advice_on_domain(domain)
     return NotReady("; ".join(lines), cause=cause, next=step)
 
 
@@ -85,6 +82,35 @@ def nobody_listens(topics: Iterable[str]) -> NotReady:
         f"nobody listens on {', '.join(topics)}: commands would go nowhere",
         cause="the arm's controller is not running, or takes commands on another topic",
         next="start it, or set the operator's command topics",
+    )
+
+
+def silent_streams(
+    connection: Connection, silent: Mapping[str, float | None], max_age_s: float, whole: bool
+) -> Stale:
+    """The error for streams that were received before and fell silent.
+
+    Args:
+        silent: stream -> its age in seconds, as ``sync.silent`` gives them.
+        max_age_s: seconds that are allowed.
+        whole: whether these are all streams that should speak.
+    """
+    lines, gone = [], []
+    for name, age in silent.items():
+        stream = connection.streams[name]
+        since = f"silent for {age:.2f} s" if age is not None else "never heard"
+        lines.append(f"{stream.label} is {since}")
+        if not connection.node.get_publishers_info_by_topic(stream.topic):
+            gone.append(stream.topic)
+    cause = "the device froze, or its driver was killed or hangs"
+    if whole:
+        cause = "every stream at once: the network is gone, or this machine is overloaded"
+    if gone:
+        cause = f"the driver is gone: nobody publishes {', '.join(gone)} any more"
+    return Stale(
+        f"{'; '.join(lines)}; {max_age_s:g} s is allowed",
+        cause=cause,
+        next="look at the driver; max_age_s of the operator says how long it may be silent",
     )
 
 
@@ -127,9 +153,10 @@ def contested(topics: Mapping[str, Sequence[str]]) -> Rejected:
     )
 
 
-def _nobody(domain: int, environ: Mapping[str, str]) -> tuple[str, str]:
-    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
-    alone = environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
+def _advice_on_domain(domain: int) -> tuple[str, str]:
+    """Cause and next step where nobody publishes anything."""
+    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    alone = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach in ("LOCALHOST", "OFF")
     cause = "the robot is on another domain"
     if alone:
         cause += ", or on another machine (discovery is limited to this one)"

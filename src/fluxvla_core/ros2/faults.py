@@ -1,4 +1,4 @@
-"""Faults of drivers, made on purpose: for simulated robots, and for tests of what guards."""
+"""Fault injection: a driver's messages frozen, lost, late or wrong, for simulations and tests."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Fault:
 
 
 class Faults:
-    """Which streams are ill, and what becomes of their messages."""
+    """The streams that have a fault, and what becomes of their messages."""
 
     def __init__(self) -> None:
         self._faults: dict[str, Fault] = {}
@@ -77,7 +77,7 @@ class Faults:
         self._share[stream] = 0.0
 
     def clear(self, stream: str) -> None:
-        """From now on ``stream`` is well."""
+        """End the fault of ``stream``."""
         self._faults.pop(stream, None)
 
     def apply(self, stream: str, message: Any) -> list[tuple[float, Any]]:

@@ -1,4 +1,4 @@
-"""From messages to a frame."""
+"""Frames of a ROS 2 robot, and the pictures of its cameras."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.ros2 import images
-from fluxvla_core.ros2.ring import Received
-from fluxvla_core.ros2.streams import CAMERA, DEPTH, StreamSpec
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.streams import CAMERA, DEPTH, Received, StreamSpec
 
 Array = npt.NDArray[np.float64]
 
@@ -55,3 +55,23 @@ def pictures(
         elif spec.kind == DEPTH:
             depths[camera.name] = images.to_depth(message, camera.height, camera.width, spec.label)
     return colours, depths
+
+
+def pictures_after(
+    connection: Connection, specs: Sequence[StreamSpec], camera: str, after: float
+) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+    """The colour pictures of a camera that are kept and newer than ``after``: see ``RosOperator``.
+
+    None for a camera that has no stream.
+    """
+    colours = (spec for spec in specs if spec.kind == CAMERA)
+    spec = next((s for s in colours if s.camera is not None and s.camera.name == camera), None)
+    if spec is None:
+        return [], 0
+    ring = connection.streams[spec.name].ring
+    found = [
+        (received.receipt, pictures([spec], {spec.name: received})[0][camera])
+        for received in ring.items()
+        if received.receipt > after
+    ]
+    return found, ring.received - ring.duplicates - ring.overtaken

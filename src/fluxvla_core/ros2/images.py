@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import LoadFailed
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2.messages import BadMessage
 
 # encoding -> (element type, number of channels, columns that are red, green and blue)
 _COLOUR: Mapping[str, tuple[int, tuple[int, int, int]]] = {

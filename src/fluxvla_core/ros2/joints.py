@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.ros2.trouble import BadMessage
+from fluxvla_core.ros2.messages import BadMessage
 
 Array = npt.NDArray[np.float64]
 

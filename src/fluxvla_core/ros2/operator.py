@@ -22,23 +22,20 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
-from fluxvla_core.ros2 import discovery, frames, silence, sync
-from fluxvla_core.ros2.actions import checked_action
+from fluxvla_core.ros2 import discovery, frames
+from fluxvla_core.ros2.commands import Motion, attempt, checked_action
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.frames import RobotFrame
-from fluxvla_core.ros2.holding import Motion, attempt
-from fluxvla_core.ros2.require import message_class
-from fluxvla_core.ros2.ring import Received
+from fluxvla_core.ros2.messages import message_class
+from fluxvla_core.ros2.readings import POLL_S, Readings
 from fluxvla_core.ros2.startup import Startup
-from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, CommandSpec, StreamSpec
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.ros2.streams import STATE, CommandSpec, Received, StreamSpec
+from fluxvla_core.ros2.sync import Stale
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")
 
-# How often a wait for messages that belong together looks again.
-_LOOK_S = 0.002
 # How long a last command may take to be acknowledged before the connection is given up.
 _FLUSH_S = 0.2
 
@@ -57,6 +54,7 @@ class RosOperator(Operator):
 
     api: ClassVar[str] = "1.0"
     embodiment: EmbodimentSpec
+    domain_id: int | None
 
     def __init__(
         self,
@@ -95,7 +93,7 @@ class RosOperator(Operator):
         self._motion = Motion()
         self._fault: FluxError | None = None
 
-    # What a subclass says.
+    # What a subclass defines.
 
     @abstractmethod
     def streams(self) -> Sequence[StreamSpec]:
@@ -141,7 +139,7 @@ class RosOperator(Operator):
 
         Raises:
             LoadFailed: no ROS 2, or a message package is missing.
-            NotReady: a topic has no publisher (names those that are there), bears another type,
+            NotReady: a topic has no publisher (names those that are there), has another type,
                 stays silent, or loses most messages; nobody listens for commands.
             Rejected: another node publishes commands.
             Faulted: what arrives is not what the embodiment describes.
@@ -173,13 +171,16 @@ class RosOperator(Operator):
             BadMessage: a message is not what the embodiment describes.
             Faulted: the connection broke.
         """
-        matched = self._matched()
-        stamps = {name: received.receipt for name, received in matched.items()}
-        states = {spec.name: matched[spec.name].message for spec in self._specs_of(STATE)}
-        stamps[STATE_STREAM] = min(stamps.pop(name) for name in states)
+        readings = self._readings
+        matched = readings.matched()
+        states = {spec.name: matched[spec.name] for spec in self._specs if spec.kind == STATE}
+        state, stamp = self._state_of(states)
+        stamps = {name: found.receipt for name, found in matched.items() if name not in states}
         colours, depths = frames.pictures(self._specs, matched)
-        newest = {name: received.message for name, received in self._fresh().items()}
-        return RobotFrame(self.read_state(states), colours, stamps, depths, self.read_base(newest))
+        newest = {name: received.message for name, received in readings.newest().items()}
+        return RobotFrame(
+            state, colours, {**stamps, STATE_STREAM: stamp}, depths, self.read_base(newest)
+        )
 
     def get_state(self) -> Array:
         """The newest ``(state_dim,)`` state, without waiting, and without converting pictures.
@@ -192,9 +193,10 @@ class RosOperator(Operator):
             BadMessage: the joint states are not what the embodiment describes.
             Faulted: the connection broke.
         """
-        self._fresh()
-        self._check_together()
-        return self._measured()[0]
+        readings = self._readings
+        readings.newest()
+        readings.check_states_together()
+        return self._state_of(readings.states())[0]
 
     def state_stamp(self) -> float:
         """Receipt of the oldest message that :meth:`get_state` reads now, on the monotonic clock.
@@ -202,9 +204,7 @@ class RosOperator(Operator):
         Raises:
             NotReady: not connected.
         """
-        self._connected()
-        newest = [self.newest(spec.name) for spec in self._specs_of(STATE)]
-        return min(received.receipt for received in newest if received is not None)
+        return min(received.receipt for received in self._readings.states().values())
 
     def pictures_after(
         self, camera: str, after: float
@@ -222,13 +222,9 @@ class RosOperator(Operator):
             BadMessage: a picture has another size or encoding than its camera.
         """
         connection = self._connection
-        specs = [s for s in self._specs_of(CAMERA) if s.camera and s.camera.name == camera]
-        if connection is None or not specs:
+        if connection is None:
             return [], 0
-        ring = connection.streams[specs[0].name].ring
-        new = [received for received in ring.items() if received.receipt > after]
-        found = [(r.receipt, frames.pictures(specs, {specs[0].name: r})[0][camera]) for r in new]
-        return found, ring.received - ring.duplicates - ring.overtaken
+        return frames.pictures_after(connection, self._specs, camera, after)
 
     def send_action(self, action: npt.ArrayLike) -> None:
         """Publish one ``(dim,)`` command.
@@ -240,8 +236,7 @@ class RosOperator(Operator):
         """
         checked = checked_action(self.embodiment, action)
         with self._lock:
-            connection = self._connected()
-            connection.check()
+            self._connected().check()
             if self._fault is not None:
                 raise self._fault
             self.admit(checked)
@@ -260,12 +255,12 @@ class RosOperator(Operator):
         with self._lock:
             if self._connection is None:
                 return
-            way, self._moving = self._way_to_hold(), False
-            if way:
+            commands, self._moving = self._stop_commands(), False
+            if commands:
                 self._motion.wait(self.embodiment)
-                self._hold(way[0])
+                self._hold(commands[0])
             attempt(self.embodiment.name, self.on_stop)
-        for before, command in itertools.pairwise(way):
+        for before, command in itertools.pairwise(commands):
             self._motion.wait(self.embodiment)
             with self._lock:
                 # Closed, or commanded by somebody else meanwhile.
@@ -331,7 +326,7 @@ class RosOperator(Operator):
         }
         startup = Startup(connection, self._specs, commands, self._publishers)
         startup.wait(self.connect_timeout_s)
-        for warning in [*startup.count(self.rate_window_s), *startup.unheard()]:
+        for warning in [*startup.count(self.rate_window_s), *startup.missing_optional()]:
             log.warning("%s", warning)
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
@@ -345,7 +340,7 @@ class RosOperator(Operator):
             except Stale:
                 if time.monotonic() >= until:
                     raise
-                time.sleep(_LOOK_S)
+                time.sleep(POLL_S)
             else:
                 return
 
@@ -355,7 +350,7 @@ class RosOperator(Operator):
             self._fault = None
             return
         error = discovery.contested(others)
-        # Whoever commands the arm is told by the refusal of the next command.
+        # While the arm is commanded, the refusal of the next command reports it.
         if self._fault is None and not self._moving:
             log.error("%s", error.what)
         with self._lock:
@@ -368,86 +363,32 @@ class RosOperator(Operator):
             raise NotReady(f"{self.embodiment.name} is not connected", next="call connect() first")
         return self._connection
 
-    def _matched(self) -> Mapping[str, Received]:
-        """Messages of state, cameras and depth that belong together, waiting a little for them."""
+    @property
+    def _readings(self) -> Readings:
+        """What arrived; raises NotReady without a connection."""
         connection = self._connected()
-        names = [spec.name for spec in self._specs_of(STATE, CAMERA, DEPTH)]
-        # A burst puts a stream apart from the others for a moment; one that fell silent is named
-        # as such in this time; only a driver that is late stays apart.
-        until = time.monotonic() + self.max_age_s
-        while True:
-            self._fresh()
-            by = "receipt" if self._clock_stepped() else self.sync_on
-            rings = {name: connection.streams[name].ring.items() for name in names}
-            try:
-                self._check_together()
-                match = sync.match(rings, self.max_skew_s, by, sync.wall())
-                sync.check_age(match, time.monotonic(), self.max_age_s)
-            except Stale:
-                if time.monotonic() >= until:
-                    raise
-                time.sleep(_LOOK_S)
-            else:
-                return match.messages
+        return Readings(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
 
-    def _check_together(self) -> None:
-        if self.sync_on == "stamp" and not self._clock_stepped():
-            streams = self._connected().streams
-            parts = {spec.name: streams[spec.name].ring.items() for spec in self._specs_of(STATE)}
-            sync.check_together(parts, self.max_skew_s, sync.wall())
+    def _state_of(self, messages: Mapping[str, Received]) -> tuple[Array, float]:
+        """The ``(state_dim,)`` state, and the receipt of the oldest message in it."""
+        state = self.read_state({name: found.message for name, found in messages.items()})
+        return state, min(found.receipt for found in messages.values())
 
-    def _specs_of(self, *kinds: str) -> list[StreamSpec]:
-        return [spec for spec in self._specs if spec.kind in kinds]
-
-    def _fresh(self) -> dict[str, Received]:
-        """The newest message of every stream that has one; none that should speak is silent."""
-        connection = self._connected()
-        connection.check()
-        newest = {spec.name: connection.streams[spec.name].newest() for spec in self._specs}
-        watched = {
-            spec.name: newest[spec.name]
-            for spec in self._specs
-            if not spec.latched and (spec.required or newest[spec.name] is not None)
-        }
-        silent = sync.silent(watched, time.monotonic(), self.max_age_s)
-        if silent:
-            whole = len(silent) == len(watched)
-            raise silence.explained(connection, silent, self.max_age_s, whole)
-        return {name: received for name, received in newest.items() if received is not None}
-
-    def _clock_stepped(self) -> bool:
-        """Whether a sender's clock stepped so recently that stamps on both sides are kept."""
-        connection = self._connected()
-        since = time.monotonic() - self.max_age_s
-        rings = [stream.ring for stream in connection.streams.values()]
-        return any(ring.stepped_at is not None and ring.stepped_at > since for ring in rings)
-
-    def _way_to_hold(self) -> list[Array]:
+    def _stop_commands(self) -> list[Array]:
         """The commands of a stop; none for an arm that rests, or is somebody else's."""
         if not self._moving or self._last is None:
             return []
         try:
-            self._fresh()
-            measured = (self._measured(-1), self._measured(-2))
+            readings = self._readings
+            readings.newest()
+            measured = self._state_of(readings.states(-1)), self._state_of(readings.states(-2))
         except FluxError:
             measured = None  # Its last command is where it goes or stays.
-        return self._motion.way_to_hold(self.embodiment, self._last, measured)
+        return self._motion.stop_commands(self.embodiment, self._last, measured)
 
     def _hold(self, command: Array) -> bool:
         self._last = command
         return attempt(self.embodiment.name, lambda: self.publish_action(command))
-
-    def _measured(self, index: int = -1) -> tuple[Array, float]:
-        """A ``(state_dim,)`` state that is kept, and the receipt of the oldest message in it.
-
-        Args:
-            index: -1 for the newest, -2 for the one before it, or the newest if it is the only one.
-        """
-        streams = self._connected().streams
-        kept = {spec.name: streams[spec.name].ring.items() for spec in self._specs_of(STATE)}
-        states = {name: items[max(index, -len(items))] for name, items in kept.items()}
-        state = self.read_state({name: found.message for name, found in states.items()})
-        return state, min(found.receipt for found in states.values())
 
     def _flush(self) -> None:
         from rclpy.duration import Duration

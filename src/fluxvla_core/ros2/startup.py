@@ -1,22 +1,38 @@
-"""What ``connect`` waits for and checks, with the error that names what is missing."""
+"""What ``connect`` waits for and checks, with the error that names what is missing.
+
+Message losses are counted because a robot that sees one picture in thirty looks like a robot with
+a bad policy. Fast DDS hands messages to processes of the same machine through shared memory, in a
+segment of 512 KB that belongs to the publisher. A VGA picture has 900 KB: it is cut into pieces
+that overwrite one another before they are read. A reliable subscription gets the pieces again;
+with best effort (what camera drivers offer by default) 93 to 99 of 100 pictures are lost. Only the
+publishing process can be given a larger segment. (On Jazzy a profile's transports are overridden
+while ``ROS_AUTOMATIC_DISCOVERY_RANGE`` is ``LOCALHOST``; there the publisher has to offer
+RELIABLE.)
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
 from typing import Any
 
 from fluxvla_core.errors import FluxError, NotReady
-from fluxvla_core.ros2 import discovery, rates
+from fluxvla_core.ros2 import discovery
 from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.rates import Reception
-from fluxvla_core.ros2.require import type_name
-from fluxvla_core.ros2.stream import Stream
-from fluxvla_core.ros2.streams import CommandSpec, StreamSpec
+from fluxvla_core.ros2.messages import type_name
+from fluxvla_core.ros2.qos import BEST_EFFORT
+from fluxvla_core.ros2.streams import CommandSpec, Stream, StreamSpec
 
 _POLL_S = 0.02
-# So many lost messages, and none received, are no bad luck.
+# So many lost messages, and none received, are not chance.
 _HOPELESS = 30
+SEGMENT_BYTES = 512 * 1024
+ENOUGH = 0.5
+"""Share of the messages that has to arrive for a stream to be used at all."""
+GOOD = 0.9
+"""Share below which somebody should know."""
 
 
 class Startup:
@@ -45,7 +61,7 @@ class Startup:
         self._since = time.monotonic()
 
     def wait(self, timeout_s: float) -> None:
-        """Return when every stream has spoken, commands have a listener and no other commander.
+        """Wait until all streams have a message, all commands a subscriber and no other publisher.
 
         Raises:
             NotReady, Rejected: not within ``timeout_s``; names the first thing that is wrong.
@@ -56,7 +72,7 @@ class Startup:
             self._connection.check()
             self._check_losses()
             late = time.monotonic() >= until
-            problem = self._problem(hurry=not late)
+            problem = self._problem(explain=late)
             if problem is None:
                 return
             if late:
@@ -77,7 +93,7 @@ class Startup:
         start = time.monotonic()
         time.sleep(seconds)
         span = time.monotonic() - start
-        warnings = rates.check(
+        warnings = check_losses(
             Reception(
                 stream.label,
                 stream.reliability,
@@ -95,8 +111,8 @@ class Startup:
             raise contested
         return warnings
 
-    def unheard(self) -> list[str]:
-        """Warnings about streams that nobody publishes, and that need not be."""
+    def missing_optional(self) -> list[str]:
+        """Warnings about streams that nobody publishes and that are not required."""
         published = discovery.published(self._node, self._connection.name)
         return [
             f"nobody publishes {spec.label}" + (f": {spec.unheard}" if spec.unheard else "")
@@ -105,47 +121,51 @@ class Startup:
         ]
 
     def _check_losses(self) -> None:
-        """Waiting longer does not help a stream of which so much was sent and nothing arrived."""
+        """Refuse streams that lost many messages and received none: waiting does not help them."""
         streams = [self._stream(spec) for spec in self._specs]
         lost = [s for s in streams if s.lost >= _HOPELESS and not s.newest()]
         if lost:
-            raise self._lossy(lost)
+            raise self._losses_error(lost)
 
-    def _lossy(self, lost: Sequence[Stream]) -> NotReady:
+    def _losses_error(self, lost: Sequence[Stream]) -> NotReady:
         span = time.monotonic() - self._since
-        return rates.lossy(
+        return losses_error(
             [
                 Reception(s.label, s.reliability, span, 0, s.lost, 0, None, s.from_fast_dds)
                 for s in lost
             ]
         )
 
-    def _problem(self, hurry: bool) -> FluxError | None:
-        """What is still wrong; ``hurry`` leaves out what only makes the message better."""
+    def _problem(self, explain: bool) -> FluxError | None:
+        """What is still wrong, None if all is there.
+
+        Args:
+            explain: look for the cause of a silent stream, which takes a while.
+        """
         quiet = [s for spec in self._specs if not (s := self._stream(spec)).newest()]
         for stream in quiet:
             stream.refresh()
         if quiet:
-            if hurry:
+            if not explain:
                 return NotReady("waiting")
-            error = self._why(quiet)
+            error = self._explain_silence(quiet)
             known = {spec.name: spec.unheard for spec in self._specs}
             causes = [known[stream.name] for stream in quiet]
             if all(causes):
                 error.cause = "; ".join(causes)
             return error
-        # Not the graph's word for it: until the two have found each other, commands are lost, and
-        # the first one that arrives would be a jump.
-        deaf = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
-        if deaf:
-            return discovery.nobody_listens(deaf)
+        # The publisher's own count: a subscriber that is on the graph may not be matched yet, and
+        # until then commands are lost, so that the first one that arrives would be a jump.
+        unmatched = [t for t in self._exclusive if not self._publishers[t].get_subscription_count()]
+        if unmatched:
+            return discovery.nobody_listens(unmatched)
         return self._contested()
 
     def _contested(self) -> FluxError | None:
         others = discovery.commanders(self._node, self._exclusive, self._connection.name)
         return discovery.contested(others) if others else None
 
-    def _why(self, quiet: Sequence[Stream]) -> FluxError:
+    def _explain_silence(self, quiet: Sequence[Stream]) -> FluxError:
         published = discovery.published(self._node, self._connection.name)
         missing = {s.name: s.topic for s in quiet if s.topic not in published}
         if missing:
@@ -158,7 +178,7 @@ class Startup:
                 return discovery.wrong_type(stream.label, stream.topic, wanted, types)
         lost = [s for s in quiet if s.lost]
         if lost:
-            return self._lossy(lost)
+            return self._losses_error(lost)
         return discovery.silent_publishers([s.label for s in quiet])
 
     def _stream(self, spec: StreamSpec) -> Stream:
@@ -170,3 +190,98 @@ def _size(stream: Stream) -> int:
     newest = stream.newest()
     data: Any = getattr(newest.message, "data", b"") if newest is not None else b""
     return len(data) if hasattr(data, "__len__") else 0
+
+
+@dataclass(frozen=True)
+class Reception:
+    """What one stream received in a while.
+
+    Args:
+        label: the stream's name and topic.
+        reliability: what it subscribed with.
+        seconds: for how long was counted.
+        received: messages that arrived.
+        lost: messages that the middleware says were sent and did not arrive.
+        size: bytes of one message, 0 if unknown.
+        expected_hz: messages a second that should come; None takes received and lost together.
+        from_fast_dds: whether its publishers are ones of Fast DDS; others know no such segment.
+    """
+
+    label: str
+    reliability: str
+    seconds: float
+    received: int
+    lost: int
+    size: int
+    expected_hz: float | None = None
+    from_fast_dds: bool = False
+
+    @property
+    def wanted(self) -> float:
+        """Messages that should have arrived."""
+        counted = float(self.received + self.lost)
+        return max(counted, (self.expected_hz or 0.0) * self.seconds)
+
+    @property
+    def share(self) -> float:
+        """Received of wanted, 1 where nothing was."""
+        return self.received / self.wanted if self.wanted else 1.0
+
+    def __str__(self) -> str:
+        return f"{self.label}: {self.received} of {self.wanted:.0f} messages arrived"
+
+
+def check_losses(receptions: Iterable[Reception]) -> list[str]:
+    """Warnings for streams that lose some messages.
+
+    Raises:
+        NotReady: a stream loses most; names all of them, and the shared-memory trap if it is one.
+    """
+    everything = list(receptions)
+    bad = [r for r in everything if r.share < ENOUGH]
+    if bad:
+        raise losses_error(bad)
+    return [f"{r} in {r.seconds:.1f} s" for r in everything if r.share < GOOD]
+
+
+def losses_error(bad: list[Reception]) -> NotReady:
+    """The error for streams that lose most of their messages."""
+    what = "; ".join(f"{r} in {r.seconds:.1f} s" for r in bad)
+    if any(is_trap(r) and r.from_fast_dds for r in bad):
+        return NotReady(
+            what,
+            cause="the publisher offers best effort, and its pictures are larger than the 512 KB "
+            "of Fast DDS's shared memory, so their pieces overwrite one another",
+            next="start the publisher (not this program) with "
+            f"FASTDDS_DEFAULT_PROFILES_FILE={large_frames_profile()}, or let it offer RELIABLE",
+        )
+    if any(is_trap(r) for r in bad):
+        return NotReady(
+            what,
+            cause="the publisher offers best effort, so that a large message is lost with any "
+            "piece of it; publisher and subscriber do not share Fast DDS's memory, so the network "
+            "or its buffers drop the pieces",
+            next="let the publisher offer RELIABLE, or make the receive buffers of this machine "
+            "larger (net.core.rmem_max) and the pictures smaller or compressed",
+        )
+    return NotReady(
+        what,
+        cause="the driver is slower than expected, or the network or this machine is overloaded",
+        next="set the rate that the driver really has, or lighten the load; "
+        "ros2 topic hz TOPIC shows what another subscriber gets",
+    )
+
+
+def is_trap(reception: Reception) -> bool:
+    """Whether large best-effort messages are lost: with Fast DDS, the shared-memory trap.
+
+    Where no message ever arrived its size is unknown, and losses that the middleware reports for a
+    best-effort stream are enough.
+    """
+    large = reception.size > SEGMENT_BYTES or (reception.size == 0 and reception.lost > 0)
+    return reception.reliability == BEST_EFFORT and large and reception.share < ENOUGH
+
+
+def large_frames_profile() -> str:
+    """Path of the Fast DDS profile with a 32 MB segment that ships with this package."""
+    return str(resources.files("fluxvla_core.ros2") / "fastdds_large_frames.xml")

@@ -1,18 +1,17 @@
-"""What an operator reads and writes, as data: topics, message types, how much is kept."""
+"""What an operator reads and writes: declared as data, and subscribed to as streams of messages."""
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+from fluxvla_core.ros2 import qos
+from fluxvla_core.ros2.messages import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, stamp_of
 from fluxvla_core.spec.embodiment import Camera
-
-JOINT_STATE = "sensor_msgs.msg:JointState"
-IMAGE = "sensor_msgs.msg:Image"
-COMPRESSED_IMAGE = "sensor_msgs.msg:CompressedImage"
-TWIST = "geometry_msgs.msg:Twist"
-ODOMETRY = "nav_msgs.msg:Odometry"
-FLOAT64 = "std_msgs.msg:Float64"
-FLOAT64_ARRAY = "std_msgs.msg:Float64MultiArray"
 
 STATE, CAMERA, DEPTH, SIDE = "state", "camera", "depth", "side"
 """What a stream is for. ``side`` streams (a robot's mode, its base) are kept and must be fresh, but
@@ -22,6 +21,11 @@ are not matched in time with the others."""
 _STATE_DEPTH = 128
 # Pictures are large; the newest few are enough to match cameras with one another.
 _PICTURE_DEPTH = 4
+# Messages that wait in the middleware while the ROS thread is busy elsewhere.
+_QUEUE = 10
+STEP = 1.0
+"""Seconds by which a stamp must jump against the receipt times to be a step of the sender's clock,
+and not a message that was overtaken."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +40,8 @@ class StreamSpec:
         depth: how many messages are kept.
         expected_hz: messages a second that should come; None: as many as are sent.
         camera: size of the pictures, for ``camera`` and ``depth``.
-        required: whether ``connect`` waits for it; only ``side`` streams need not be. Without, it
-            warns if nobody publishes it. What has spoken once must go on in either case.
+        required: whether ``connect`` waits for it; only ``side`` streams need not be. Otherwise it
+            warns if nobody publishes it. Once a message arrived, more must come in either case.
         latched: ask for the last message that was sent before, where publishers keep it. It is sent
             when something changes, so that silence means nothing.
         unheard: the likely cause where it is not heard, for messages.
@@ -61,16 +65,16 @@ class StreamSpec:
 
 
 def depth_stream(camera: str) -> str:
-    """What the stream of a camera's distances is called."""
+    """The name of the stream of a camera's depth pictures."""
     return f"{camera}_depth"
 
 
 def camera_stream(
     camera: Camera, topic: str, expected_hz: float | None = None, depth: bool = False
 ) -> StreamSpec:
-    """The stream of a camera's pictures; of its distances (named ``<camera>_depth``) if ``depth``.
+    """The stream of a camera's pictures; of its depth (named ``<camera>_depth``) if ``depth``.
 
-    A topic that ends in ``/compressed`` or ``/compressedDepth`` bears ``CompressedImage``, as
+    A topic that ends in ``/compressed`` or ``/compressedDepth`` carries ``CompressedImage``, as
     image_transport names them.
     """
     packed = topic.rstrip("/").rpartition("/")[2] in ("compressed", "compressedDepth")
@@ -98,3 +102,153 @@ class CommandSpec:
     topic: str
     message: str = JOINT_STATE
     exclusive: bool = True
+
+
+@dataclass(frozen=True)
+class Received:
+    """One message.
+
+    ``receipt`` is seconds on this process's monotonic clock; ``stamp`` seconds on the sender's
+    clock, None if the message has none.
+    """
+
+    receipt: float
+    stamp: float | None
+    message: Any
+
+
+class Ring:
+    """At most ``depth`` messages, oldest dropped first, in the order of the sender's stamps.
+
+    A message that another overtook, or that comes twice, says nothing new; it is counted and
+    dropped, so that a driver repeating its last picture counts as silent. When the sender's clock
+    steps (a restart, NTP, a simulation that begins again), what came before the step is dropped,
+    because it cannot be compared with what comes after. Any thread may call anything.
+    """
+
+    def __init__(self, depth: int) -> None:
+        if depth < 1:
+            raise ValueError(f"a ring holds at least 1 message, got depth {depth}")
+        self._items: deque[Received] = deque(maxlen=depth)
+        self._lock = threading.Lock()
+        self._before: tuple[float, float | None] = (0.0, None)
+        self.received = 0
+        self.duplicates = 0
+        self.overtaken = 0
+        self.clock_steps = 0
+        self.stepped_at: float | None = None
+
+    def add(self, receipt: float, stamp: float | None, message: Any) -> bool:
+        """Keep the message if it is news; returns whether it is."""
+        with self._lock:
+            self.received += 1
+            before, self._before = self._before, (receipt, stamp)
+            newest = self._items[-1].stamp if self._items else None
+            if stamp is not None and newest is not None and before[1] is not None:
+                if stamp in (newest, before[1]):
+                    self.duplicates += 1
+                    return False
+                # A gap in the stream moves both clocks alike and is no step.
+                if abs((stamp - before[1]) - (receipt - before[0])) > STEP:
+                    self.clock_steps += 1
+                    self.stepped_at = receipt
+                    self._items.clear()
+                elif stamp < newest:
+                    self.overtaken += 1
+                    return False
+            self._items.append(Received(receipt, stamp, message))
+            return True
+
+    def newest(self) -> Received | None:
+        """The newest message, None before the first."""
+        with self._lock:
+            return self._items[-1] if self._items else None
+
+    def items(self) -> tuple[Received, ...]:
+        """All messages, newest last."""
+        with self._lock:
+            return tuple(self._items)
+
+
+class Stream:
+    """Messages of one topic; made by ``Connection.subscribe``.
+
+    The callback stores and does nothing else, so that one thread serves every stream. Reliability
+    is chosen by what publishers offer, and again when that changes (a driver that starts later, or
+    comes back with other settings).
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        name: str,
+        topic: str,
+        message: Any,
+        depth: int,
+        latched: bool = False,
+    ) -> None:
+        self.name = name
+        self.topic = topic
+        self.message = message
+        self.ring = Ring(depth)
+        self.lost = 0
+        self.reliability = ""
+        self.from_fast_dds = False
+        self._lock = threading.Lock()
+        self._asked: tuple[str, bool] | None = None
+        self._node = node
+        self._latched = latched
+        self._depth = max(depth, _QUEUE)
+        self._subscription: Any = None
+        self.refresh()
+
+    @property
+    def label(self) -> str:
+        """Name and topic, for messages."""
+        return f"{self.name} ({self.topic})"
+
+    def newest(self) -> Received | None:
+        """The newest message, None before the first."""
+        return self.ring.newest()
+
+    def refresh(self) -> None:
+        """Subscribe once there is a publisher, and anew when publishers offer something else."""
+        with self._lock:
+            offers = self._node.get_publishers_info_by_topic(self.topic)
+            wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)
+            self.from_fast_dds = qos.from_fast_dds(offers)
+            if not offers or wanted == self._asked:
+                return
+            before, self._asked = self._subscription, wanted
+            self.reliability = wanted[0]
+            self._subscription = self._subscribe(*wanted)
+            if before is not None:
+                self._node.destroy_subscription(before)
+
+    def _store(self, message: Any) -> None:
+        self.ring.add(time.monotonic(), stamp_of(message), message)
+
+    def _count_lost(self, event: Any) -> None:
+        self.lost += event.total_count_change
+
+    def _subscribe(self, reliability: str, latched: bool) -> Any:
+        def subscribe(**options: Any) -> Any:
+            profile = qos.profile(reliability, self._depth, latched)
+            return self._node.create_subscription(
+                self.message, self.topic, self._store, profile, **options
+            )
+
+        events, unsupported = _lost_events(self._count_lost)
+        try:
+            return subscribe(event_callbacks=events)
+        except unsupported:
+            # Not every middleware reports losses; then only an expected rate can show a loss.
+            return subscribe()
+
+
+def _lost_events(callback: Callable[[Any], None]) -> tuple[Any, type[Exception]]:
+    try:
+        from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+    except ImportError:  # Humble has them in another module
+        from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
+    return SubscriptionEventCallbacks(message_lost=callback), UnsupportedEventTypeError

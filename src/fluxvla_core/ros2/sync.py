@@ -12,14 +12,24 @@ import bisect
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
-from fluxvla_core.ros2.ring import STEP, Received
-from fluxvla_core.ros2.trouble import Stale
+from fluxvla_core.errors import NotReady
+from fluxvla_core.ros2.streams import STEP, Received
 
 _CLOCKS = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
 # Messages of a stream that tell how long they take.
 _FEW = 16
 Streams = Mapping[str, Sequence[Received]]
+
+
+class Stale(NotReady):
+    """A stream is silent, late, or too far from the others in time; it may recover.
+
+    The arm still obeys: it is braked and held, by the safety rule named here.
+    """
+
+    rule: ClassVar[str] = "freshness"
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,7 @@ def match(
         streams: name -> messages, newest last; none empty.
         max_skew: seconds that the chosen messages may be apart.
         by: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived (for senders
-            whose clocks differ). Where any stream bears no stamps, ``receipt`` is used.
+            whose clocks differ). Where any stream has no stamps, ``receipt`` is used.
         wall: what to add to receipts for this machine's wall clock, which tells whose clock is off.
 
     Raises:
@@ -76,12 +86,12 @@ def match(
     times = {name: _time(message, by) for name, message in chosen.items()}
     skew = max(times.values()) - min(times.values())
     if skew > max_skew:
-        error = _apart(chosen, times, skew, max_skew, by)
+        error = _too_far_apart(chosen, times, skew, max_skew, by)
         if by == "stamp":
             first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
             delays = {name: _delay(streams[name]) for name in (first, last)}
             if abs(delays[first] - delays[last]) > STEP:
-                error.cause, error.next = _off(delays, wall), _CLOCKS
+                error.cause, error.next = _wrong_clock(delays, wall), _CLOCKS
         raise error
     return Matched(chosen, skew, slowest)
 
@@ -94,7 +104,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
     take longer than joint states, and are matched by their stamps instead.
 
     Args:
-        streams: those that make up the state; where one bears no stamps, nothing can be said.
+        streams: those that make up the state; where one has no stamps, nothing is checked.
         max_skew, wall: see ``match``.
 
     Raises:
@@ -109,7 +119,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
         raise Stale(
             f"{first} is stamped {apart:.3f} s before {last}, with which it arrives; "
             f"at most {max_skew:g} s is allowed",
-            cause=_off({name: delays[name] for name in (first, last)}, wall),
+            cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall),
             next=f"{_CLOCKS}; max_skew_s sets what is allowed",
         )
 
@@ -139,7 +149,7 @@ def _delay(items: Sequence[Received]) -> float:
     return min((m.receipt - m.stamp for m in items[-_FEW:] if m.stamp is not None), default=0.0)
 
 
-def _off(delays: Mapping[str, float], wall: float | None) -> str:
+def _wrong_clock(delays: Mapping[str, float], wall: float | None) -> str:
     """Whose clock is off, of two streams whose stamps are."""
     slow, fast = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
     # By this machine's wall clock; a stamp in the future cannot be a message that is late.
@@ -168,7 +178,7 @@ def _time(message: Received, by: str) -> float:
     return message.receipt
 
 
-def _apart(
+def _too_far_apart(
     chosen: Mapping[str, Received],
     times: Mapping[str, float],
     skew: float,

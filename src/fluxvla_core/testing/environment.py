@@ -1,12 +1,12 @@
-"""What every environment must do, as tests that a plugin inherits.
+"""Conformance tests for environments, which a plugin inherits.
 
     from fluxvla_core.testing import EnvironmentConformance
 
     class TestMyEnvironment(EnvironmentConformance):
         entry_point = "MyEnvironment"
 
-pytest collects the inherited tests. Evaluations rely on what they check: that an episode's course
-follows from its task and seed alone, whatever was run before and whoever looked at it.
+pytest collects the inherited tests. Evaluations rely on what they check: that an episode depends on
+its task and seed alone, not on earlier episodes or on which cameras are drawn.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from fluxvla_core.spec.embodiment import Camera
 SEED = 11
 
 
-class Saboteur(RandomPolicy):
+class DivergingPolicy(RandomPolicy):
     """Acts at random and, before its third answer, gives everything an impossible velocity."""
 
     def enter(self, environment: Environment) -> None:
@@ -163,7 +163,7 @@ class EnvironmentConformance:
             pytest.skip("no MuJoCo simulation below")
         course = RolloutSettings(max_steps=self.steps)
         with pytest.raises(Diverged, match=r"BADQVEL|not finite"):
-            run_episode(environment, Saboteur(), task, SEED, course)
+            run_episode(environment, DivergingPolicy(), task, SEED, course)
         assert self.course(environment, task), "the next episode is a whole one again"
 
     def test_it_can_be_closed_any_number_of_times(self, environment: Environment) -> None:

@@ -1,4 +1,4 @@
-"""What every operator must do, as tests that a plugin inherits.
+"""Conformance tests for operators, which a plugin inherits.
 
     from fluxvla_core.testing import OperatorConformance
 
@@ -31,8 +31,10 @@ from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-# How long nothing may come before nothing more is taken to come.
+# No command in this time means that no more are under way.
 _QUIET_S = 0.3
+# How long importing a plugin in a new process may take.
+_IMPORT_S = 120.0
 _IMPORT_PROBE = """
 import importlib, json, sys, threading
 importlib.import_module(sys.argv[1])
@@ -50,7 +52,8 @@ class OperatorConformance:
     heavy_modules: ClassVar[tuple[str, ...]] = ("torch", "rclpy")
     """Modules that importing the plugin may not pull in."""
     ready_within_s: ClassVar[float] = 10.0
-    """How long ``get_frame`` may say NotReady after ``connect``."""
+    """How long each wait of the tests may take: for a first frame, for newer readings, for the end
+    of commands after a stop."""
 
     @pytest.fixture
     def operator(self) -> Iterator[Any]:
@@ -100,11 +103,18 @@ class OperatorConformance:
         return None
 
     def settled(self, operator: Any) -> int | None:
-        """``commands_heard`` once no more come."""
-        while (heard := self.commands_heard(operator)) is not None:
+        """``commands_heard`` once no more come; fails if they go on for ``ready_within_s``."""
+        deadline = time.monotonic() + self.ready_within_s
+        heard = self.commands_heard(operator)
+        while heard is not None:
             time.sleep(_QUIET_S)
-            if self.commands_heard(operator) == heard:
+            before, heard = heard, self.commands_heard(operator)
+            if heard == before:
                 break
+            assert time.monotonic() < deadline, (
+                f"commands still arrive after {self.ready_within_s:g} s without a send_action, "
+                f"{heard} by now: what sends them does not end"
+            )
         return heard
 
     def test_is_complete(self, operator: Any) -> None:
@@ -114,7 +124,9 @@ class OperatorConformance:
     def test_import_is_light(self) -> None:
         module = OPERATORS.get(self.entry_point).__module__
         run = [sys.executable, "-c", _IMPORT_PROBE, module]
-        found = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+        found = subprocess.run(
+            run, capture_output=True, text=True, check=True, timeout=_IMPORT_S
+        ).stdout
         modules, threads = json.loads(found)
         assert not set(self.heavy_modules) & set(modules)
         assert threads == 1, "importing the plugin starts a thread"
@@ -179,7 +191,7 @@ class OperatorConformance:
             time.sleep(0.02)
             if waiting:
                 connected.send_action(self.hold(connected))
-        assert not waiting, f"no newer reading of {sorted(waiting)}"
+        assert not waiting, f"no newer reading of {sorted(waiting)} in {self.ready_within_s:g} s"
 
     @pytest.mark.parametrize("fault", ["nan", "inf", "short", "long", "matrix", "above", "below"])
     def test_bad_actions_are_refused(self, connected: Any, fault: str) -> None:
@@ -234,10 +246,10 @@ class OperatorConformance:
             except BaseException as error:  # noqa: BLE001 - carried to the test's own thread
                 failures.append(error)
 
-        thread = threading.Thread(target=stop)
+        thread = threading.Thread(target=stop, daemon=True)
         thread.start()
         thread.join(self.ready_within_s)
-        assert not thread.is_alive()
+        assert not thread.is_alive(), f"stop did not return in {self.ready_within_s:g} s"
         assert failures == []
 
     def test_close_gives_everything_back(self, operator: Any) -> None:

@@ -15,7 +15,7 @@ from importlib import resources
 import pytest
 
 from fluxvla_core.errors import LoadFailed
-from fluxvla_core.ros2.require import require_rclpy
+from fluxvla_core.ros2 import require_rclpy
 from fluxvla_core.testing.ros2_driver import Driver
 from fluxvla_core.testing.ros_domains import claimed_domain
 

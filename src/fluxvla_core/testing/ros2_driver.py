@@ -1,10 +1,10 @@
-"""A robot's ROS 2 side without the robot: a process that publishes, listens, and falls ill.
+"""A stand-in for a robot's ROS 2 drivers: a process that publishes, subscribes, injects faults.
 
     python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
 
-``Driver`` starts that process from a test, tells it what to do and reads what it heard. It is a
-process of its own because that is what drivers are: what one process does to another through DDS
-(lost pictures, killed publishers, other settings after a restart) happens between processes only.
+``Driver`` starts that process from a test, gives it orders and keeps what it received. It is a
+process of its own because drivers are: lost pictures, killed publishers and other settings after a
+restart happen between processes only.
 Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
 """
 
@@ -22,12 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.ros2 import images, joints, qos
-from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.faults import Fault, Faults, Outbox
-from fluxvla_core.ros2.require import message_class
+from fluxvla_core.ros2 import Connection, Fault, Faults, Outbox, images, joints, message_class, qos
 
 _START_S = 120.0
+_END_S = 5.0
 
 
 class Driver:
@@ -39,7 +37,7 @@ class Driver:
             (Image), ``format`` (CompressedImage: ``jpeg`` or ``png``), ``data`` (std_msgs),
             ``follows`` (a sink's topic: the last command there is where its joints are, in the
             order of ``command_names`` if it has none);
-            ``best_effort`` and ``latched`` say how; ``stamped: false`` leaves stamps at zero.
+            ``best_effort`` and ``latched`` set its QoS; ``stamped: false`` leaves stamps at zero.
         sinks: what it listens to: ``topic`` and ``message``. What arrives is in ``heard``.
         name: of its node.
         environment: of the process; this one's by default.
@@ -66,7 +64,10 @@ class Driver:
         self._reader.start()
         if not self._ready.wait(_START_S) or self._process.poll() is not None:
             self.kill()
-            raise RuntimeError(f"the driver did not start (exit code {self._process.returncode})")
+            raise RuntimeError(
+                f"the driver did not start within {_START_S:g} s "
+                f"(exit code {self._process.returncode})"
+            )
 
     def tell(self, **order: Any) -> None:
         """``fault="TOPIC=MODE:AMOUNT"``, ``change={topic: {key: value}}``, ``reset=True``: back to
@@ -83,7 +84,7 @@ class Driver:
     def kill(self) -> None:
         """End it with SIGKILL: no goodbye on the graph."""
         self._process.kill()
-        self._process.wait()
+        self._process.wait(_END_S)
 
     def close(self) -> None:
         """End it by closing its input; it leaves the graph properly."""
@@ -91,10 +92,10 @@ class Driver:
         if self._process.poll() is None:
             self._process.stdin.close()
             try:
-                self._process.wait(5.0)
+                self._process.wait(_END_S)
             except subprocess.TimeoutExpired:
                 self.kill()
-        self._reader.join(5.0)
+        self._reader.join(_END_S)
 
     def on(self, topic: str) -> list[dict[str, Any]]:
         """What it heard on ``topic``, oldest first: ``at`` (monotonic) and the message's fields."""
@@ -199,21 +200,21 @@ def _orders() -> queue.Queue[dict[str, Any] | None]:
     return orders
 
 
-def _listen(
-    connection: Connection, sinks: Sequence[Mapping[str, Any]], say: Callable[..., None]
+def _subscribe(
+    connection: Connection, sinks: Sequence[Mapping[str, Any]], write: Callable[..., None]
 ) -> dict[str, Any]:
     commands: dict[str, Any] = {}
 
-    def hear(topic: str) -> Callable[[Any], None]:
+    def receiver(topic: str) -> Callable[[Any], None]:
         def store(message: Any) -> None:
             commands[topic] = message
-            say(topic=topic, at=time.monotonic(), **_plain(message))
+            write(topic=topic, at=time.monotonic(), **_plain(message))
 
         return store
 
     for sink in sinks:
         connection.node.create_subscription(
-            message_class(sink["message"]), sink["topic"], hear(sink["topic"]), 50
+            message_class(sink["message"]), sink["topic"], receiver(sink["topic"]), 50
         )
     return commands
 
@@ -254,15 +255,15 @@ def run(spec: Mapping[str, Any]) -> None:
     connection = Connection(spec.get("name", "driver"))
     lock = threading.Lock()
 
-    def say(**fields: Any) -> None:
+    def write(**fields: Any) -> None:
         with lock:
             print(json.dumps(fields), flush=True)
 
     try:
-        commands = _listen(connection, spec["sinks"], say)
+        commands = _subscribe(connection, spec["sinks"], write)
         publishers = [_Publisher(connection, dict(stream)) for stream in spec["streams"]]
         orders, faults = _orders(), Faults()
-        say(ready=True)
+        write(ready=True)
         _publish(connection, publishers, commands, orders, faults)
     finally:
         connection.close()

@@ -10,7 +10,8 @@ import sys
 
 import numpy as np
 from fluxvla_sim.aloha.world import CUBE as TWO_ARMS
-from fluxvla_sim.ros2.node import NodeSettings, simulate
+from fluxvla_sim.ros2.node import simulate
+from fluxvla_sim.ros2.settings import NodeSettings
 from fluxvla_sim.ur.world import CUBE as ONE_ARM
 
 from fluxvla_core.commands import make_reporter
@@ -19,7 +20,7 @@ from fluxvla_myrobot.embodiment import DUAL_ARM, SIZE, SPEC
 
 
 class Driver:
-    """All joints on one topic, commands for them in the same order; see ``fluxvla_sim`` (Body)."""
+    """All joints on one topic, commands in the same order; see ``fluxvla_sim.ros2.drivers``."""
 
     latched, depths, knobs = {}, {}, {}
 
@@ -31,11 +32,11 @@ class Driver:
         # The simulation's grippers go from 0 to 1.
         self._scale = np.array([joint.open or 1.0 for joint in spec.joints])
 
-    def say(self, state, now):
+    def messages(self, state, now):
         message = message_class(JOINT_STATE)()
         return {"joints": joints.fill(message, self._names, state * self._scale)}
 
-    def hear(self, topic, message, now):
+    def receive(self, topic, message, now):
         first = 0 if self.commands[topic] == JOINT_STATE else len(self._names) - 1
         values = np.atleast_1d(message.data if first else message.position)
         columns = slice(first, first + len(values))

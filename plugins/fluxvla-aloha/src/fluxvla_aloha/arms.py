@@ -20,7 +20,7 @@ a joint may take one second from full speed to rest. The gripper's jaws move the
 
 **AgileX PiPER**. Positions and speed are those of ``CHANGELOG.MD`` and ``INTERFACE_V2.MD`` in
 agilexrobotics/piper_sdk (commit 1dadd60), the acceleration the largest that the latter lets a
-joint be set to. Its driver tells the gripper's opening in metres, 0.07 at most. No source gives
+joint be set to. Its driver gives the gripper's opening in metres, 0.07 at most. No source gives
 the gripper's speed; the slowest of the others is used.
 
 Grippers are normalised, 0 closed and 1 open, and reach their speed in 0.08 s.

@@ -1,4 +1,4 @@
-"""The speed of a mobile base: limited, and zero as soon as nobody asks for more."""
+"""Velocity commands of a mobile base: limited, and zero when no new one comes in time."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class AlohaOperator(RosOperator):
     Args:
         preset: ``cobot_magic`` (AgileX) or ``interbotix``.
         img_front_topic, img_left_topic, img_right_topic: colour pictures; a topic that ends in
-            ``/compressed`` bears ``CompressedImage``.
+            ``/compressed`` carries ``CompressedImage``.
         img_front_depth_topic, img_left_depth_topic, img_right_depth_topic: depth pictures.
         puppet_arm_left_topic, puppet_arm_right_topic: joint states of the arms.
         puppet_arm_left_cmd_topic, puppet_arm_right_cmd_topic: their commands.
@@ -70,7 +70,7 @@ class AlohaOperator(RosOperator):
         embodiment: in place of ``arms``, the spec of others (as ``EmbodimentSpec.to_dict`` gives
             it), with seven joints an arm, left first, gripper last.
         domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.operator.RosOperator``.
+            ``fluxvla_core.ros2.RosOperator``.
         context: what the run knows (injected).
 
     Raises:
@@ -289,7 +289,7 @@ def fill_command(message: Any, names: Sequence[str], values: Array, group: str) 
     if field is None:
         raise ConfigError(
             f"{type(message).__name__} has none of the fields position, cmd and data: "
-            "it cannot bear joint targets"
+            "it cannot carry joint targets"
         )
     if field == "cmd":
         message.name = group
@@ -312,7 +312,7 @@ def _spec(
     if given is not None and arms is not None:
         raise ConfigError("arms and embodiment both say which arms there are; give one of them")
     try:
-        # Where nobody said which, nothing moves; a spec there must be.
+        # Without known arms connect() refuses; until then there must be some spec.
         usual = aloha_spec(cameras, rate_hz, kind or "viperx300")
     except ValueError as error:
         raise ConfigError(f"AlohaOperator: {error}") from error

@@ -3,7 +3,7 @@
 Both have two arms and three cameras. They differ in the names of topics and joints, in the raw
 value of a gripper's ends, in the messages that command an arm, and in the arms: Interbotix takes
 its own ViperX 300; cobot_magic came with ARX X5 (``arx5v.launch`` in its readme) and comes with
-AgileX PiPER arms, and nothing in its messages tells which.
+AgileX PiPER arms, and nothing in its messages shows which.
 """
 
 from __future__ import annotations

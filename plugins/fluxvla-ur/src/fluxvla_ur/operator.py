@@ -60,7 +60,7 @@ class UROperator(RosOperator):
         model: ``ur3e``, ``ur5e`` or ``ur10e``.
         controller: the active ros2_control controller; one of ``CONTROLLERS``.
         img_front_topic, img_left_topic: colour pictures of the front and the wrist camera; a topic
-            that ends in ``/compressed`` bears ``CompressedImage``.
+            that ends in ``/compressed`` carries ``CompressedImage``.
         img_front_depth_topic, img_left_depth_topic: depth pictures.
         puppet_arm_left_topic: joint states.
         puppet_arm_left_cmd_topic: joint commands; None takes the controller's.
@@ -84,7 +84,7 @@ class UROperator(RosOperator):
         trajectory_time_s: with a trajectory controller, how far ahead each target is set.
         camera_rate_hz: pictures a second that should come; None: as many as are sent.
         domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.operator.RosOperator``.
+            ``fluxvla_core.ros2.RosOperator``.
 
     Raises:
         ConfigError: an unknown model or controller, or a value out of its range.
@@ -174,7 +174,7 @@ class UROperator(RosOperator):
             if self._use_depth:
                 found.append(camera_stream(camera, depth, self._camera_hz, depth=True))
         if self._gripper_joint is None:
-            # A bare number bears no stamp, so it cannot be matched in time with the others.
+            # A bare number has no stamp, so it cannot be matched in time with the others.
             found.append(
                 StreamSpec("gripper", self._gripper_state, self._gripper_message, SIDE, depth=1)
             )
@@ -197,7 +197,7 @@ class UROperator(RosOperator):
             depth=1,
             required=self._require_status,
             latched=True,
-            # The driver tells of changes only, and begins with a program that does not run.
+            # The driver publishes changes only, and begins with a program that does not run.
             unheard="External Control was not played on the teach pendant since the driver "
             f"started, or its io_and_status_controller has another name{hint}",
         )

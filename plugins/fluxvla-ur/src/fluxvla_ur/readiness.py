@@ -1,4 +1,4 @@
-"""What a robot says of itself that forbids to command it: a stop, a pause."""
+"""Checks of a UR's safety mode and speed scaling: whether it may be commanded."""
 
 from __future__ import annotations
 

@@ -358,7 +358,7 @@ class URRTDEOperator(Operator):
                 log.error("%s: reading failed: %s", self.embodiment.name, error)
 
     def _kick(self, now: float) -> None:
-        # An arm that nobody sees is for the controller's watchdog to stop.
+        # While the controller is silent its watchdog is left to stop the arm.
         due = self._spoke and now - self._spoke > 0.4 / self._watchdog_hz and not self._silent()
         if self._lock.acquire(blocking=False):
             try:
@@ -393,7 +393,7 @@ class URRTDEOperator(Operator):
     def _stop_servo(self) -> None:
         stop = partial(self._control.servoStop, ACCELERATION)
         if not within(_SILENT_S if self._silent() else _STOP_S, stop):
-            # The call still waits, in its thread, and the client bears one at a time.
+            # The call still waits, in its thread, and the client takes one at a time.
             self._broken = True
             log.error(
                 "%s: the controller does not answer; its watchdog stops the arm", self.robot_ip
@@ -414,7 +414,8 @@ class URRTDEOperator(Operator):
         return not self._broken and bool(self._control.isProgramRunning())
 
     def _not_obeying(self) -> Faulted:
-        # The two connections tell of one stop a cycle apart; what ended the script is more to say.
+        # The two connections report a stop a cycle apart; its cause explains more than the script's
+        # end.
         time.sleep(2.0 / _DATA_HZ)
         if self._newest is not None:
             check_safety(self._newest.safety)

@@ -1,4 +1,4 @@
-"""ur-rtde's client: getting it, and letting go of it."""
+"""The ur-rtde client: importing it, calls with a time limit, disconnecting."""
 
 from __future__ import annotations
 

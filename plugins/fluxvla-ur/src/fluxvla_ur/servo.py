@@ -1,11 +1,12 @@
-"""What becomes of streamed positions on a UR, and how often they must come.
+"""Streaming positions to a UR: the largest step that it takes, and the rate that follows.
 
 With ``forward_position_controller`` the driver hands each position to a program on the robot that
-moves there with ``servoj`` in one control cycle, 2 ms: whoever commands is the interpolator, and a
-slow one makes a staircase. The program also guards itself: a position that is further away than
-20 rad/s reach in one cycle, from the last one and from where the arm is, is ignored, and so is
-every one after it that is no nearer (``JOINT_IGNORE_SPEED`` and ``set_servo_setpoint`` of
-``external_control.urscript`` in UniversalRobots/Universal_Robots_Client_Library, commit c5d1e26).
+moves there with ``servoj`` in one control cycle, 2 ms: whatever sends the commands interpolates,
+and at a low rate the motion is a staircase. The program also guards itself: a position that is
+further away than 20 rad/s reach in one cycle, from the last one and from where the arm is, is
+ignored, and so is every one after it that is no nearer (``JOINT_IGNORE_SPEED`` and
+``set_servo_setpoint`` of ``external_control.urscript`` in
+UniversalRobots/Universal_Robots_Client_Library, commit c5d1e26).
 """
 
 from __future__ import annotations

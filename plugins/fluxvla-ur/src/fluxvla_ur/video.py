@@ -86,7 +86,7 @@ class VideoCamera:
         while not self._closing.is_set():
             there, picture = self._capture.read()
             if not there:
-                # A device that is gone says so at once, for ever; its silence is what is noticed.
+                # Every read of a device that is gone fails at once; its newest picture grows old.
                 self._closing.wait(0.05)
                 continue
             self._newest = time.monotonic(), np.ascontiguousarray(picture[..., ::-1])

@@ -31,8 +31,7 @@ from fluxvla_core.robot.events import (
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.trace import EpisodeTrace, Recording
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.ros2.frames import RobotFrame
-from fluxvla_core.ros2.streams import depth_stream
+from fluxvla_core.ros2 import RobotFrame, depth_stream
 
 
 class EpisodeRecorder(EpisodeObserver):

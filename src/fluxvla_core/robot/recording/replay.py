@@ -29,9 +29,7 @@ from fluxvla_core.robot.recording.recorded import (
     open_recording,
 )
 from fluxvla_core.robot.recording.ros_messages import BASE
-from fluxvla_core.ros2.actions import checked_action
-from fluxvla_core.ros2.frames import RobotFrame
-from fluxvla_core.ros2.streams import depth_stream
+from fluxvla_core.ros2 import RobotFrame, checked_action, depth_stream
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -5,19 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fluxvla_core.ros2 import IMAGE, Faults, Outbox, depth_stream, images, message_class
 from fluxvla_sim.render import Renderer, import_mujoco
-
-if TYPE_CHECKING:
-    from fluxvla_sim.ros2.node import NodeSettings
+from fluxvla_sim.ros2.settings import NodeSettings
 
 
 class Cameras(threading.Thread):
     """Draws each camera at its own time; ``check`` raises what ended the thread.
 
-    Colours and distances of a camera come from one drawing and bear one stamp, as an RGB-D camera's
+    Colours and distances of a camera come from one drawing and have one stamp, as an RGB-D camera's
     do. What nobody listens to is not drawn.
 
     Args:

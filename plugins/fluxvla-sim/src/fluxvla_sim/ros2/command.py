@@ -32,7 +32,7 @@ class SimCommand:
             default=1.0,
             metavar="F",
             help="simulated seconds in a second, for a machine that is too slow; default 1. The "
-            "operator must be told the same",
+            "operator needs the same real_time_factor",
         )
         parser.add_argument(
             "--camera-hz",
@@ -90,7 +90,7 @@ class SimCommand:
             action="append",
             default=[],
             metavar="STREAM=MODE[:AMOUNT][@S]",
-            help="make a stream ill, S seconds after the start (also at any time, as text on "
+            help="give a stream a fault, S seconds after the start (also at any time, as text on "
             f"/sim/fault; STREAM=well ends it). {_modes()}. Streams of aloha: 'left arm', 'right "
             "arm', base, top, left_wrist, right_wrist; of ur5e: arm, gripper, 'speed scaling', "
             "front, wrist; a camera's distances: top_depth, …",
@@ -107,7 +107,7 @@ class SimCommand:
     def run(self, args: Any) -> int:
         from fluxvla_core.commands import make_reporter
         from fluxvla_core.ros2 import require_rclpy
-        from fluxvla_sim.ros2.streams import stream_latency, timed_fault
+        from fluxvla_sim.ros2.settings import stream_latency, timed_fault
 
         if not args.ros2:
             raise UsageError(
@@ -128,17 +128,17 @@ class SimCommand:
         self, args: Any, faults: list[Any], latencies: dict[str, float], reporter: Any
     ) -> int:
         from fluxvla_sim.environment import ENVIRONMENTS
-        from fluxvla_sim.ros2.node import NodeSettings, simulate
-        from fluxvla_sim.ros2.streams import check_fault, check_stream
+        from fluxvla_sim.ros2.node import simulate
+        from fluxvla_sim.ros2.settings import NodeSettings, check_fault, check_stream
 
         robot = ENVIRONMENTS[args.robot].robot
         world, _ = robot.find(args.task or robot.default_tasks[0])
-        body = _aloha(args) if args.robot == "aloha" else _ur(args)
-        _some_cameras(body, args.cameras)
+        driver = _aloha(args) if args.robot == "aloha" else _ur(args)
+        _some_cameras(driver, args.cameras)
         for _, stream, fault in faults:
-            check_fault(body, stream, fault)
+            check_fault(driver, stream, fault)
         for stream in latencies:
-            check_stream(body, stream)
+            check_stream(driver, stream)
         settings = NodeSettings(
             name=args.robot,
             seed=args.seed,
@@ -152,7 +152,7 @@ class SimCommand:
             faults=faults,
             domain_id=args.domain_id,
         )
-        simulate(body, world, settings, reporter, args.render, args.seconds)
+        simulate(driver, world, settings, reporter, args.render, args.seconds)
         return 0
 
 
@@ -163,35 +163,35 @@ def _modes() -> str:
     return "; ".join(f"{names[mode]}: {what}" for mode, what in MODES.items())
 
 
-def _some_cameras(body: Any, names: list[str] | None) -> None:
-    unknown = [name for name in names or () if name not in body.cameras]
+def _some_cameras(driver: Any, names: list[str] | None) -> None:
+    unknown = [name for name in names or () if name not in driver.cameras]
     if unknown:
         raise UsageError(
-            f"no camera {', '.join(map(repr, unknown))}; there are {', '.join(body.cameras)}"
+            f"no camera {', '.join(map(repr, unknown))}; there are {', '.join(driver.cameras)}"
         )
     if names:
-        body.cameras = {name: body.cameras[name] for name in names}
+        driver.cameras = {name: driver.cameras[name] for name in names}
 
 
 def _aloha(args: Any) -> Any:
     from fluxvla_aloha.presets import PRESETS
 
-    from fluxvla_sim.ros2.bodies import AlohaBody
+    from fluxvla_sim.ros2.drivers import AlohaDriver
 
     if args.preset not in PRESETS:
         raise UsageError(f"unknown preset {args.preset!r}; known are {', '.join(PRESETS)}")
     if args.speed_scaling is not None:
         raise UsageError("an ALOHA has no speed slider: --speed-scaling is for a UR")
-    return AlohaBody(PRESETS[args.preset])
+    return AlohaDriver(PRESETS[args.preset])
 
 
 def _ur(args: Any) -> Any:
     from fluxvla_ur.operator import CONTROLLERS
 
-    from fluxvla_sim.ros2.bodies import URBody
+    from fluxvla_sim.ros2.drivers import URDriver
 
     if args.controller not in CONTROLLERS:
         raise UsageError(
             f"unknown controller {args.controller!r}; known are {', '.join(CONTROLLERS)}"
         )
-    return URBody(args.controller, 100.0 if args.speed_scaling is None else args.speed_scaling)
+    return URDriver(args.controller, 100.0 if args.speed_scaling is None else args.speed_scaling)

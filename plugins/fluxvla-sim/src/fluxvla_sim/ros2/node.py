@@ -16,18 +16,17 @@ then lives that much slower, its rates with it, and whoever drives it follows th
 from __future__ import annotations
 
 import json
-import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from fluxvla_mujoco import divergence
 
 from fluxvla_core.commands import Reporter
-from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation import Diverged
 from fluxvla_core.ros2 import (
     IMAGE,
@@ -39,10 +38,9 @@ from fluxvla_core.ros2 import (
     message_class,
     qos,
 )
-from fluxvla_sim.ros2.bodies import Body
 from fluxvla_sim.ros2.cameras import Cameras
-from fluxvla_sim.ros2.judge import Judge
-from fluxvla_sim.ros2.streams import check_fault, depths
+from fluxvla_sim.ros2.drivers import Driver
+from fluxvla_sim.ros2.settings import NodeSettings, check_fault, depths
 from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, World
 
 _FACTS_EVERY = 5
@@ -54,68 +52,6 @@ _WELL = "well"
 # Commands that may wait while this process is kept from running: a UR ignores what comes after a
 # gap, and a simulation's stall is none of the commander's.
 _WAITING = 200
-# Of a product of two rates; a billion parts are months.
-_ROUNDING = 1e-9
-
-
-@dataclass(frozen=True)
-class NodeSettings:
-    """How a simulated robot presents itself.
-
-    Args:
-        name: of the robot; ``sim_`` before it names the node.
-        seed: of the first scene.
-        real_time_factor: simulated seconds in a second.
-        state_hz: states a simulated second, of every stream of them. Above ``CONTROL_HZ`` the
-            physics goes in smaller parts of a control period, down to its own 2 ms.
-        camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
-            nobody listens to is not drawn.
-        latencies: stream -> simulated seconds that its messages are under way, with true stamps.
-        height, width: of every picture, in pixels.
-        best_effort: offer pictures as camera drivers do by default, not reliably.
-        faults: (seconds after the start, stream, fault), what falls ill by itself.
-        domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
-    """
-
-    name: str
-    seed: int = 0
-    real_time_factor: float = 1.0
-    state_hz: float = CONTROL_HZ
-    camera_hz: float = 30.0
-    latencies: Mapping[str, float] = field(default_factory=dict)
-    height: int = 480
-    width: int = 640
-    best_effort: bool = False
-    faults: Sequence[tuple[float, str, Fault]] = ()
-    domain_id: int | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 < self.real_time_factor <= 1:
-            raise ConfigError(
-                f"the real-time factor must be above 0 and at most 1, got {self.real_time_factor:g}"
-            )
-        if not 0 < self.camera_hz <= 1000:
-            raise ConfigError(f"cameras need a rate from 0 to 1000 Hz, got {self.camera_hz:g}")
-        most = CONTROL_HZ * SUBSTEPS
-        if not 0 < self.state_hz <= most:
-            raise ConfigError(
-                f"states need a rate from 0 to {most:g} Hz, as the physics is stepped; "
-                f"got {self.state_hz:g}"
-            )
-
-    @property
-    def parts(self) -> int:
-        """Into how many parts a control period is divided: as few as ``state_hz`` allows."""
-        whole = (n for n in range(1, SUBSTEPS + 1) if SUBSTEPS % n == 0)
-        return next(n for n in whole if CONTROL_HZ * n >= self.state_hz)
-
-    def states_by(self, part: int) -> int:
-        """How many states are said by the end of so many parts of control periods."""
-        return math.floor(part * self.state_hz / (CONTROL_HZ * self.parts) + _ROUNDING)
-
-    def latency_s(self, stream: str) -> float:
-        """How long a stream's messages are under way, in seconds of the wall clock."""
-        return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
 @dataclass
@@ -129,11 +65,50 @@ class Counts:
     refused: dict[str, int] = field(default_factory=dict)
 
 
+class Judge:
+    """Keeps the facts of each episode, and judges every task of the world.
+
+    An episode's steps begin with its first command, as in an evaluation: until then nothing can
+    have been done. After the world's ``max_steps`` its outcome is settled.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._facts = world.begin()
+        self._seed = 0
+        self._resets = 0
+
+    def reset(self, seed: int) -> None:
+        """An episode begins."""
+        self._facts = self._world.begin()
+        self._seed = seed
+        self._resets += 1
+
+    def after(self, scene: Scene) -> None:
+        """One more control period has passed since the first command."""
+        if self._facts.steps < self._world.max_steps:
+            self._facts = self._facts.after(scene)
+
+    def facts(self) -> dict[str, Any]:
+        """JSON values: ``seed``, ``resets`` (how many episodes began), ``steps`` and ``tasks``:
+        name -> ``instruction``, ``success``, ``done``."""
+        tasks = {
+            task.name: {
+                "instruction": task.instruction,
+                "success": task.success(self._facts),
+                "done": task.done(self._facts) or self._facts.steps >= self._world.max_steps,
+            }
+            for task in self._world.tasks
+        }
+        steps = self._facts.steps
+        return {"seed": self._seed, "resets": self._resets, "steps": steps, "tasks": tasks}
+
+
 class RobotNode:
     """Opens the connection at once; ``run`` simulates; ``close`` ends both.
 
     Args:
-        body: the robot's side of its topics.
+        driver: the robot's side of its topics.
         scene: the physics.
         judge: of the scene's world.
 
@@ -143,22 +118,22 @@ class RobotNode:
 
     def __init__(
         self,
-        body: Body,
+        driver: Driver,
         scene: Scene,
         settings: NodeSettings,
         reporter: Reporter,
         judge: Judge,
     ) -> None:
         self.counts = Counts()
-        self._body, self._scene, self._settings = body, scene, settings
+        self._driver, self._scene, self._settings = driver, scene, settings
         self._reporter, self._judge = reporter, judge
         self._faults = Faults()
-        # The scene's data, the body's target and what is set by topics.
+        # The scene's data, the driver's target and what is set by topics.
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._commanded = False
         self._parts = 0
-        self._told: dict[str, Any] = {}
+        self._published: dict[str, Any] = {}
         self._connection = Connection(f"sim_{settings.name}", settings.domain_id)
         try:
             self._reset(settings.seed)
@@ -177,7 +152,7 @@ class RobotNode:
         cameras = Cameras(
             self._scene.model,
             self._pictures,
-            tuple(self._body.cameras),
+            tuple(self._driver.cameras),
             self._settings,
             self._faults,
             self._look,
@@ -230,17 +205,17 @@ class RobotNode:
         whole = self._parts % parts == 0
         with self._lock:
             simulated = self._simulated(now)
-            self._scene.advance(self._body.target(simulated), SUBSTEPS // parts)
+            self._scene.advance(self._driver.target(simulated), SUBSTEPS // parts)
             why = divergence(self._scene.data)
             if why is not None:  # a robot that jumps home by itself is none
                 raise Diverged(f"the simulation diverged: {why}")
             if whole and self._commanded:
                 self._judge.after(self._scene)
             due = self._settings.states_by(self._parts) > self._settings.states_by(self._parts - 1)
-            said = self._body.say(self._scene.state, simulated) if due else {}
+            messages = self._driver.messages(self._scene.state, simulated) if due else {}
             # Within the lock, so that no state of before a reset is stamped after it.
             stamp = self._now().to_msg()
-        for stream, message in said.items():
+        for stream, message in messages.items():
             if stream in self._publishers:
                 if hasattr(message, "header"):
                     message.header.stamp = stamp
@@ -248,16 +223,16 @@ class RobotNode:
                 outbox.put(stream, self._publishers[stream], message, sent)
         if whole:
             self.counts.periods += 1
-            self._tell()
+            self._publish_facts()
 
-    def _tell(self) -> None:
+    def _publish_facts(self) -> None:
         with self._lock:
-            told, reset_at = self._judge.tell(), self._reset_at
-        news = any(told[key] != self._told.get(key) for key in ("resets", "tasks"))
+            facts, reset_at = self._judge.facts(), self._reset_at
+        news = any(facts[key] != self._published.get(key) for key in ("resets", "tasks"))
         if news or self.counts.periods % _FACTS_EVERY == 0:
-            self._told = told
+            self._published = facts
             facts = {
-                **told,
+                **facts,
                 "reset_at": reset_at,
                 "time": self.counts.periods / CONTROL_HZ,
                 "late": self.counts.late,
@@ -274,41 +249,40 @@ class RobotNode:
         return self._connection.node.get_clock().now()
 
     def _open(self) -> None:
-        connection, body = self._connection, self._body
+        connection, driver = self._connection, self._driver
         self._string = message_class("std_msgs.msg:String")
         self._publishers = {
             stream: connection.publisher(topic, message_class(message), depth=5)
-            for stream, (topic, message) in body.states.items()
+            for stream, (topic, message) in driver.states.items()
         }
         offered = qos.BEST_EFFORT if self._settings.best_effort else qos.RELIABLE
         self._pictures = {
             stream: connection.publisher(topic, message_class(IMAGE), offered, depth=2)
-            for stream, topic in {**body.cameras, **depths(body)}.items()
+            for stream, topic in {**driver.cameras, **depths(driver)}.items()
         }
-        said = body.say(self._scene.state, self._simulated(time.monotonic()))
-        for stream, (topic, message) in body.latched.items():
-            profile = qos.profile(qos.RELIABLE, 1, latched=True)
-            kept = connection.node.create_publisher(message_class(message), topic, profile)
-            kept.publish(said[stream])
+        messages = driver.messages(self._scene.state, self._simulated(time.monotonic()))
+        for stream, (topic, message) in driver.latched.items():
+            publisher = connection.publisher(topic, message_class(message), latched=True)
+            publisher.publish(messages[stream])
         self._facts_publisher = connection.publisher("/sim/facts", self._string)
-        for topic, message in {**body.commands, **body.knobs}.items():
-            self._listen(topic, message, self._hear(topic))
-        self._listen("/sim/reset", "std_msgs.msg:Int64", lambda m: self._reset(int(m.data)))
-        self._listen("/sim/fault", "std_msgs.msg:String", lambda m: self._ill(m.data))
+        for topic, message in {**driver.commands, **driver.knobs}.items():
+            self._subscribe(topic, message, self._receiver(topic))
+        self._subscribe("/sim/reset", "std_msgs.msg:Int64", lambda m: self._reset(int(m.data)))
+        self._subscribe("/sim/fault", "std_msgs.msg:String", lambda m: self._set_fault(m.data))
 
-    def _listen(self, topic: str, message: str, callback: Callable[[Any], None]) -> None:
+    def _subscribe(self, topic: str, message: str, callback: Callable[[Any], None]) -> None:
         profile = qos.profile(qos.RELIABLE, _WAITING)
         self._connection.node.create_subscription(message_class(message), topic, callback, profile)
 
-    def _hear(self, topic: str) -> Callable[[Any], None]:
-        def hear(message: Any) -> None:
+    def _receiver(self, topic: str) -> Callable[[Any], None]:
+        def receive(message: Any) -> None:
             now = self._simulated(time.monotonic())
             try:
                 with self._lock:
                     if self._is_late(message, now):
                         return
-                    self._body.hear(topic, message, now)
-                    self._commanded |= topic in self._body.commands
+                    self._driver.receive(topic, message, now)
+                    self._commanded |= topic in self._driver.commands
             except BadMessage as error:
                 # What a driver does with nonsense: nothing.
                 refused = self.counts.refused
@@ -318,7 +292,7 @@ class RobotNode:
                 return
             self.counts.commands += 1
 
-        return hear
+        return receive
 
     def _is_late(self, message: Any, now: float) -> bool:
         """Whether a command was under way when the episode began: it was for the one before."""
@@ -333,19 +307,19 @@ class RobotNode:
         with self._lock:
             self._reset_s = self._simulated(time.monotonic())
             self._scene.reset(max(seed, 0))
-            self._body.reset(self._scene.state)
+            self._driver.reset(self._scene.state)
             self._judge.reset(max(seed, 0))
             self._reset_at = self._now().nanoseconds
             self._commanded = False
 
-    def _ill(self, text: str) -> None:
+    def _set_fault(self, text: str) -> None:
         stream, _, mode = text.partition("=")
         if mode == _WELL:
             self._faults.clear(stream)
             return
         try:
             stream, fault = Fault.parse(text)
-            check_fault(self._body, stream, fault)
+            check_fault(self._driver, stream, fault)
         except FluxError as error:
             self._reporter.warn(str(error))
             return
@@ -359,7 +333,7 @@ class RobotNode:
 
 
 def simulate(
-    body: Body,
+    driver: Driver,
     world: World,
     settings: NodeSettings,
     reporter: Reporter,
@@ -375,15 +349,15 @@ def simulate(
         As ``RobotNode`` and its ``run``.
     """
     scene = world.open_scene(render)
-    node = RobotNode(body, scene, settings, reporter, Judge(world))
+    node = RobotNode(driver, scene, settings, reporter, Judge(world))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())
     try:
-        topics = [topic for topic, _ in body.states.values()]
+        topics = [topic for topic, _ in driver.states.values()]
         reporter.info(
             f"simulating {settings.name} at {settings.real_time_factor:g} of real time: "
-            f"{', '.join([*topics, *body.cameras.values()])}; "
-            f"commands on {', '.join(body.commands)}; Ctrl-C ends"
+            f"{', '.join([*topics, *driver.cameras.values()])}; "
+            f"commands on {', '.join(driver.commands)}; Ctrl-C ends"
         )
         node.run(seconds)
     finally:

@@ -1,8 +1,8 @@
-"""Real robots' operators that know that their robot is simulated.
+"""Operators for robots that ``fluxvla sim`` simulates behind ROS 2.
 
 ``AlohaSimROSOperator`` is ``AlohaOperator``, ``URSimROSOperator`` is ``UROperator``: the same
-topics, messages and checks, and three things more that only a simulation can do. It begins an
-episode from a seed, it tells whether the task is done, and it may live slower than real time.
+topics, messages and checks. A simulation can do three things more: begin an episode from a seed,
+report whether the task is done, and run slower than real time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from fluxvla_core.ros2 import (
     message_class,
 )
 from fluxvla_sim.operators import check_arms
-from fluxvla_sim.ros2.clock import SlowedClock
 
 log = logging.getLogger("fluxvla.sim")
 
@@ -46,8 +45,30 @@ _SETTLE_S = 0.2
 _KEPT = 0.95
 
 
+class SlowedClock:
+    """The monotonic clock at ``factor`` of its speed: what is a second here takes 1 / factor.
+
+    A control loop that lives by it sends 50 commands in a simulated second, whatever that takes;
+    its deadlines, watchdogs and latencies are all in the robot's time. A policy so has more time to
+    think than on a real robot: results must state the factor.
+    """
+
+    lockstep = False
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+
+    def now(self) -> float:
+        return time.monotonic() * self.factor
+
+    def sleep_until(self, deadline: float) -> None:
+        left = deadline / self.factor - time.monotonic()
+        if left > 0:
+            time.sleep(left)
+
+
 class InSimulation(RosOperator):
-    """Put before a robot's operator among the bases of a class.
+    """Mixin for the operator of a robot that ``fluxvla sim`` simulates; first of the bases.
 
     Args:
         seed: places the objects in the first episode; each later one adds 1.
@@ -138,7 +159,7 @@ class InSimulation(RosOperator):
         # the simulator take commands in an episode's first 0.1 s.
         wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)
         at = self.facts()["reset_at"] + round(wait_s * 1e9)
-        streams = [spec.name for spec in self._specs_of(STATE, CAMERA)]
+        streams = [spec.name for spec in self.streams() if spec.kind in (STATE, CAMERA)]
         self._wait(
             lambda: all(self._stamp(name) >= at for name in streams),
             "the simulator shows nothing of the new episode",
@@ -166,7 +187,7 @@ class InSimulation(RosOperator):
         Raises:
             NotReady: there was none yet.
         """
-        return self._told()[0]
+        return self._newest_facts()[0]
 
     def episode_facts(self) -> dict[str, Any]:
         """JSON values about how the last episode was simulated, for whoever reports its outcome.
@@ -198,10 +219,10 @@ class InSimulation(RosOperator):
 
     def _simulated(self) -> tuple[float, float]:
         """Simulated seconds of the newest facts, and when they came (monotonic)."""
-        facts, receipt = self._told()
+        facts, receipt = self._newest_facts()
         return float(facts["time"]), receipt
 
-    def _told(self) -> tuple[Mapping[str, Any], float]:
+    def _newest_facts(self) -> tuple[Mapping[str, Any], float]:
         received = self.newest("facts")
         if received is None:
             raise NotReady(f"the simulator ({FACTS}) has said nothing yet")

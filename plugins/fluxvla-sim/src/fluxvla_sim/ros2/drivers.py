@@ -1,4 +1,4 @@
-"""A robot's side of its topics: what it says of its state, and what it makes of commands."""
+"""Simulated ROS drivers: state messages from a scene's state, joint targets from commands."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from fluxvla_core.ros2 import (
     joints,
     message_class,
 )
-from fluxvla_sim.ros2.base import Base
 
 Array = npt.NDArray[np.float64]
+TIMEOUT_S = 0.5
+"""A speed that is not asked for again within this time ends, as real bases have it."""
 
 
-class Body(Protocol):
-    """Between a scene's numbers and a robot's messages; knows no publisher and no time of its own.
+class Driver(Protocol):
+    """Converts between a scene's numbers and a robot's messages; has no publisher and no clock.
 
     ``states`` and ``latched`` are stream -> (topic, message type), ``cameras`` and ``depths`` are
     the scene's camera -> topic, ``commands`` is topic -> message type. So is ``knobs``, what a
@@ -43,10 +44,10 @@ class Body(Protocol):
     commands: Mapping[str, str]
     knobs: Mapping[str, str]
 
-    def say(self, state: Array, now: float) -> dict[str, Any]:
+    def messages(self, state: Array, now: float) -> dict[str, Any]:
         """Stream -> message, of the scene's ``(D,)`` state; ``latched`` ones too."""
 
-    def hear(self, topic: str, message: Any, now: float) -> None:
+    def receive(self, topic: str, message: Any, now: float) -> None:
         """Take a command, or what a knob is set to.
 
         Raises:
@@ -60,7 +61,61 @@ class Body(Protocol):
         """Forget all commands; the arm stays at ``state``."""
 
 
-class AlohaBody:
+class MobileBase:
+    """Takes a ``Twist``, gives its ``Odometry``: a differential drive that has its speed at once.
+
+    The scene does not move: table and objects would have to come along. Only the odometry shows
+    where the base is.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Stand still, where odometry begins."""
+        self._x = self._y = self._heading = 0.0
+        self._forward = self._turning = 0.0
+        self._at = self._until = 0.0
+
+    def drive(self, message: Any, topic: str, now: float) -> None:
+        """Take a speed.
+
+        Raises:
+            BadMessage: it is not finite.
+        """
+        forward, turning = float(message.linear.x), float(message.angular.z)
+        if not (math.isfinite(forward) and math.isfinite(turning)):
+            raise BadMessage(f"{topic}: a speed is not finite")
+        self._roll(now)
+        self._forward, self._turning = forward, turning
+        self._until = now + TIMEOUT_S
+
+    def odometry(self, now: float) -> Any:
+        """The odometry at ``now``."""
+        self._roll(now)
+        message = message_class(ODOMETRY)()
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        pose, twist = message.pose.pose, message.twist.twist
+        pose.position.x, pose.position.y = self._x, self._y
+        pose.orientation.z = math.sin(self._heading / 2)
+        pose.orientation.w = math.cos(self._heading / 2)
+        twist.linear.x, twist.angular.z = self._forward, self._turning
+        return message
+
+    def _roll(self, now: float) -> None:
+        passed = min(now, self._until) - self._at
+        if passed > 0:
+            # Half of the turn before the way, half after it: exact to the second order.
+            self._heading += self._turning * passed / 2
+            self._x += self._forward * passed * math.cos(self._heading)
+            self._y += self._forward * passed * math.sin(self._heading)
+            self._heading += self._turning * passed / 2
+        self._at = now
+        if now >= self._until:
+            self._forward = self._turning = 0.0
+
+
+class AlohaDriver:
     """Two arms with grippers on a mobile base, as their drivers present them.
 
     Args:
@@ -84,7 +139,7 @@ class AlohaBody:
         scene = ("top", "left_wrist", "right_wrist")
         self.cameras = dict(zip(scene, preset.images, strict=True))
         self.depths = dict(zip(scene, preset.depths, strict=True))
-        self._base = Base()
+        self._base = MobileBase()
         # Topic -> the columns of the action that it commands.
         self._columns: dict[str, range] = {}
         self.commands: dict[str, str] = {preset.velocity: TWIST}
@@ -99,17 +154,17 @@ class AlohaBody:
                 self.commands[gripper] = gripper_message or preset.gripper_message
         self._target: Array = np.zeros(2 * self._ARM)
 
-    def say(self, state: Array, now: float) -> dict[str, Any]:
-        said = {"base": self._base.say(now)}
+    def messages(self, state: Array, now: float) -> dict[str, Any]:
+        messages = {"base": self._base.odometry(now)}
         for index, name in enumerate(self._arms):
             arm = state[self._ARM * index : self._ARM * (index + 1)].copy()
             arm[-1] = self._raw(arm[-1])
-            said[name] = joints.fill(message_class(JOINT_STATE)(), self._preset.joints, arm)
-        return said
+            messages[name] = joints.fill(message_class(JOINT_STATE)(), self._preset.joints, arm)
+        return messages
 
-    def hear(self, topic: str, message: Any, now: float) -> None:
+    def receive(self, topic: str, message: Any, now: float) -> None:
         if topic == self._preset.velocity:
-            self._base.hear(message, topic, now)
+            self._base.drive(message, topic, now)
             return
         columns = self._columns[topic]
         names = [self._preset.joints[column % self._ARM] for column in columns]
@@ -134,7 +189,7 @@ class AlohaBody:
         return (raw - closed) / (opened - closed)
 
 
-class URBody:
+class URDriver:
     """A UR arm as ur_robot_driver presents it, and a gripper that takes and gives a number.
 
     Like the program on a real robot it ignores streamed positions that are too far away.
@@ -152,7 +207,7 @@ class URBody:
     _GRIPPER = "/gripper/command"
     _SLIDER = "/sim/speed_scaling"
     _SCALED = "scaled_joint_trajectory_controller"
-    # Older drivers sort joints by name; whoever reads them by index is found out here.
+    # Older drivers sort joints by name: an operator that reads them by index fails here.
     _NAMES = tuple(sorted(JOINTS))
 
     def __init__(self, controller: str = STREAMED, speed_scaling: float = 100.0) -> None:
@@ -181,7 +236,7 @@ class URBody:
         self.knobs = {self._SLIDER: FLOAT64}
         self.reset(np.zeros(self._ARM + 1))
 
-    def say(self, state: Array, now: float) -> dict[str, Any]:
+    def messages(self, state: Array, now: float) -> dict[str, Any]:
         where = dict(zip(JOINTS, state, strict=False))
         self._measured = np.array(state[: self._ARM])
         arm = message_class(JOINT_STATE)()
@@ -193,7 +248,7 @@ class URBody:
             "program running": message_class(BOOL)(data=True),
         }
 
-    def hear(self, topic: str, message: Any, now: float) -> None:
+    def receive(self, topic: str, message: Any, now: float) -> None:
         if topic == self._GRIPPER:
             self._gripper = command_values(message, ("gripper",), topic)[0]
             return

@@ -1,4 +1,7 @@
-"""How an arm comes to hold in a stop: the commands from the last one to the one that holds it."""
+"""What an arm may be sent: checked actions, and the commands of a stop.
+
+A stop goes from the last command to the one that holds the arm, within its limits.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.errors import Rejected
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.tracking import HOLD_REACH
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -25,8 +29,30 @@ _APART_S = 0.25
 _LONGEST_S = 3.0
 
 
+def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
+    """A fresh ``(dim,)`` float64 copy of ``action``.
+
+    Raises:
+        Rejected: another shape, not finite, or outside the joints' position limits.
+    """
+    values = np.array(action, dtype=np.float64)
+    if values.shape != (embodiment.dim,):
+        raise Rejected(
+            f"{embodiment.name} takes actions of shape ({embodiment.dim},), got {values.shape}"
+        )
+    for joint, value in zip(embodiment.joints, values, strict=True):
+        if not np.isfinite(value):
+            raise Rejected(f"{joint.name}: the command is {value}, not a finite number")
+        if not joint.lower <= value <= joint.upper:
+            raise Rejected(
+                f"{joint.name}: the command {value:.4g} {joint.unit} is outside "
+                f"[{joint.lower:.4g}, {joint.upper:.4g}]"
+            )
+    return values
+
+
 class Motion:
-    """What an arm was sent last and how fast it moves by that: what a stop goes on from."""
+    """The last commands of an arm and their times: the motion that a stop has to brake."""
 
     def __init__(self) -> None:
         self._last: Array | None = None
@@ -37,24 +63,23 @@ class Motion:
     def sent(self, command: Array) -> None:
         """A ``(dim,)`` command was sent now."""
         now = time.monotonic()
-        apart = now - self._at
-        known = self._last is not None and apart < _APART_S
-        self._before = (self._last, apart) if known and self._last is not None else None
+        last, apart = self._last, now - self._at
+        self._before = (last, apart) if last is not None and apart < _APART_S else None
         self._last, self._at = command, now
 
-    def way_to_hold(
+    def stop_commands(
         self, embodiment: EmbodimentSpec, last: Array, measured: tuple[Measured, Measured] | None
     ) -> list[Array]:
-        """The commands of a stop, after which what was sent is no motion any more.
+        """The commands of a stop, one at least; the motion before it is forgotten.
 
         Args:
             embodiment: whose limits, and whose rate.
             last: ``(dim,)`` the last command.
-            measured: the arm's newest state and the one before it; None where it does not say.
+            measured: the arm's newest state and the one before it; None if unknown.
         """
         period = 1.0 / embodiment.rate_hz
         before, apart = self._before or (last, period)
-        # Commands come at a beat, however late a single one is.
+        # Commands come at a fixed rate, however late a single one is.
         seconds = max(round(apart / period), 1) * period
         moving = time.monotonic() - self._at <= 2.5 * seconds
         self._last = self._before = None
@@ -64,7 +89,7 @@ class Motion:
             ahead = time.monotonic() - receipt + PATIENCE_S
             moved = (state - earlier) * (ahead / (receipt - then) if receipt > then else 0.0)
             target = hold_target(embodiment, last, state, moved)
-        return list(way_to_hold(embodiment, last, before if moving else last, seconds, target))
+        return list(braking_commands(embodiment, last, before if moving else last, seconds, target))
 
     def wait(self, embodiment: EmbodimentSpec) -> None:
         """Wait until the next command of a stop is due: not sooner after the last than usual."""
@@ -100,7 +125,7 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Ar
     return target
 
 
-def way_to_hold(
+def braking_commands(
     embodiment: EmbodimentSpec, last: Array, before: Array, seconds: float, target: Array
 ) -> Array:
     """Commands from the last one to rest, within the limits of the embodiment.

@@ -1,0 +1,115 @@
+"""The newest messages of an operator's streams: checked for age, matched in time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+from fluxvla_core.ros2 import discovery, sync
+from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, Received, StreamSpec
+from fluxvla_core.ros2.sync import Stale
+
+# How often a wait for messages that belong together looks again.
+POLL_S = 0.002
+
+
+class Readings:
+    """What the streams of one connection received.
+
+    Args:
+        connection: with all streams subscribed.
+        specs: the streams.
+        max_age_s, max_skew_s, sync_on: see ``RosOperator``.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        specs: Sequence[StreamSpec],
+        max_age_s: float,
+        max_skew_s: float,
+        sync_on: str,
+    ) -> None:
+        self._connection = connection
+        self._specs = specs
+        self._states = [spec.name for spec in specs if spec.kind == STATE]
+        self._in_frames = [spec.name for spec in specs if spec.kind in (STATE, CAMERA, DEPTH)]
+        self._max_age = max_age_s
+        self._max_skew = max_skew_s
+        self._sync_on = sync_on
+
+    def newest(self) -> dict[str, Received]:
+        """The newest message of every stream that has one.
+
+        Raises:
+            Stale: a stream is silent that should not be.
+            Faulted: the connection broke.
+        """
+        self._connection.check()
+        streams = self._connection.streams
+        newest = {spec.name: streams[spec.name].newest() for spec in self._specs}
+        watched = {
+            spec.name: newest[spec.name]
+            for spec in self._specs
+            if not spec.latched and (spec.required or newest[spec.name] is not None)
+        }
+        silent = sync.silent(watched, time.monotonic(), self._max_age)
+        if silent:
+            whole = len(silent) == len(watched)
+            raise discovery.silent_streams(self._connection, silent, self._max_age, whole)
+        return {name: received for name, received in newest.items() if received is not None}
+
+    def states(self, index: int = -1) -> dict[str, Received]:
+        """One message of each ``state`` stream, which has had one, whatever their ages are.
+
+        Args:
+            index: -1 for the newest, -2 for the one before it, or the newest if it is the only one.
+        """
+        kept = self._kept(self._states)
+        return {name: items[max(index, -len(items))] for name, items in kept.items()}
+
+    def check_states_together(self) -> None:
+        """Refuse ``state`` streams whose newest messages are of different times.
+
+        Raises:
+            Stale: their stamps are too far apart.
+        """
+        if self._sync_on == "stamp" and not self._clock_stepped():
+            sync.check_together(self._kept(self._states), self._max_skew, sync.wall())
+
+    def matched(self) -> Mapping[str, Received]:
+        """Messages of state, cameras and depth that belong together, one of each stream.
+
+        Waits up to ``max_age_s`` for them: a burst puts a stream apart from the others for a
+        moment, one that fell silent is named as such in this time, and only a driver that is late
+        stays apart.
+
+        Raises:
+            Stale: a stream is silent or late, or they are too far apart in time.
+            Faulted: the connection broke.
+        """
+        until = time.monotonic() + self._max_age
+        while True:
+            self.newest()
+            by = "receipt" if self._clock_stepped() else self._sync_on
+            kept = self._kept(self._in_frames)
+            try:
+                self.check_states_together()
+                match = sync.match(kept, self._max_skew, by, sync.wall())
+                sync.check_age(match, time.monotonic(), self._max_age)
+            except Stale:
+                if time.monotonic() >= until:
+                    raise
+                time.sleep(POLL_S)
+            else:
+                return match.messages
+
+    def _kept(self, names: Sequence[str]) -> dict[str, tuple[Received, ...]]:
+        return {name: self._connection.streams[name].ring.items() for name in names}
+
+    def _clock_stepped(self) -> bool:
+        """Whether a sender's clock stepped so recently that stamps on both sides are kept."""
+        since = time.monotonic() - self._max_age
+        steps = [stream.ring.stepped_at for stream in self._connection.streams.values()]
+        return any(at is not None and at > since for at in steps)

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.evaluation.divergence import Diverged
 from fluxvla_core.evaluation.policies import RandomPolicy, fit, resolve_name
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.evaluation.worker import memory_mb, swapped_task
 from fluxvla_core.spec.embodiment import Camera
 

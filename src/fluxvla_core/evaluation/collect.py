@@ -25,10 +25,9 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
-from fluxvla_core.evaluation.divergence import Diverged, check_step
 from fluxvla_core.evaluation.policies import fit, resolve_name
 from fluxvla_core.evaluation.pool import Outcome, run_jobs
-from fluxvla_core.evaluation.rollout import ChunkCommands, shaped
+from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
 from fluxvla_core.evaluation.worker import choose_tasks
 from fluxvla_core.robot.checks import not_finite
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec

@@ -9,6 +9,7 @@ are kept, so an evaluation that was interrupted goes on.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +33,6 @@ from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
 from fluxvla_core.evaluation.provenance import Code, code_of, provenance
 from fluxvla_core.evaluation.results import choose_episodes
 from fluxvla_core.evaluation.statistics import problems, summarise
-from fluxvla_core.robot.runner import FOLDER as EPISODES
 
 FOLDER = "eval_robot"
 GROUP = "policy"
@@ -208,17 +208,24 @@ class RobotEvalRunner(Runner):
         simulated = runner.robot.simulated
         if not simulated:
             self._ask(f"{key.task}, episode {key.seed}: put things in place, then press Enter: ")
-        before, began, failure = set(self._folders()), time.monotonic(), None
+        began, failure = time.monotonic(), None
         try:
             runner.run()
         except FluxError as error:
             failure = error
-        made = sorted(set(self._folders()) - before)
-        summary = _summary(made[-1]) if made else {}
-        if failure is not None and not summary:
+        if failure is not None and (runner.recorder is None or not runner.recorder.summary):
             raise failure
-        record = {**_head(key), "attempts": 1, **_tail(summary, time.monotonic() - began)}
-        record["folder"] = made[-1].relative_to(self.context.work_dir).as_posix()
+        summary = runner.recorder.summary
+        folder = os.path.relpath(runner.recorder.folder, self.context.work_dir)
+        record: dict[str, Any] = {
+            "group": key.group,
+            "task": key.task,
+            "seed": key.seed,
+            "status": DONE,
+            "attempts": 1,
+            **_counted(summary, time.monotonic() - began),
+            "folder": Path(folder).as_posix(),
+        }
         record |= Operator.adapt(runner.ros_operator).episode_facts()
         rules = [trip["rule"] for trip in summary["trips"]]
         if failure is None and record["success"] is None:
@@ -252,9 +259,6 @@ class RobotEvalRunner(Runner):
         getattr(self.context.reporter, "settle", lambda: None)()
         return input(question).strip()
 
-    def _folders(self) -> list[Path]:
-        return [p for p in (Path(self.context.work_dir) / EPISODES).glob("*-*") if p.is_dir()]
-
     def _videos(self, records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         shown = []
         for record in choose_episodes(records, self.record_videos):
@@ -278,11 +282,7 @@ def _named(
     return {str(task): str(task) for task in (known if tasks is None else tasks)}
 
 
-def _head(key: EpisodeKey) -> dict[str, Any]:
-    return {"group": key.group, "task": key.task, "seed": key.seed, "status": DONE}
-
-
-def _tail(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+def _counted(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     """Of an episode's summary what evaluations count, as JSON values."""
     kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_beats")
     answers = summary["timings"].get("policy", {"count": 0, "p50_ms": 0.0})
@@ -295,14 +295,6 @@ def _tail(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
             "policy_seconds": answers["count"] * answers["p50_ms"] / 1e3,
         },
     }
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    path = folder / "episode.json"
-    if not path.is_file():
-        return {}
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
 
 
 def _kept_time(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.policy import Actor
-from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.evaluation.divergence import check_state, check_step
+from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.checks import not_finite
 from fluxvla_core.robot.commands import CommandFormer
 from fluxvla_core.robot.joining import interpolate
@@ -211,3 +210,38 @@ def shaped(chunk: Any, dim: int) -> Array:
 def find_task(tasks: Sequence[TaskSpec], name: str) -> TaskSpec:
     """The task called ``name``, which is one of ``tasks``."""
     return next(task for task in tasks if task.name == name)
+
+
+class Diverged(RunFailed):
+    """A simulation diverged, so the episode's outcome says nothing about the policy."""
+
+
+def check_step(environment: Environment, steps: int) -> Array:
+    """The environment's state after so many steps.
+
+    Raises:
+        Diverged: it is not finite, or the environment's ``divergence()`` says what went wrong.
+    """
+    state = environment.state
+    check_state(state, steps)
+    why = environment.divergence()
+    if why is not None:
+        raise Diverged(
+            f"the simulation diverged in the first {steps} steps: {why}",
+            cause="what happened was too fast for the simulator's time step, as two bodies that "
+            "are pressed into each other; the episode says nothing about the policy",
+        )
+    return state
+
+
+def check_state(state: Any, steps: int) -> None:
+    """Refuse a state that is not finite after so many steps.
+
+    Raises:
+        Diverged: the message says after how many.
+    """
+    if not np.isfinite(state).all():
+        raise Diverged(
+            f"the environment's state is not finite after {steps} steps",
+            cause="the simulation diverged",
+        )

@@ -30,7 +30,7 @@ from fluxvla_core.evaluation.episode_log import (
     open_episode_log,
 )
 from fluxvla_core.evaluation.episodes import Shard, episode_keys, run_in_pool, shard_of
-from fluxvla_core.evaluation.live_settings import Live, live_options
+from fluxvla_core.evaluation.live import LiveSettings, live_options
 from fluxvla_core.evaluation.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
@@ -97,8 +97,9 @@ class EvalRunner(Runner):
         swap_seed: of the first of these episodes; by default they repeat those of the policy.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
         live: on the wall clock, through the control loop and the safety of a robot, into
-            ``<work_dir>/eval_live/``: True, or a table with the keys ``live.TAKEN`` of an
-            inference runner. Slow policies miss ticks; outcomes depend on the machine.
+            ``<work_dir>/eval_live/``: True, or a table with those keys of an inference runner
+            that ``live.LIVE_OPTIONS`` lists. Slow policies miss ticks; outcomes depend on the
+            machine.
         workers: processes that simulate, 2 by default and 1 live; ``--nproc`` overrides it.
         batch_size: rows of every forward pass of the policy. Results follow from it, because sums
             do; they do not follow from how many of the rows were in use.
@@ -407,7 +408,7 @@ class EvalRunner(Runner):
         )
         return {"shard": part.index, "episodes_left": left}
 
-    def _live_settings(self, spec: EnvironmentSpec) -> Live | None:
+    def _live_settings(self, spec: EnvironmentSpec) -> LiveSettings | None:
         if self._live is None:
             return None
         if not spec.limited:
@@ -420,7 +421,7 @@ class EvalRunner(Runner):
         if self._course.replan_every is not None:
             options.setdefault("execute_horizon", self._course.replan_every)
         fps = self._video[3] if self.record_videos else None
-        return Live(options, str(self.folder / RECORDS), fps)
+        return LiveSettings(options, str(self.folder / RECORDS), fps)
 
     def _ready(self) -> tuple[EnvironmentSpec, Settings]:
         assert self._spec is not None, "run_setup() comes first"

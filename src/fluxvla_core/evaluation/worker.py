@@ -14,7 +14,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episode_log import POLICY, SWAPPED, EpisodeKey
-from fluxvla_core.evaluation.live_settings import Live
+from fluxvla_core.evaluation.live import LiveSettings, run_live
 from fluxvla_core.evaluation.policies import Source, fit, make_policy
 from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
@@ -89,7 +89,7 @@ class Settings:
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
     served: Mapping[str, Facts] = field(default_factory=dict)
-    live: Live | None = None
+    live: LiveSettings | None = None
 
 
 class EpisodeWorker:
@@ -149,10 +149,8 @@ class EpisodeWorker:
         return self._completed(record, cameras)
 
     def _live(
-        self, live: Live, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
+        self, live: LiveSettings, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
     ) -> dict[str, Any]:
-        from fluxvla_core.evaluation.live import run_live
-
         task, course = find_task(self.environment.spec.tasks, key.task), self._settings.course
         record = run_live(
             f"{key.group}-{key.task}-{key.seed}",

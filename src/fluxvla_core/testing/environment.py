@@ -22,9 +22,8 @@ import pytest
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.evaluation.divergence import Diverged
 from fluxvla_core.evaluation.policies import RandomPolicy
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.plugins.registry import ENVIRONMENTS
 from fluxvla_core.spec.embodiment import Camera
 

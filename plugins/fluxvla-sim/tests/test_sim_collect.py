@@ -14,7 +14,6 @@ from fluxvla_sim.expert import SimExpert
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
-from fluxvla_core.evaluation import find_task
 from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera
 
@@ -29,7 +28,7 @@ def environment():
 
 
 def act(environment, name, **arguments):
-    task = find_task(environment.spec.tasks, name)
+    task = environment.spec.task(name)
     return demonstrate(environment, SimExpert(**arguments), task, 3, [CAMERA])
 
 

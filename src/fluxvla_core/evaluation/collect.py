@@ -25,7 +25,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
-from fluxvla_core.evaluation.policies import fit, resolve_name
+from fluxvla_core.evaluation.policies import match_policy, resolve_policy
 from fluxvla_core.evaluation.pool import Outcome, run_jobs
 from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
 from fluxvla_core.evaluation.worker import choose_tasks
@@ -102,7 +102,7 @@ def collect(
     actor = _actor(collection, environment)
     environment.close()
     choose_tasks(spec.tasks, collection.tasks)
-    fit(actor, spec)
+    match_policy(actor, spec)
     cameras = _cameras(collection, spec)
     fps = spec.embodiment.rate_hz / frame_stride(actor, spec)
     return collect_episodes(
@@ -243,13 +243,13 @@ def _checked(chunk: Any, spec: EnvironmentSpec) -> npt.NDArray[np.float64]:
 
 
 def _actor(collection: Collection, environment: Environment) -> Actor:
-    what = resolve_name(collection.policy, environment)
-    if isinstance(what, str):
+    policy = resolve_policy(collection.policy, environment)
+    if isinstance(policy, str):
         raise ConfigError(
-            f"policy {what!r} demonstrates nothing: its actions are what was learned",
+            f"policy {policy!r} demonstrates nothing: its actions are what was learned",
             next="evaluate it: fluxvla run --section eval",
         )
-    return Actor.adapt(build_policy_from_cfg(what))
+    return Actor.adapt(build_policy_from_cfg(policy))
 
 
 def _cameras(collection: Collection, spec: EnvironmentSpec) -> tuple[Camera, ...]:

@@ -35,11 +35,11 @@ from fluxvla_core.evaluation.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
     UNTRAINED,
-    Source,
+    PolicySource,
     chosen_checkpoint,
     load,
     policy_tables,
-    resolve_name,
+    resolve_policy,
 )
 from fluxvla_core.evaluation.policy_server import PolicyServer
 from fluxvla_core.evaluation.pool import WorkerPool
@@ -210,8 +210,8 @@ class EvalRunner(Runner):
         self._environment = plain(environment)
         self._video = (video_cameras, video_height, video_width, video_fps)
         self._policy = policy if isinstance(policy, str) else plain(policy)
-        self._source = Source(
-            what=CHECKPOINT,
+        self._source = PolicySource(
+            policy=CHECKPOINT,
             dataset=dataset,
             denormalize_action=denormalize_action,
             norm_stats_key=norm_stats_key,
@@ -221,7 +221,7 @@ class EvalRunner(Runner):
         )
         served = batch_size > 1 or not device.startswith("cpu")
         self._serve = served if serve_policy is None else serve_policy
-        self._course = RolloutSettings((), replan_every, max_steps, policy_seed)
+        self._rollout = RolloutSettings((), replan_every, max_steps, policy_seed)
         self._size = None if height is None or width is None else (height, width)
         self._checkpoint: dict[str, Any] | None = None
         self._spec: EnvironmentSpec | None = None
@@ -239,7 +239,7 @@ class EvalRunner(Runner):
         """
         environment = Environment.adapt(build_environment_from_cfg(self._environment))
         self._spec = environment.spec
-        what = resolve_name(self._policy, environment)
+        policy = resolve_policy(self._policy, environment)
         environment.close()
         names, height, width, fps = self._video
         try:
@@ -247,23 +247,23 @@ class EvalRunner(Runner):
         except ConfigError as error:
             raise self.wrong("video_cameras", error.what) from error
         self._tasks = choose_tasks(self._spec.tasks, self._given)
-        if what in FROM_CHECKPOINT or self.baseline:
+        if policy in FROM_CHECKPOINT or self.baseline:
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]
-        sources = {POLICY: replace(self._source, what=what, ckpt_path=path)}
+        sources = {POLICY: replace(self._source, policy=policy, ckpt_path=path)}
         if self.baseline:
-            sources[UNTRAINED] = replace(sources[POLICY], what=UNTRAINED)
+            sources[UNTRAINED] = replace(sources[POLICY], policy=UNTRAINED)
         self._settings = Settings(
             environment=self._environment,
             tasks=tuple(task.name for task in self._tasks),
             sources=sources,
-            course=self._course,
+            rollout=self._rollout,
             size=self._size,
             video=video,
             live=self._live_settings(self._spec),
         )
-        tables = [self._environment, what, self._source.dataset, self._source.denormalize_action]
+        tables = [self._environment, policy, self._source.dataset, self._source.denormalize_action]
         if path is not None:
             tables += policy_tables(path)
         simulators = environment.distributions
@@ -356,11 +356,11 @@ class EvalRunner(Runner):
         """What outcomes follow from, beside each episode's key; JSON values."""
         spec, settings = self._ready()
         source = asdict(settings.sources[POLICY])
-        policy = source.pop("what")
+        policy = source.pop("policy")
         del source["ckpt_path"]
-        course = asdict(settings.course)
-        del course["cameras"]
-        values: dict[str, Any] = {**course, "size": settings.size, **source, **spec.details}
+        rollout = asdict(settings.rollout)
+        del rollout["cameras"]
+        values: dict[str, Any] = {**rollout, "size": settings.size, **source, **spec.details}
         if self._live is not None:
             values["live"] = self._live
         if self.instruction_swap:
@@ -386,7 +386,7 @@ class EvalRunner(Runner):
         loaders = {
             name: partial(load, source)
             for name, source in settings.sources.items()
-            if self._serve and source.what in FROM_CHECKPOINT
+            if self._serve and source.policy in FROM_CHECKPOINT
         }
         timeout = self.episode_timeout_s
         if not loaders:
@@ -418,8 +418,8 @@ class EvalRunner(Runner):
                 "safety of a robot cannot be kept for its actions",
             )
         options = dict(self._live)
-        if self._course.replan_every is not None:
-            options.setdefault("execute_horizon", self._course.replan_every)
+        if self._rollout.replan_every is not None:
+            options.setdefault("execute_horizon", self._rollout.replan_every)
         fps = self._video[3] if self.record_videos else None
         return LiveSettings(options, str(self.folder / RECORDS), fps)
 

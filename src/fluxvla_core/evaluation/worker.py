@@ -15,9 +15,9 @@ from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episode_log import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluation.live import LiveSettings, run_live
-from fluxvla_core.evaluation.policies import Source, fit, make_policy
+from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
 from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
-from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.spec.embodiment import Camera
 
 
@@ -76,7 +76,7 @@ class Settings:
         tasks: names of the tasks that are evaluated; a wrong instruction is one of theirs if it
             can be.
         sources: where the policy of ``policy`` and that of ``untrained`` come from.
-        course: how episodes are run; its cameras are filled in for each policy.
+        rollout: how episodes are run; its cameras are filled in for each policy.
         size: height and width of the policy's pictures; as it was trained by default.
         served: policies that the parent answers for, by group.
         live: on the wall clock instead of stepped.
@@ -84,8 +84,8 @@ class Settings:
 
     environment: Mapping[str, Any]
     tasks: tuple[str, ...]
-    sources: Mapping[str, Source]
-    course: RolloutSettings
+    sources: Mapping[str, PolicySource]
+    rollout: RolloutSettings
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
     served: Mapping[str, Facts] = field(default_factory=dict)
@@ -126,21 +126,21 @@ class EpisodeWorker:
             job = Job(job)
         settings, key = self._settings, job.key
         actor, cameras = self.actor(key.group)
-        tasks = self.environment.spec.tasks
+        spec = self.environment.spec
         if settings.live is not None:
             return self._live(settings.live, key, actor, cameras)
-        instructed = None
+        instruction_of = None
         if key.group == SWAPPED:
-            instructed = find_task(tasks, swapped_task(self.environment, key.task, settings.tasks))
+            instruction_of = spec.task(swapped_task(self.environment, key.task, settings.tasks))
         film = None if job.video is None else Film(Path(job.video), settings.video)
         try:
             record = run_episode(
                 self.environment,
                 actor,
-                find_task(tasks, key.task),
+                spec.task(key.task),
                 key.seed,
-                replace(settings.course, cameras=cameras),
-                instructed,
+                replace(settings.rollout, cameras=cameras),
+                instruction_of,
                 film,
             )
         finally:
@@ -151,16 +151,16 @@ class EpisodeWorker:
     def _live(
         self, live: LiveSettings, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
     ) -> dict[str, Any]:
-        task, course = find_task(self.environment.spec.tasks, key.task), self._settings.course
+        task, rollout = self.environment.spec.task(key.task), self._settings.rollout
         record = run_live(
             f"{key.group}-{key.task}-{key.seed}",
             self.environment,
             actor,
             task,
             key.seed,
-            course.policy_seed + key.seed,
+            rollout.policy_seed + key.seed,
             cameras,
-            course.max_steps or task.max_steps,
+            rollout.max_steps or task.max_steps,
             live,
         )
         return self._completed(record, cameras)
@@ -181,7 +181,7 @@ class EpisodeWorker:
                 actor = ServedPolicy(self._link, name, self._settings.served[name])
             else:
                 actor = make_policy(self._settings.sources[name])
-            cameras = fit(actor, self.environment.spec, self._settings.size)
+            cameras = match_policy(actor, self.environment.spec, self._settings.size)
             self._actors[name] = actor, cameras
         return self._actors[name]
 
@@ -217,16 +217,18 @@ class Film:
             self._writer.close()
 
 
-def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> str:
-    """The task to ask for instead of ``task``: the next one, round and round, that could be done
-    in its scene; one of ``wanted`` if there is one.
+def swapped_task(environment: Environment, task: str, evaluated: Sequence[str]) -> str:
+    """The task whose instruction the policy gets instead of that of ``task``.
+
+    It is the next one, cyclically, that could be done in the same scene, and one of ``evaluated``
+    if possible.
 
     Raises:
         ConfigError: the environment's scenes allow no other task.
     """
     names: list[str] = [each.name for each in environment.spec.tasks]
-    others = list(environment.others(task))
-    others = [name for name in others if name in wanted] or others
+    others = list(environment.other_tasks(task))
+    others = [name for name in others if name in evaluated] or others
     if not others:
         raise ConfigError(
             f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
@@ -238,7 +240,7 @@ def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> 
 
 
 def memory_mb() -> float:
-    """The most memory that this process ever had (resident), in MiB; 0 where nobody tells."""
+    """The most memory that this process ever had (resident), in MiB; 0 if unknown."""
     status = Path("/proc/self/status")
     if status.exists():
         # Not getrusage: on Linux a new process begins with the peak of the one that started it.

@@ -26,8 +26,7 @@ HEIGHT, WIDTH = 480, 640
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The evaluation engine: workers, episode log, records."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
-    from fluxvla_core.evaluation.episodes import run_in_pool
+    from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
     from fluxvla_core.evaluation.policies import PolicySource
     from fluxvla_core.evaluation.pool import WorkerPool
     from fluxvla_core.evaluation.rollout import RolloutSettings

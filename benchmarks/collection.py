@@ -39,8 +39,7 @@ from fluxvla_sim.expert import SimExpert
 from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluation.collect import demonstrate
-from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
-from fluxvla_core.evaluation.episodes import run_in_pool
+from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
 from fluxvla_core.evaluation.policies import PolicySource
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode

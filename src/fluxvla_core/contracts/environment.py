@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -72,6 +73,22 @@ class EnvironmentSpec:
     def task(self, name: str) -> TaskSpec:
         """The task called ``name``, which is one of ``tasks``."""
         return next(task for task in self.tasks if task.name == name)
+
+    def select_tasks(self, names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
+        """The tasks called ``names``, in their order; all of them for None.
+
+        Raises:
+            ConfigError: there is none of that name, or one is named twice.
+        """
+        if names is None:
+            return self.tasks
+        known = {task.name: task for task in self.tasks}
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
+        if not names or len(set(names)) != len(names):
+            raise ConfigError(f"tasks must name each task once, got {list(names)}")
+        return tuple(known[name] for name in names)
 
 
 @dataclass(frozen=True)

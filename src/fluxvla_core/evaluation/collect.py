@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,12 +25,11 @@ from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
 from fluxvla_core.evaluation.policies import match_policy, resolve_policy
-from fluxvla_core.evaluation.pool import Outcome, run_jobs
+from fluxvla_core.evaluation.pool import Outcome, WorkerPool
 from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
-from fluxvla_core.evaluation.worker import choose_tasks
 from fluxvla_core.robot.checks import not_finite
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
-from fluxvla_core.untrusted import checked, read_json
+from fluxvla_core.untrusted import read_json
 
 META, SETTINGS = "meta", "collection.json"
 _GO_ON = "run the same command with --resume"
@@ -101,7 +99,7 @@ def collect(
     spec: EnvironmentSpec = environment.spec
     actor = _actor(collection, environment)
     environment.close()
-    choose_tasks(spec.tasks, collection.tasks)
+    spec.select_tasks(collection.tasks)
     match_policy(actor, spec)
     cameras = _cameras(collection, spec)
     fps = spec.embodiment.rate_hz / frame_stride(actor, spec)
@@ -126,7 +124,7 @@ class Demonstrator:
         self._environment = Environment.adapt(build_environment_from_cfg(collection.environment))
         self._spec = self._environment.spec
         self._actor = _actor(collection, self._environment)
-        self._tasks = choose_tasks(self._spec.tasks, collection.tasks)
+        self._tasks = self._spec.select_tasks(collection.tasks)
         self._cameras = _cameras(collection, self._spec)
 
     def __call__(self, episode: int) -> Demonstration:
@@ -339,8 +337,8 @@ def collect_episodes(
             raise explain_disk(error, out, "no episode was lost", next) from error
         kept = writer.episodes
         jobs = range(kept, episodes)
-        with closing(run_jobs(factory, jobs, workers)) as outcomes:
-            for number, found in _in_order(outcomes, jobs):
+        with WorkerPool(factory, workers) as pool:
+            for number, found in _in_order(pool.run(jobs), jobs):
                 for frame in range(len(found.states)):
                     pictures = {name: stack[frame] for name, stack in found.images.items()}
                     writer.add_frame(
@@ -394,51 +392,3 @@ def _check_same(note: Path, settings: Mapping[str, Any]) -> None:
             f"the interrupted collection had other settings: {'; '.join(other)}",
             next=f"use the same settings, or delete {note.parent} and begin anew",
         )
-
-
-def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | None:
-    """Whether none of ``seeds`` was among those that demonstrations were collected with.
-
-    Args:
-        tables: of a checkpoint's config, from which its datasets are found.
-        environment: the ``type`` of what is evaluated; seeds of another one mean something else.
-
-    Returns:
-        None where a dataset does not say how it was collected.
-    """
-    roots = list(_roots(tables))
-    collections = [_collection(Path(root)) for root in roots]
-    if not roots or None in collections:
-        return None
-    for collection in collections:
-        assert collection is not None
-        if collection["environment"].get("type") != environment:
-            continue
-        first, count = collection["seed"], collection["episodes"]
-        if any((seed - first) % SPARE_STRIDE < count for seed in seeds):
-            return False
-    return True
-
-
-def _roots(table: Any) -> Iterator[str]:
-    """Every ``data_root_path`` below ``table``."""
-    if isinstance(table, Mapping):
-        roots = table.get("data_root_path")
-        for root in roots if isinstance(roots, (list, tuple)) else [roots]:
-            if isinstance(root, str):
-                yield root
-        table = list(table.values())
-    if isinstance(table, (list, tuple)):
-        for value in table:
-            yield from _roots(value)
-
-
-def _collection(root: Path) -> dict[str, Any] | None:
-    try:
-        found = read_json(root / META / SETTINGS, dict[str, Any], DataError)
-        whole = {"environment": dict[str, Any], "seed": int, "episodes": int}
-        return {
-            name: checked(found.get(name), kind, DataError, name) for name, kind in whole.items()
-        }
-    except DataError:
-        return None

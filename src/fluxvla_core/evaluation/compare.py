@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episode_log import DONE, FORMAT, FORMER, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, whole_lines
 from fluxvla_core.evaluation.statistics import all_of, mcnemar_test, rate, verdict
 
 NAMED = 5

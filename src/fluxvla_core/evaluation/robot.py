@@ -22,7 +22,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 from fluxvla_core.evaluation import results
-from fluxvla_core.evaluation.episode_log import (
+from fluxvla_core.evaluation.episodes import (
     DONE,
     ERROR,
     EpisodeKey,
@@ -164,11 +164,7 @@ class RobotEvalRunner(Runner):
             "videos": self._videos(records),
             "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
         }
-        path = self.folder / "results.json"
-        results.write_results(path, found)
-        results.keep_config(self.folder, self.context)
-        reporter.artifact("evaluation", path)
-        results.report_results(reporter, found, self.folder)
+        results.save_results(self.folder, found, self.context)
         results.check_all_done(records, log.path)
         return found
 

@@ -21,15 +21,17 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results
-from fluxvla_core.evaluation.collect import unseen_seeds
-from fluxvla_core.evaluation.episode_log import (
+from fluxvla_core.evaluation.episodes import (
     POLICY,
     SWAPPED,
     EpisodeKey,
     EpisodeLog,
+    Shard,
+    episode_keys,
     open_episode_log,
+    run_in_pool,
+    shard_of,
 )
-from fluxvla_core.evaluation.episodes import Shard, episode_keys, run_in_pool, shard_of
 from fluxvla_core.evaluation.live import LiveSettings, live_options
 from fluxvla_core.evaluation.policies import (
     CHECKPOINT,
@@ -43,7 +45,7 @@ from fluxvla_core.evaluation.policies import (
 )
 from fluxvla_core.evaluation.policy_server import PolicyServer
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.provenance import Code, code_of, drawn, provenance
+from fluxvla_core.evaluation.provenance import Code, code_of, provenance, rendering, unseen_seeds
 from fluxvla_core.evaluation.results import (
     choose_episodes,
     record_videos,
@@ -63,7 +65,6 @@ from fluxvla_core.evaluation.worker import (
     Job,
     Settings,
     Video,
-    choose_tasks,
 )
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
@@ -246,7 +247,7 @@ class EvalRunner(Runner):
             video = Video.of(self._spec, names, height, width, fps)
         except ConfigError as error:
             raise self.wrong("video_cameras", error.what) from error
-        self._tasks = choose_tasks(self._spec.tasks, self._given)
+        self._tasks = self._spec.select_tasks(self._given)
         if policy in FROM_CHECKPOINT or self.baseline:
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
@@ -327,7 +328,7 @@ class EvalRunner(Runner):
                 **provenance(self._code),
                 "seeds": results.seeds(records),
                 "unseen_seeds": self._unseen,
-                "pictures": drawn(records),
+                "pictures": rendering(records),
                 "reused": {"episodes": len(log.reused), "changed": log.changed},
             },
             "videos": videos,
@@ -335,11 +336,7 @@ class EvalRunner(Runner):
         }
         if self._live is not None:
             found["live"] = results.ticks(records)
-        path = self.folder / "results.json"
-        results.write_results(path, found)
-        results.keep_config(self.folder, self.context)
-        reporter.artifact("evaluation", path)
-        results.report_results(reporter, found, self.folder)
+        results.save_results(self.folder, found, self.context)
         if new:  # what others have to try again is theirs: failing here would end them, too
             results.check_all_done(records, log.path)
         return found

@@ -26,7 +26,7 @@ from statistics import NormalDist, mean
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episode_log import DONE, POLICY, SWAPPED
+from fluxvla_core.evaluation.episodes import DONE, POLICY, SWAPPED, reason
 
 CONFIDENCE = 0.95
 
@@ -121,13 +121,6 @@ def describe_problem(row: Mapping[str, Any]) -> str:
     many = "1 episode" if count == 1 else f"{count} episodes"
     failed = "failed" if row["status"] == DONE else "gave no result"
     return f"{row['group']}: {many} {failed}: {row['what']}"
-
-
-def reason(text: str) -> str:
-    """What a message or a traceback says in one line: the last that is no advice."""
-    lines = text.strip().splitlines()
-    said = [line for line in lines if not line.startswith(("  likely cause: ", "  next: "))]
-    return (said or lines)[-1].strip()
 
 
 def all_of(tasks: int) -> str:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluation.episode_log import POLICY, SWAPPED, EpisodeKey
+from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluation.live import LiveSettings, run_live
 from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
 from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
@@ -253,20 +253,3 @@ def memory_mb() -> float:
         return 0.0
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(most / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
-
-
-def choose_tasks(tasks: Sequence[TaskSpec], names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
-    """The tasks that are meant, in the order of ``names``; all of them for None.
-
-    Raises:
-        ConfigError: there is none of that name, or one is named twice.
-    """
-    if names is None:
-        return tuple(tasks)
-    known = {task.name: task for task in tasks}
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
-    if not names or len(set(names)) != len(names):
-        raise ConfigError(f"tasks must name each task once, got {list(names)}")
-    return tuple(known[name] for name in names)

@@ -1,7 +1,7 @@
-"""Environments and evaluation: what a simulator, a benchmark or a demonstration is written with.
+"""Public API for simulation environments, evaluation runners and data collection.
 
-An environment offers tasks and steps a simulation; an evaluation runner plays episodes in it and
-counts successes.
+An environment has tasks and steps a simulation; an evaluation runner runs episodes in it and counts
+successes.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Demonstrations of a policy, a scripted expert as a rule, in any environment.
+"""Collect demonstrations of a policy, usually a scripted expert, in any environment.
 
-Episode ``k`` is acted out with seed ``seed + k``; where the expert fails, or the simulation
-diverges, with the next of that episode's own spare seeds. What it shows follows from ``k`` alone,
-so the dataset is the same for any number of workers, and a collection that was interrupted can go
-on.
+Episode ``k`` is run with seed ``seed + k``; where the expert fails, or the simulation diverges,
+with the next of that episode's own spare seeds. Its content follows from ``k`` alone, so the
+dataset is the same for any number of workers, and an interrupted collection can be continued.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ SPARE_STRIDE = 500_000_000
 
 @dataclass(frozen=True)
 class Collection:
-    """What a dataset follows from.
+    """Settings of a collection, from which its dataset follows.
 
     Args:
         environment: the table of a registered environment.
@@ -117,7 +116,7 @@ def collect(
 
 
 class Demonstrator:
-    """A worker: acts out the episode of a number, with spare seeds where the expert fails."""
+    """A worker: runs the episode of a number, with spare seeds where the expert fails."""
 
     def __init__(self, collection: Collection) -> None:
         self._collection = collection
@@ -158,20 +157,20 @@ class Demonstrator:
 def demonstrate(
     environment: Environment, actor: Actor, task: TaskSpec, seed: int, cameras: Sequence[Camera]
 ) -> tuple[Demonstration, bool]:
-    """Act out ``task`` and record its first ``record_steps`` steps.
+    """Run an episode of ``task`` and record its first ``record_steps`` steps.
 
-    A frame is what is seen before its steps; its action is what the actor wants to have reached at
-    the next frame: the first action of its chunk. What is executed on the way there is the actor's
-    ``executed``, or leads straight to it. So noise can be in what is done and not in what is
-    taught, which leads back (Laskey et al., "DART", CoRL 2017).
+    A frame is the observation before its steps; its action is the actor's target for the next
+    frame: the first action of its chunk. The commands on the way there are the actor's
+    ``executed``, or a straight line. So noise can be in the executed commands and not in the
+    recorded actions, which lead back (Laskey et al., "DART", CoRL 2017).
 
     Returns:
-        The episode, and whether the task was done, judged over all of it.
+        The episode, and whether the task was done at its end.
 
     Raises:
         SpecMismatch: the actor's chunk is of another shape.
         RunFailed: it is not finite.
-        Diverged: the simulation is not what it was.
+        Diverged: the simulation diverged.
     """
     environment, actor = Environment.adapt(environment), Actor.adapt(actor)
     spec = environment.spec
@@ -208,7 +207,7 @@ def demonstrate(
 
 
 def frame_stride(actor: Actor, spec: EnvironmentSpec) -> int:
-    """Control steps from frame to frame: a frame is an action of the actor.
+    """Control steps from one frame to the next; there is one frame for each of the actor's actions.
 
     Raises:
         ConfigError: the actor's rate does not divide the environment's.
@@ -270,12 +269,12 @@ def _cameras(collection: Collection, spec: EnvironmentSpec) -> tuple[Camera, ...
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode.
+    """One recorded episode.
 
     Args:
         images: camera name -> ``(N, H, W, 3)`` uint8.
         states: ``(N, S)``; actions: ``(N, D)``, in the embodiment's units.
-        instruction: what was done.
+        instruction: the language instruction of the task.
         retried: how many attempts failed before.
     """
 
@@ -349,7 +348,7 @@ def collect_episodes(
                 frames += len(found.states)
                 pace = (number + 1 - kept) / (time.monotonic() - began)
                 reporter.progress("demonstrations", number + 1, episodes, per_s=round(pace, 2))
-    # Where it stays: whoever evaluates what was trained on it knows which seeds it has seen.
+    # It stays with the dataset, so that an evaluation knows the seeds of the training data.
     write_json(out / META / SETTINGS, dict(settings))
     seconds = time.monotonic() - began
     result = {

@@ -223,14 +223,14 @@ class EpisodeLog:
     def settled(self, keys: Iterable[EpisodeKey]) -> list[dict[str, Any]] | None:
         """The record of every one of ``keys``, in their order, or None while one is missing.
 
-        An error counts: whoever had the episode tried it as often as it may be tried.
+        An error counts: the process that had the episode tried it as often as allowed.
         """
         records = [self._done.get(key, self._errors.get(key)) for key in keys]
         found = [record for record in records if record is not None]
         return found if len(found) == len(records) else None
 
     def look_beside(self) -> None:
-        """Take in what others have written by now.
+        """Read what other processes have written by now.
 
         Raises:
             OSError: a file cannot be read.

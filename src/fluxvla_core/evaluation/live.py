@@ -175,7 +175,7 @@ class EnvironmentOperator(Operator):
         """Hold: the last command stays."""
 
     def close(self) -> None:
-        """Nothing: the environment belongs to whoever made it."""
+        """Nothing: whoever made the environment closes it."""
 
     def _over(self) -> bool:
         ended = self._last_step is not None and bool(self._last_step.ended)

@@ -1,4 +1,4 @@
-"""Jobs for worker processes that may crash.
+"""A pool of worker processes for jobs that may crash.
 
 A worker is built once per process by a factory and then called with one job after another. A
 process that dies, hangs or raises is replaced: what made one job fail may be broken for good in it,
@@ -283,9 +283,9 @@ def _serve(
     plugins: tuple[str, ...],
     link: Connection | None,
 ) -> None:
-    """A worker process's life: build the worker, answer jobs until the pipe closes."""
+    """Main function of a worker process: build the worker, run jobs until the pipe closes."""
     leave_stopping_to_the_parent()
-    with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
+    with suppress(EOFError, OSError):  # the parent is gone: no answer is needed
         try:
             load_plugin_files(plugins)
             work = factory() if link is None else factory(link)

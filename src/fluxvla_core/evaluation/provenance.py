@@ -1,4 +1,4 @@
-"""What results come from beside their settings: code, versions, machine, commit and date.
+"""Provenance of results: code, versions, machine, commit, date, and seeds that were trained on.
 
 An episode's outcome follows from its key, the evaluation's settings, the code that ran it and the
 libraries below. The last two are a ``Code``: every episode log holds the one that its episodes are
@@ -93,7 +93,7 @@ def commit(folder: Path) -> str | None:
     """Of the git checkout that ``folder`` is tracked in, with ``+changes`` where files were
     changed since; None where there is none, or no git."""
     if _git(folder, "ls-files", "--error-unmatch", ".") is None:
-        return None  # an environment within somebody else's repository
+        return None  # an environment within another repository
     head = _git(folder, "rev-parse", "HEAD")
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
     return f"{head}+changes" if head and changed else head

@@ -1,9 +1,9 @@
-"""``RobotEvalRunner``: a policy's success rate on a robot, one episode after the other.
+"""``RobotEvalRunner``: evaluates a policy's success rate on a robot.
 
-What drives the robot is the config's inference section as it stands: its runner, its operator, all
-of its safety, in real time. A simulated robot begins every episode from a seed and tells whether
-the task was done; with a real one a person puts things in place and says so. Episodes that ended
-are kept, so an evaluation that was interrupted goes on.
+The robot is driven by the config's inference section as it stands: its runner, its operator, all
+of its safety, in real time. A simulated robot begins every episode from a seed and reports whether
+the task was done; with a real one a person sets up the scene and answers whether it was. Finished
+episodes are kept, so an evaluation that was interrupted can continue.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from fluxvla_core.evaluation.statistics import problems, summarise
 
 FOLDER = "eval_robot"
 GROUP = "policy"
-POLICYS_FAULT = ("chunk", "policy", "starvation", "tracking")
+POLICY_RULES = ("chunk", "policy", "starvation", "tracking")
 """Rules of a safety stop that the policy is to blame for: the episode counts as a failure. After
 any other stop it counts as an error, which says nothing about the policy."""
 
@@ -57,10 +57,10 @@ class RobotEvalRunner(Runner):
         seed: of each task's first episode, for the policy and, where the section's operator takes
             one, for the scene; the others count up from it.
         go_on: after a safety stop, go on with the next episode. Only for robots that can hurt
-            nobody: else somebody must look first, and start the same command again.
+            nobody: with any other a person must look first, and start the same command again.
         record_videos: how many episodes the results show: failures first, then successes.
         answer: reads a person's line; stdin by default.
-        reuse: also count episodes that other code ran; without it that is asked.
+        reuse: also count existing episodes that other code ran, which is an error otherwise.
 
     Raises:
         ConfigError: there is no such section, it has no such task, or a value is impossible.
@@ -124,7 +124,7 @@ class RobotEvalRunner(Runner):
         """Run the episodes that are not there yet, write ``results.json``, return what is in it.
 
         Raises:
-            RunFailed: nobody can tell whether a task was done; an episode gave no result (the
+            RunFailed: it is unknown whether a task was done; an episode gave no result (the
                 results of the others are written).
             UsageError: there are episodes that other code ran, and ``reuse`` is not set.
             SafetyStop, OperatorError: what ended an episode, unless ``go_on``.
@@ -225,8 +225,8 @@ class RobotEvalRunner(Runner):
         record |= Operator.adapt(runner.ros_operator).episode_facts()
         rules = [trip["rule"] for trip in summary["trips"]]
         if failure is None and record["success"] is None:
-            record["success"] = self._judged(key)
-        elif failure is not None and rules[:1] and rules[0] in POLICYS_FAULT:
+            record["success"] = self._ask_success(key)
+        elif failure is not None and rules[:1] and rules[0] in POLICY_RULES:
             record["success"] = False
         elif failure is not None:
             record |= {"status": ERROR, "error": str(failure)}
@@ -238,7 +238,7 @@ class RobotEvalRunner(Runner):
             self.context.reporter.warn(f"{key.task}, episode {key.seed}: {failure}")
         return record
 
-    def _judged(self, key: EpisodeKey) -> bool:
+    def _ask_success(self, key: EpisodeKey) -> bool:
         while True:
             said = self._ask(f"{key.task}, episode {key.seed}: was the task done? [y/n] ")
             if said[:1].casefold() in ("y", "n"):

@@ -1,4 +1,4 @@
-"""``EvalRunner``: a policy's success rate in any environment.
+"""``EvalRunner``: evaluates a policy's success rate in any environment.
 
 Every episode's outcome follows from the policy, its task and its seed. Neither the number of
 processes, nor the machines, nor an interruption changes anything but the time.
@@ -90,8 +90,8 @@ class EvalRunner(Runner):
         seed: of each task's first episode; the others count up from it.
         policy_seed: the policy's seed is this more than the episode's.
         tasks: names of the tasks; all by default.
-        replan_every: how many actions of a chunk are used before the policy is asked again; all of
-            them by default.
+        replan_every: how many actions of a chunk are executed before the policy is queried again;
+            all of them by default.
         max_steps: control steps after which an episode ends, instead of the environment's.
         instruction_swap: also give the policy another task's instruction, and test whether the
             right one does better.
@@ -116,8 +116,8 @@ class EvalRunner(Runner):
         height, width: of the policy's pictures; as in its training data by default.
         device, mixed_precision_dtype: of the policy.
         episode_timeout_s: an episode that takes longer is tried again in a new process.
-        reuse: also count episodes that other code ran (other versions, changed plugins) which are
-            there; without it that is asked.
+        reuse: also count existing episodes that other code ran (other versions, changed plugins),
+            which is an error otherwise.
 
     Raises:
         ConfigError: a value is impossible.
@@ -400,8 +400,8 @@ class EvalRunner(Runner):
         left = sum(log.settled([key]) is None for key in keys)
         part: Shard = self.shard
         self.context.reporter.info(
-            f"part {part.index} of {part.count} is done; {left} episodes of others are not, and "
-            "whoever ends last writes the results"
+            f"part {part.index} of {part.count} is done; {left} episodes of other parts are not: "
+            "the process that ends last writes the results"
         )
         return {"shard": part.index, "episodes_left": left}
 

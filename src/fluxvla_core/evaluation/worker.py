@@ -1,4 +1,4 @@
-"""What an evaluation's worker processes do; imported there, and light until then."""
+"""Worker processes of an evaluation: environment, policy, and one episode after another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluation.live import LiveSettings, run_live
 from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
-from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
+from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.spec.embodiment import Camera
 
@@ -69,16 +69,16 @@ class Job:
 
 @dataclass(frozen=True)
 class Settings:
-    """What workers need to know; every outcome follows from it and the episode's key.
+    """Settings of the worker processes; every outcome follows from them and the episode's key.
 
     Args:
         environment: the table of a registered environment.
-        tasks: names of the tasks that are evaluated; a wrong instruction is one of theirs if it
-            can be.
+        tasks: names of the tasks that are evaluated; a wrong instruction is of one of them if
+            possible.
         sources: where the policy of ``policy`` and that of ``untrained`` come from.
         rollout: how episodes are run; its cameras are filled in for each policy.
         size: height and width of the policy's pictures; as it was trained by default.
-        served: policies that the parent answers for, by group.
+        served: attributes of the policies that the parent serves, by group.
         live: on the wall clock instead of stepped.
     """
 
@@ -88,15 +88,15 @@ class Settings:
     rollout: RolloutSettings
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
-    served: Mapping[str, Facts] = field(default_factory=dict)
+    served: Mapping[str, PolicyFacts] = field(default_factory=dict)
     live: LiveSettings | None = None
 
 
 class EpisodeWorker:
     """Runs episodes in one process: a function from a job to the record of its episode.
 
-    Environment and policy are made at once, the untrained twin when it is first needed; all are
-    kept.
+    Environment and policy are made at once, the untrained baseline when it is first needed; all
+    are kept.
 
     Args:
         link: to a ``PolicyServer``, where there are served policies.

@@ -31,8 +31,7 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
-from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS
+from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 

@@ -224,5 +224,5 @@ def test_an_expert_acts_in_libero_only_and_with_noise_up_to_one():
     expert = LiberoExpert()
     with pytest.raises(ConfigError, match="in LiberoEnvironment only, not in object"):
         expert.enter(object())
-    with pytest.raises(ConfigError, match="must be told where it acts"):
+    with pytest.raises(ConfigError, match="does not know its environment"):
         expert.predict_action({})

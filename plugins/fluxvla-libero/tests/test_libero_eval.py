@@ -290,7 +290,7 @@ def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, list
         infer(tmp_path, listener, "wave at me", **limited)
     (summary,) = infer(tmp_path, listener, "wave at me", scene=2, **limited)
     assert (summary["success"], summary["outcome"], summary["steps"]) == (None, "ended", 2)
-    assert "nobody can judge it after 2 steps" in listener.lines
+    assert "success unknown after 2 steps" in listener.lines
     with pytest.raises(UsageError, match="cannot be done in the scene of"):
         infer(tmp_path, listener, "6", scene=2, **limited)
     with pytest.raises(UsageError, match="no task was given"):

@@ -37,7 +37,7 @@ class LiberoEvalRunner(EvalRunner):
         tasks: which of the suite's, by index or name; all by default.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         norm_stats_key: which of the checkpoint's statistics.
-        eval_chunk_size: how many actions of a chunk are executed before the next is asked for.
+        eval_chunk_size: how many actions of a chunk are executed before the next query.
         resize_size: side of the policy's pictures, which are drawn in that size; as it was
             trained by default.
         num_trials_per_task: episodes for each task, from the first initial state on; at most 50.

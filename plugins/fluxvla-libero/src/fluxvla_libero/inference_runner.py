@@ -231,7 +231,7 @@ class LiberoInferenceRunner:
         finally:
             trace.close(summary)
             environment.close()
-        word = {True: "success", False: "no success", None: "nobody can judge it"}[success]
+        word = {True: "success", False: "no success", None: "success unknown"}[success]
         reporter.info(f"{word} after {found['steps']} steps")
         reporter.artifact("episode", trace.folder)
         return summary

@@ -126,7 +126,7 @@ class SimRobot:
 
     Args:
         name: as commands take it.
-        title: as people are told.
+        title: as displayed.
         cameras: of every one of its worlds.
         embodiment: its spec with the cameras that are given, at ``CONTROL_HZ``.
         worlds: what it can be put into.

@@ -226,7 +226,7 @@ def test_a_gpu_of_ones_own_makes_no_part_another_evaluation(tmp_path, checkpoint
             context=RunContext(work_dir=checkpoint), environment=WALK, device="cuda"
         )
         runner.run_setup()
-        devices.add(runner.what()["settings"]["device"])
+        devices.add(runner.identity()["settings"]["device"])
     assert devices == {"cuda"}
 
 

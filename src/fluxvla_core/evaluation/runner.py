@@ -170,7 +170,7 @@ class EvalRunner(Runner):
         try:
             self._live: dict[str, Any] | None = plain(live_options(live))
         except ConfigError as error:
-            raise self.wrong("live", error.what) from error
+            raise self.config_error("live", error.what) from error
         usual = 2 if self._live is None else 1
         self.workers = nproc or (usual if workers is None else workers)
         self.ckpt_path = ckpt_path
@@ -183,7 +183,8 @@ class EvalRunner(Runner):
         self.episode_timeout_s = episode_timeout_s
         self.reuse = reuse
         self.folder = Path(self.context.work_dir) / (FOLDER if self._live is None else LIVE_FOLDER)
-        self._given = tasks
+        self.task_names = tasks
+        """Of the tasks to evaluate, None for all; a subclass may set it before ``run_setup``."""
         for name, value, least in (
             ("episodes", episodes, 1),
             ("workers", self.workers, 1),
@@ -195,13 +196,13 @@ class EvalRunner(Runner):
             ("swap_seed", swap_seed, 0),
         ):
             if value is not None and value < least:
-                raise self.wrong(name, f"must be at least {least}, got {value}")
+                raise self.config_error(name, f"must be at least {least}, got {value}")
         if (height is None) != (width is None):
-            raise self.wrong("height", "and width belong together: give both or none")
+            raise self.config_error("height", "and width belong together: give both or none")
         if video_fps <= 0:
-            raise self.wrong("video_fps", f"must be positive, got {video_fps:g}")
+            raise self.config_error("video_fps", f"must be positive, got {video_fps:g}")
         if self._live is not None and instruction_swap:
-            raise self.wrong("instruction_swap", "cannot be live: evaluate it stepped")
+            raise self.config_error("instruction_swap", "cannot be live: evaluate it stepped")
         if environment is None:
             raise ConfigError(
                 f"{type(self).__name__} has no environment: where is the policy to act?",
@@ -246,8 +247,8 @@ class EvalRunner(Runner):
         try:
             video = Video.of(self._spec, names, height, width, fps)
         except ConfigError as error:
-            raise self.wrong("video_cameras", error.what) from error
-        self._tasks = self._spec.select_tasks(self._given)
+            raise self.config_error("video_cameras", error.what) from error
+        self._tasks = self._spec.select_tasks(self.task_names)
         if policy in FROM_CHECKPOINT or self.baseline:
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
@@ -286,10 +287,10 @@ class EvalRunner(Runner):
                 written), or results cannot be written.
         """
         reporter, keys = self.context.reporter, self.keys()
-        what = self.what()
+        identity = self.identity()
         log = open_episode_log(
             self.folder / self.shard.log_name,
-            what,
+            identity,
             reporter,
             "episodes*.jsonl",
             self._code.to_dict(),
@@ -312,10 +313,11 @@ class EvalRunner(Runner):
                 videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
             else:
                 videos = recorded_videos(shown, self.folder, RECORDS)
+        policy = identity["policy"]
         found = {
             "format": results.FORMAT,
-            "policy": what["policy"] if isinstance(what["policy"], str) else what["policy"]["type"],
-            "environment": what["environment"]["type"],
+            "policy": policy if isinstance(policy, str) else policy["type"],
+            "environment": identity["environment"]["type"],
             "mode": "stepped" if self._live is None else "live",
             "groups": summarise(records),
             "problems": problems(records),
@@ -323,7 +325,7 @@ class EvalRunner(Runner):
             "behaviours": count_behaviours(records),
             "obeyed": count_obeyed(records),
             "checkpoint": self._checkpoint,
-            "settings": what["settings"],
+            "settings": identity["settings"],
             "provenance": {
                 **provenance(self._code),
                 "seeds": results.seeds(records),
@@ -349,8 +351,8 @@ class EvalRunner(Runner):
         tasks = [task.name for task in self._tasks]
         return episode_keys(groups, tasks, self.episodes, self._ready()[0].keep_together)
 
-    def what(self) -> dict[str, Any]:
-        """What outcomes follow from, beside each episode's key; JSON values."""
+    def identity(self) -> dict[str, Any]:
+        """What outcomes follow from, besides each episode's key, as JSON values."""
         spec, settings = self._ready()
         source = asdict(settings.sources[POLICY])
         policy = source.pop("policy")
@@ -372,10 +374,10 @@ class EvalRunner(Runner):
         )
         return about
 
-    def wrong(self, name: str, what: str) -> ConfigError:
+    def config_error(self, key: str, problem: str) -> ConfigError:
         """An error about a key of this section."""
-        where = self.context.where(f"{self.context.section}.{name}")
-        return ConfigError(f"{name} {what}", where=where)
+        where = self.context.where(f"{self.context.section}.{key}")
+        return ConfigError(f"{key} {problem}", where=where)
 
     @contextmanager
     def _pool(self) -> Iterator[WorkerPool]:
@@ -409,7 +411,7 @@ class EvalRunner(Runner):
         if self._live is None:
             return None
         if not spec.limited:
-            raise self.wrong(
+            raise self.config_error(
                 "live",
                 f"needs an environment that takes joint targets; {spec.name} does not, and the "
                 "safety of a robot cannot be kept for its actions",

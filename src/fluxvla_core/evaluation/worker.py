@@ -132,7 +132,7 @@ class EpisodeWorker:
         instruction_of = None
         if key.group == SWAPPED:
             instruction_of = spec.task(swapped_task(self.environment, key.task, settings.tasks))
-        film = None if job.video is None else Film(Path(job.video), settings.video)
+        video = None if job.video is None else VideoRecorder(Path(job.video), settings.video)
         try:
             record = run_episode(
                 self.environment,
@@ -141,11 +141,11 @@ class EpisodeWorker:
                 key.seed,
                 replace(settings.rollout, cameras=cameras),
                 instruction_of,
-                film,
+                video,
             )
         finally:
-            if film is not None:
-                film.close()
+            if video is not None:
+                video.close()
         return self._completed(record, cameras)
 
     def _live(
@@ -186,8 +186,8 @@ class EpisodeWorker:
         return self._actors[name]
 
 
-class Film:
-    """A video of an episode: call it at every step, then close it."""
+class VideoRecorder:
+    """Records a video of an episode: call it at every step, then close it."""
 
     def __init__(self, path: Path, video: Video) -> None:
         self._path = path

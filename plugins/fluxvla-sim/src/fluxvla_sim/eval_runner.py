@@ -69,7 +69,7 @@ class SimEvalRunner(EvalRunner):
         )
         least = max(self.robot.find(name)[0].max_steps for name in names) if names else 0
         if max_steps is not None and max_steps < least:
-            raise self.wrong("max_steps", f"must be at least {least}, got {max_steps}")
+            raise self.config_error("max_steps", f"must be at least {least}, got {max_steps}")
 
 
 class AlohaSimEvalRunner(SimEvalRunner):

@@ -99,7 +99,7 @@ class Step:
         reward: of this step.
         success: whether the task of the scene is done, now or at any moment before.
         ended: whether the episode ends here; a success need not end it.
-        behaviours: the success of every task that can be judged in this scene, by name.
+        behaviours: the success of every task that can be checked in this scene, by name.
     """
 
     reward: float
@@ -161,7 +161,7 @@ class Environment(Contract):
 
     @attribute
     def distributions(self) -> Sequence[str]:
-        """Installed packages that outcomes follow from, beside those that its own requires."""
+        """Installed packages that outcomes follow from, besides those that its plugin requires."""
         return ()
 
     def state_hash(self) -> str | None:

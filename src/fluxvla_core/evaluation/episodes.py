@@ -148,10 +148,10 @@ class EpisodeLog:
 
     Args:
         path: the file; its folder is made if need be.
-        what: what is evaluated, as JSON values. A file that was written about something else is
+        identity: what is evaluated, as JSON values. A file about another evaluation is
             set aside under a name of its own.
-        beside: a pattern of file names in the same folder, where others keep episodes of the same
-            evaluation; what they have finished is finished here, too.
+        other_logs: pattern of file names in the same folder in which other processes keep episodes
+            of the same evaluation; what they have finished is finished here, too.
         code: what runs the episodes, as JSON values; not recorded and not compared by default.
         reuse: count episodes of other code, too.
 
@@ -168,8 +168,8 @@ class EpisodeLog:
     def __init__(
         self,
         path: Path,
-        what: Mapping[str, Any],
-        beside: str | None = None,
+        identity: Mapping[str, Any],
+        other_logs: str | None = None,
         code: Mapping[str, Any] | None = None,
         reuse: bool = False,
     ) -> None:
@@ -177,9 +177,9 @@ class EpisodeLog:
         self.set_aside: Path | None = None
         self.reused: set[EpisodeKey] = set()
         self.changed: list[str] = []
-        self._beside = beside
+        self._other_logs = other_logs
         self._reuse = reuse
-        self._evaluation = json.loads(json_text(what))
+        self._evaluation = json.loads(json_text(identity))
         self._code = None if code is None else json.loads(json_text(code))
         self._done: dict[EpisodeKey, dict[str, Any]] = {}
         self._errors: dict[EpisodeKey, dict[str, Any]] = {}
@@ -189,7 +189,7 @@ class EpisodeLog:
                 self._read()
             if not path.exists():
                 self._write_header()
-            self.look_beside()
+            self.read_other_logs()
         except OSError as error:
             raise RunFailed(f"episodes cannot be kept: {error}", where=str(path)) from error
 
@@ -229,14 +229,14 @@ class EpisodeLog:
         found = [record for record in records if record is not None]
         return found if len(found) == len(records) else None
 
-    def look_beside(self) -> None:
+    def read_other_logs(self) -> None:
         """Read what other processes have written by now.
 
         Raises:
             OSError: a file cannot be read.
             UsageError: other code ran their episodes of this evaluation.
         """
-        for path in sorted(self.path.parent.glob(self._beside)) if self._beside else []:
+        for path in sorted(self.path.parent.glob(self._other_logs)) if self._other_logs else []:
             if path == self.path:
                 continue
             records = whole_lines(path.read_bytes())
@@ -314,15 +314,15 @@ class EpisodeLog:
 
 def open_episode_log(
     path: Path,
-    what: dict[str, Any],
+    identity: Mapping[str, Any],
     reporter: Reporter,
-    beside: str | None = None,
+    other_logs: str | None = None,
     code: Mapping[str, Any] | None = None,
     reuse: bool = False,
 ) -> EpisodeLog:
-    """Open the episode log of an evaluation of ``what``; reports if that of another evaluation was
+    """Open the episode log of an evaluation; reports if that of another evaluation was
     set aside, or if episodes of other code are counted."""
-    log = EpisodeLog(path, what, beside, code, reuse)
+    log = EpisodeLog(path, identity, other_logs, code, reuse)
     if log.reused:
         reporter.warn(
             f"{len(log.reused)} episodes that other code ran are counted, as reuse says: "

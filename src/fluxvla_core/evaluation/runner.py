@@ -303,7 +303,7 @@ class EvalRunner(Runner):
             run_in_pool(pool, mine, log, reporter)
             # Loading libraries and models is not what is measured.
             seconds = time.monotonic() - began - (pool.ready_s or 0.0)
-            log.look_beside()
+            log.read_other_logs()
             records = log.settled(keys)
             if records is None:
                 return self._leave_to_others(keys, log)

@@ -52,7 +52,7 @@ class LiberoEnvironment(MujocoEnvironment):
         mixed: each of these tasks in the scenes of all of them where it can be done: then the
             scene does not say what to do. Tasks are called ``<task>-in-scene-<index>``.
         cameras: of the scene, also by the names that public datasets give them.
-        height, width: of their pictures, where nobody asks for another size.
+        height, width: of their pictures, if no other size is requested.
         render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
         begin: ``fixed`` or ``random``.
         num_steps_wait: they do not count.
@@ -199,7 +199,7 @@ class LiberoEnvironment(MujocoEnvironment):
         scene.settle(self._wait)
         self._name = self._instructed = task
         here = {name: pair[1] for name, pair in self.pairs.items() if self._shares(name, where)}
-        self._checked = {name: each for name, each in here.items() if scene.can_judge(each)}
+        self._checked = {name: each for name, each in here.items() if scene.can_check(each)}
         self._did = dict.fromkeys(self._checked, False)
 
     def other_tasks(self, task: str) -> tuple[str, ...]:

@@ -68,7 +68,7 @@ class Expert:
 
     def __init__(self, scene: LiberoScene, task: SuiteTask) -> None:
         wanted = goal(task)
-        if len(wanted) != 1 or wanted[0][0] != "in" or not scene.can_judge(task):
+        if len(wanted) != 1 or wanted[0][0] != "in" or not scene.can_check(task):
             raise ConfigError(
                 f"the scripted expert cannot do {task.name!r} in the scene of {scene.task.name!r}",
                 cause="it only puts one object that is there into a container (libero_object)",

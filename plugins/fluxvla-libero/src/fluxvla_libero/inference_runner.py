@@ -247,7 +247,7 @@ class LiberoInferenceRunner:
 
     @contextmanager
     def _live(self) -> Iterator[Any]:
-        """A function that shows pictures side by side; it does nothing where nobody looks."""
+        """A function that shows pictures side by side; it does nothing without a live view."""
         if self.live_port is None:
             yield lambda pictures: None
             return

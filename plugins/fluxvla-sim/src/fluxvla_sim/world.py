@@ -62,7 +62,7 @@ class Scene(Protocol):
 
 
 class Facts(Protocol):
-    """What has happened in an episode so far: all that success is judged by.
+    """What has happened in an episode so far: everything that success depends on.
 
     ``steps`` were taken, the last one with ``reward``.
     """

@@ -6,7 +6,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -297,20 +297,21 @@ def record_videos(
 
 
 def recorded_videos(
-    records: Sequence[Mapping[str, Any]], folder: Path, below: str
+    recordings: Iterable[tuple[Mapping[str, Any], Path]], folder: Path
 ) -> list[dict[str, Any]]:
-    """The videos that were made while the episodes ran, as :func:`record_videos` lists its own.
+    """The videos that were recorded while the episodes ran, as :func:`record_videos` lists its own.
 
     Args:
-        records: of live episodes, with ``record``: their folders, relative to ``folder/below``.
+        recordings: each episode's record with the folder of its recording.
+        folder: of the results, to which the videos' paths are relative.
     """
     return [
         {
             **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": video.relative_to(folder).as_posix(),
+            "path": Path(os.path.relpath(video, folder)).as_posix(),
         }
-        for record in records
-        for video in sorted((folder / below / record["record"]).glob("*.mp4"))[:1]
+        for record, place in recordings
+        for video in sorted(place.glob("*.mp4"))[:1]
     ]
 
 

@@ -31,7 +31,6 @@ from fluxvla_core.evaluation.episodes import (
 )
 from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
 from fluxvla_core.evaluation.provenance import Code, code_of, provenance
-from fluxvla_core.evaluation.results import choose_episodes
 from fluxvla_core.evaluation.statistics import problems, summarise
 
 FOLDER = "eval_robot"
@@ -147,6 +146,8 @@ class RobotEvalRunner(Runner):
             done = len(log.records(keys)) + len(errors)
             reporter.progress("episodes", done, len(keys), successes=succeeded)
         records = [errors[key] if key in errors else log.records([key])[0] for key in keys]
+        shown = results.choose_episodes(records, self.record_videos)
+        recordings = [(r, Path(self.context.work_dir) / r["folder"]) for r in shown]
         results.check_any_done(records, log.path)
         found = {
             "format": results.FORMAT,
@@ -161,7 +162,7 @@ class RobotEvalRunner(Runner):
                 "seeds": results.seeds(records),
                 "reused": {"episodes": len(log.reused), "changed": log.changed},
             },
-            "videos": self._videos(records),
+            "videos": results.recorded_videos(recordings, self.folder),
             "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
         }
         results.save_results(self.folder, found, self.context)
@@ -254,15 +255,6 @@ class RobotEvalRunner(Runner):
             )
         getattr(self.context.reporter, "settle", lambda: None)()
         return input(question).strip()
-
-    def _videos(self, records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        shown = []
-        for record in choose_episodes(records, self.record_videos):
-            folder = Path(self.context.work_dir) / record["folder"]
-            for video in sorted(folder.glob("*.mp4"))[:1]:
-                kept = {key: record[key] for key in ("group", "task", "seed", "success")}
-                shown.append({**kept, "path": f"../{record['folder']}/{video.name}"})
-        return shown
 
     def _wrong(self, name: str, what: str) -> ConfigError:
         where = self.context.where(f"{self.context.section}.{name}")

@@ -312,7 +312,8 @@ class EvalRunner(Runner):
             if self._live is None:
                 videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
             else:
-                videos = recorded_videos(shown, self.folder, RECORDS)
+                recordings = [(r, self.folder / RECORDS / r["record"]) for r in shown]
+                videos = recorded_videos(recordings, self.folder)
         policy = identity["policy"]
         found = {
             "format": results.FORMAT,

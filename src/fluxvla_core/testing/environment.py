@@ -1,12 +1,12 @@
-"""Conformance tests of environments, which a plugin inherits.
+"""Conformance tests for environments, which a plugin inherits.
 
     from fluxvla_core.testing import EnvironmentConformance
 
     class TestMyEnvironment(EnvironmentConformance):
         entry_point = "MyEnvironment"
 
-pytest collects the inherited tests. Evaluations rely on what they check: that an episode is
-determined by its task and seed alone, whatever was run before and whether it was rendered.
+pytest collects the inherited tests. Evaluations rely on what they check: that an episode depends on
+its task and seed alone, not on earlier episodes or on which cameras are drawn.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def test_the_specifications_parameters_are_taken(tmp_path):
     assert runner.workers == 3
     assert runner._source.precision == "bf16"
     assert runner._size == (224, 224)
-    assert runner._course.policy_seed == 7
+    assert runner._rollout.policy_seed == 7
     assert runner.model_family == "pi0"
 
 

@@ -26,9 +26,8 @@ HEIGHT, WIDTH = 480, 640
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The evaluation engine: workers, episode log, records."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
-    from fluxvla_core.evaluation.episodes import run_in_pool
-    from fluxvla_core.evaluation.policies import Source
+    from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
+    from fluxvla_core.evaluation.policies import PolicySource
     from fluxvla_core.evaluation.pool import WorkerPool
     from fluxvla_core.evaluation.rollout import RolloutSettings
     from fluxvla_core.evaluation.worker import Settings
@@ -38,8 +37,8 @@ def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, 
     settings = Settings(
         environment={"type": "AlohaSimEnvironment", "render": render},
         tasks=(TASK,),
-        sources={"policy": Source({"type": "Still"})},
-        course=RolloutSettings(max_steps=steps),
+        sources={"policy": PolicySource({"type": "Still"})},
+        rollout=RolloutSettings(max_steps=steps),
     )
     keys = [EpisodeKey("policy", TASK, seed) for seed in range(episodes)]
     warm = [EpisodeKey("policy", TASK, 10**6 + n) for n in range(processes)]

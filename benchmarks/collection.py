@@ -31,19 +31,17 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "1")
 
-from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS
+from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 
 from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluation.collect import demonstrate
-from fluxvla_core.evaluation.episode_log import EpisodeKey, open_episode_log
-from fluxvla_core.evaluation.episodes import run_in_pool
-from fluxvla_core.evaluation.policies import Source
+from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
+from fluxvla_core.evaluation.policies import PolicySource
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
 from fluxvla_core.spec.embodiment import Camera
 
@@ -109,12 +107,12 @@ def stock(steps: int = 4) -> float:
 
 def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     """Episodes a minute through the engine, and in a bare loop in this process."""
-    course = RolloutSettings(replan_every=5)
+    rollout = RolloutSettings(replan_every=5)
     settings = Settings(
         environment={"type": "AlohaSimEnvironment"},
         tasks=("lift_hold",),
-        sources={"policy": Source({"type": "SimExpert"})},
-        course=course,
+        sources={"policy": PolicySource({"type": "SimExpert"})},
+        rollout=rollout,
     )
     keys = [EpisodeKey("policy", "lift_hold", seed) for seed in range(episodes)]
     folder = Path(tempfile.mkdtemp())
@@ -127,11 +125,11 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
         engine = time.perf_counter() - began
     shutil.rmtree(folder)
     environment, expert = AlohaSimEnvironment(), SimExpert()
-    task = find_task(environment.spec.tasks, "lift_hold")
-    run_episode(environment, expert, task, 10**6, course)
+    task = environment.spec.task("lift_hold")
+    run_episode(environment, expert, task, 10**6, rollout)
     began = time.perf_counter()
     for key in keys:
-        run_episode(environment, expert, task, key.seed, course)
+        run_episode(environment, expert, task, key.seed, rollout)
     bare = time.perf_counter() - began
     return 60 * episodes / engine, 60 * episodes / bare
 

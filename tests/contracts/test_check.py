@@ -300,7 +300,8 @@ def test_what_inherits_nothing_gets_the_defaults_and_keeps_all_of_its_own():
     assert type(adapted).__name__ == "Scene"
     adapted.reset(3, "t")
     assert (scene.seeds, adapted.step(5), adapted.own(), adapted.spec) == ([3], 5, "own", "spec")
-    assert (adapted.others("t"), adapted.state_hash(), adapted.divergence()) == ((), None, None)
+    assert adapted.other_tasks("t") == ()
+    assert (adapted.state_hash(), adapted.divergence()) == (None, None)
     scene.simulation = adapted.spec = "later"
     assert (adapted.simulation, scene.spec) == ("later", "later")
     assert original(adapted) is scene

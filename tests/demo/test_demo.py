@@ -288,7 +288,7 @@ def test_the_verdict_says_when_nothing_was_shown(tmp_path: Path) -> None:
     }
     file.write_text(json.dumps(swapped))
     assert outcome.verdict(file) == [
-        "wrong instruction: does the task that it was told: 44 of 50 episodes "
+        "wrong instruction: follows the instruction: 44 of 50 episodes "
         "(88%, 95 % interval 76% to 94%)"
     ]
     file.write_text(json.dumps({"groups": {"mine": {"all": RATE}, "no": {"all": {"episodes": 0}}}}))

@@ -27,8 +27,8 @@ from fluxvla_core.evaluation.collect import (
     collect_episodes,
     demonstrate,
     task_of,
-    unseen_seeds,
 )
+from fluxvla_core.evaluation.provenance import unseen_seeds
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from tests.evaluation.conftest import WALKING
 

@@ -9,7 +9,7 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import UsageError
 from fluxvla_core.evaluation.compare import compare, describe, read
-from fluxvla_core.evaluation.episode_log import EpisodeLog
+from fluxvla_core.evaluation.episodes import EpisodeLog
 
 
 def evaluated(folder, outcomes, group="policy", name="episodes.jsonl", **about):

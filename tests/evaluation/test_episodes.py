@@ -14,8 +14,7 @@ import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.evaluation.episode_log import EpisodeKey, EpisodeLog, open_episode_log
-from fluxvla_core.evaluation.episodes import run_in_pool
+from fluxvla_core.evaluation.episodes import EpisodeKey, EpisodeLog, open_episode_log, run_in_pool
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.statistics import describe_rate, summarise
 from tests.evaluation.workers import Episodes

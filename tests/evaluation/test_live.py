@@ -11,8 +11,7 @@ import pytest
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError, Rejected, RunFailed
-from fluxvla_core.evaluation.live import EnvironmentOperator
-from fluxvla_core.evaluation.live_settings import live_options
+from fluxvla_core.evaluation.live import EnvironmentOperator, live_options
 from fluxvla_core.evaluation.runner import EvalRunner
 
 LINE = {"type": "Walk", "limited": True, "max_steps": 30}

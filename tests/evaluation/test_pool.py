@@ -8,7 +8,7 @@ import os
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.evaluation.pool import WorkerPool, run_jobs
+from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.plugins.files import load_plugin_files
 from tests.evaluation import workers
 
@@ -20,7 +20,8 @@ def no_process_is_left():
 
 
 def outcomes(factory, jobs, processes=2, **options):
-    return sorted(run_jobs(factory, jobs, processes, **options), key=lambda o: o.index)
+    with WorkerPool(factory, processes, **options) as pool:
+        return sorted(pool.run(jobs), key=lambda o: o.index)
 
 
 @pytest.mark.parametrize("processes", [1, 3])
@@ -124,7 +125,7 @@ def test_workers_that_die_at_once_do_not_go_on_for_ever():
 
 def test_closing_the_iterator_ends_the_workers(tmp_path):
     recorder = workers.Recorder(str(tmp_path))
-    iterator = run_jobs(recorder, [f"slow-{n}" for n in range(50)], 2)
+    iterator = WorkerPool(recorder, 2).run([f"slow-{n}" for n in range(50)])
     next(iterator)
     iterator.close()
     assert multiprocessing.active_children() == []
@@ -152,7 +153,7 @@ def test_a_pool_grows_with_its_jobs_and_replaces_who_died(tmp_path):
 
 def test_workers_below_one_are_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
-        next(run_jobs(workers.square, [1], 0))
+        WorkerPool(workers.square, 0)
 
 
 def test_plugin_files_of_the_parent_are_loaded_in_the_workers(tmp_path):

@@ -8,7 +8,8 @@ from importlib.util import find_spec
 import pytest
 
 from fluxvla_core.evaluation import provenance
-from fluxvla_core.evaluation.provenance import code_of, commit, differences, drawn
+from fluxvla_core.evaluation.episodes import code_differences
+from fluxvla_core.evaluation.provenance import code_of, commit, rendering
 from fluxvla_core.plugins.files import load_plugin_files
 
 
@@ -43,7 +44,9 @@ def test_a_plugin_files_content_is_part_of_the_code(tmp_path):
     two = code_of([], (), ())
     assert len({without.hash, one.hash, two.hash}) == 3
     assert code_of([], (), ()) == two
-    assert differences(one.to_dict(), two.to_dict()) == [f"source code {one.hash} -> {two.hash}"]
+    assert code_differences(one.to_dict(), two.to_dict()) == [
+        f"source code {one.hash} -> {two.hash}"
+    ]
 
 
 def test_the_commit_is_that_of_the_checkout_with_the_code(tmp_path):
@@ -70,4 +73,7 @@ def test_the_commit_is_that_of_the_checkout_with_the_code(tmp_path):
 def test_several_machines_may_draw_one_evaluation():
     one = {"pictures": {"sizes": {"top": [8, 9]}, "by": "egl: a"}}
     two = {"pictures": {"sizes": {"top": [8, 9]}, "by": "osmesa: b"}}
-    assert drawn([one, two, one, {}]) == {"sizes": {"top": [8, 9]}, "by": ["egl: a", "osmesa: b"]}
+    assert rendering([one, two, one, {}]) == {
+        "sizes": {"top": [8, 9]},
+        "by": ["egl: a", "osmesa: b"],
+    }

@@ -17,6 +17,7 @@ from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.results import (
     choose_episodes,
     record_videos,
+    recorded_videos,
     video_name,
     with_others,
 )
@@ -260,3 +261,14 @@ def test_every_group_is_seen_beside_the_trained_policy():
     # Of the same seed where there is one.
     assert [(r["group"], r["seed"]) for r in shown[2:]] == [("swapped", 2), ("untrained", 1)]
     assert with_others([], records) == []
+
+
+def test_videos_that_were_recorded_with_the_episodes_are_listed_relative_to_the_results(tmp_path):
+    record = {"group": "policy", "task": "t", "seed": 3, "success": True, "instruction": "go"}
+    for name in ("a.mp4", "b.mp4"):
+        (tmp_path / "inference" / "001-t").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "inference" / "001-t" / name).touch()
+    recordings = [(record, tmp_path / "inference" / "001-t"), (record, tmp_path / "none")]
+    assert recorded_videos(recordings, tmp_path / "eval_robot") == [
+        {**record, "path": "../inference/001-t/a.mp4"}
+    ]

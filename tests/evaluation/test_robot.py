@@ -11,6 +11,7 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import ConfigError, RunFailed, SafetyStop, UsageError
 from fluxvla_core.evaluation.robot import RobotEvalRunner
+from fluxvla_core.operators import EpisodeTrace
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
 from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
@@ -260,3 +261,20 @@ def test_what_the_section_refuses_is_refused_before_anything_moves(evaluate, sec
     with pytest.raises((ConfigError, UsageError), match="max_publish_step must be at least 1"):
         evaluate({"max_publish_step": 0})
     assert not any(slider.x for slider in Simulated.made)
+
+
+def test_an_episode_whose_recording_fails_is_counted_all_the_same(
+    evaluate, section, monkeypatch, listener
+):
+    real = EpisodeTrace.close
+
+    def close(self, summary):
+        real(self, summary)
+        raise RunFailed("the episode could not be recorded completely: no space left")
+
+    monkeypatch.setattr(EpisodeTrace, "close", close)
+    section["policy"].wild = range(10, 14)
+    found = evaluate(tasks=["1"], go_on=True)
+    counted = found["groups"]["policy"]["all"]
+    assert (counted["successes"], counted["episodes"], counted["errors"]) == (0, 4, 0)
+    assert any("no space left" in line for line in listener.warnings)

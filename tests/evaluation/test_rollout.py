@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.evaluation.divergence import Diverged
-from fluxvla_core.evaluation.policies import RandomPolicy, fit, resolve_name
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.policies import RandomPolicy, match_policy, resolve_policy
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.evaluation.worker import memory_mb, swapped_task
 from fluxvla_core.spec.embodiment import Camera
 
@@ -38,10 +37,11 @@ class Says:
         return self.chunk
 
 
-def episode(environment, actor, task="right", told=None, watch=None, **course):
-    tasks = {each.name: each for each in environment.spec.tasks}
-    told = None if told is None else tasks[told]
-    return run_episode(environment, actor, tasks[task], 5, RolloutSettings(**course), told, watch)
+def episode(environment, actor, task="right", instructed=None, on_step=None, **settings):
+    spec = environment.spec
+    other = None if instructed is None else spec.task(instructed)
+    settings = RolloutSettings(**settings)
+    return run_episode(environment, actor, spec.task(task), 5, settings, other, on_step)
 
 
 def test_it_ends_with_the_environment_or_with_the_steps(walk):
@@ -66,7 +66,7 @@ def test_the_policy_sees_what_it_asks_for_and_has_a_seed_of_its_own(walk):
 
 
 def test_another_instruction_ends_the_episode_and_is_no_success(walk):
-    found = episode(walk.Walk(), walk.Walker(), told="left")
+    found = episode(walk.Walk(), walk.Walker(), instructed="left")
     assert found["instruction"] == "go left"
     assert found["behaviours"] == {"right": False, "left": True}
     assert found["success"] is False
@@ -83,7 +83,7 @@ def test_joint_targets_are_joined_and_kept_within_the_limits(walk):
     world = walk.Walk(limited=True)
     says = Says([[0.9], [0.9]], action_rate_hz=5.0)
     found = episode(
-        world, says, replan_every=1, max_steps=8, watch=lambda w, n: places.append(w.place)
+        world, says, replan_every=1, max_steps=8, on_step=lambda w, n: places.append(w.place)
     )
     assert found["calls"] == 4, "a keyframe lasts two control steps"
     assert found["clamped"] > 0
@@ -136,11 +136,11 @@ def test_a_state_that_is_not_finite_is_not_the_policys_fault(walk):
         assert "likely cause: the simulation diverged" in str(caught.value)
 
 
-@pytest.mark.parametrize("told", [None, "left"])
-def test_the_last_steps_state_is_looked_at_too(walk, told):
+@pytest.mark.parametrize("instructed", [None, "left"])
+def test_the_last_steps_state_is_looked_at_too(walk, instructed):
     """Nobody observes after it: such an episode was a failure, or a success that was not."""
     with pytest.raises(Diverged, match="state is not finite after 3 steps"):
-        episode(walk.Walk(diverging=6), walk.Walker(), max_steps=3, told=told)
+        episode(walk.Walk(diverging=6), walk.Walker(), max_steps=3, instructed=instructed)
 
 
 def test_equal_seeds_give_equal_courses(walk):
@@ -153,25 +153,25 @@ def test_equal_seeds_give_equal_courses(walk):
 
 def test_a_policy_that_does_not_fit_is_refused(walk):
     spec = walk.Walk().spec
-    assert fit(Says(None), spec) == ()
-    assert fit(Says(None, cameras=("eye",)), spec) == (walk.EYE,)
-    assert fit(Says(None, cameras=("eye",)), spec, (5, 6)) == (Camera("eye", 5, 6),)
+    assert match_policy(Says(None), spec) == ()
+    assert match_policy(Says(None, cameras=("eye",)), spec) == (walk.EYE,)
+    assert match_policy(Says(None, cameras=("eye",)), spec, (5, 6)) == (Camera("eye", 5, 6),)
     with pytest.raises(SpecMismatch, match="the policy looks at ear; a line has eye"):
-        fit(Says(None, cameras=("ear",)), spec)
+        match_policy(Says(None, cameras=("ear",)), spec)
     with pytest.raises(SpecMismatch, match=r"for steps of 1/20 s, a line's for 1/10 s"):
-        fit(Says(None, action_rate_hz=20.0), spec)
-    assert fit(Says(None, action_rate_hz=20.0), walk.Walk(limited=True).spec) == ()
+        match_policy(Says(None, action_rate_hz=20.0), spec)
+    assert match_policy(Says(None, action_rate_hz=20.0), walk.Walk(limited=True).spec) == ()
     with pytest.raises(SpecMismatch, match="frame: joint / world"):
-        fit(Says(None, embodiment=replace(spec.embodiment, frame="joint")), spec)
+        match_policy(Says(None, embodiment=replace(spec.embodiment, frame="joint")), spec)
 
 
 def test_names_of_policies(walk):
-    assert resolve_name("checkpoint", walk.Walk()) == "checkpoint"
-    assert resolve_name("expert", walk.Walk()) == {"type": "Walker"}
-    assert resolve_name("random", walk.Walk()) == {"type": "RandomPolicy"}
-    assert resolve_name({"type": "X"}, walk.Walk()) == {"type": "X"}
+    assert resolve_policy("checkpoint", walk.Walk()) == "checkpoint"
+    assert resolve_policy("expert", walk.Walk()) == {"type": "Walker"}
+    assert resolve_policy("random", walk.Walk()) == {"type": "RandomPolicy"}
+    assert resolve_policy({"type": "X"}, walk.Walk()) == {"type": "X"}
     with pytest.raises(ConfigError, match="object names no expert"):
-        resolve_name("expert", object())
+        resolve_policy("expert", object())
 
 
 def test_random_actions_follow_from_the_seed(walk):
@@ -193,7 +193,7 @@ def test_a_wrong_instruction_is_the_next_task_of_those_evaluated(walk):
     class World:
         spec = walk.Walk().spec
 
-        def others(self, task):
+        def other_tasks(self, task):
             return ["left"] if task == "right" else []
 
     assert swapped_task(World(), "right", ["right"]) == "left"

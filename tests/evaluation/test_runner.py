@@ -203,7 +203,7 @@ def test_parts_of_a_job_are_run_apart_and_merged(tmp_path, walking, monkeypatch,
         if rank != "2":
             assert result["shard"] == int(rank)
             assert not (tmp_path / "parts" / "eval" / "results.json").exists()
-    assert "part 0 of 3 is done; 5 episodes of others are not, and whoever ends last" in " ".join(
+    assert "part 0 of 3 is done; 5 episodes of other parts are not: the process" in " ".join(
         listener.lines
     )
     assert courses(tmp_path / "parts") == courses(tmp_path / "whole")
@@ -226,7 +226,7 @@ def test_a_gpu_of_ones_own_makes_no_part_another_evaluation(tmp_path, checkpoint
             context=RunContext(work_dir=checkpoint), environment=WALK, device="cuda"
         )
         runner.run_setup()
-        devices.add(runner.what()["settings"]["device"])
+        devices.add(runner.identity()["settings"]["device"])
     assert devices == {"cuda"}
 
 

@@ -49,14 +49,14 @@ class Walk:
                 os._exit(9)
         self.rng, self.place = np.random.default_rng(seed), 0.0
         self.left = 3 if seed < self.diverging else None
-        self.scene = self.told = task
+        self.scene = self.instructed = task
         self.did = {"right": False, "left": False}
 
-    def others(self, task):
+    def other_tasks(self, task):
         return [each.name for each in self.spec.tasks if each.name != task]
 
-    def tell(self, task):
-        self.told = task
+    def set_instruction(self, task):
+        self.instructed = task
 
     @property
     def state(self):
@@ -75,7 +75,7 @@ class Walk:
             self.place = self.place if self.left else float("nan")
         self.did["right"] |= self.place >= 1
         self.did["left"] |= self.place <= -1
-        ended = self.did[self.scene] or self.did[self.told]
+        ended = self.did[self.scene] or self.did[self.instructed]
         return Step(self.place, self.did[self.scene], ended, dict(self.did))
 
     def observe(self, cameras):
@@ -83,7 +83,9 @@ class Walk:
         return {
             "qpos": self.state.astype(np.float32),
             "images": {c.name: np.full((c.height, c.width, 3), shade, np.uint8) for c in cameras},
-            "task_description": next(t.instruction for t in self.spec.tasks if t.name == self.told),
+            "task_description": next(
+                t.instruction for t in self.spec.tasks if t.name == self.instructed
+            ),
         }
 
     def close(self):
@@ -92,7 +94,7 @@ class Walk:
 
 @POLICIES.register_module()
 class Walker:
-    """Walks ``speed`` a step to where it is told, in chunks of 3."""
+    """Walks ``speed`` a step to where the instruction says, in chunks of 3."""
 
     cameras = ()
 

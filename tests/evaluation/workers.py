@@ -105,8 +105,7 @@ class Episodes:
 def evaluate_forever(folder: str) -> None:
     """What a killed or interrupted evaluation runs: slow episodes into a log."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluation.episode_log import EpisodeKey, EpisodeLog
-    from fluxvla_core.evaluation.episodes import run_in_pool
+    from fluxvla_core.evaluation.episodes import EpisodeKey, EpisodeLog, run_in_pool
     from fluxvla_core.evaluation.pool import WorkerPool
 
     keys = [EpisodeKey("policy", "task", seed) for seed in range(40)]

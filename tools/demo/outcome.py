@@ -44,7 +44,7 @@ def _line(name: str, rate: Mapping[str, Any], obeyed: Mapping[str, Any]) -> str:
     if name == "swapped":
         who = "wrong instruction"
         if name in obeyed:
-            rate, who, does = obeyed[name], f"{who}: does the task that it was told", "episodes"
+            rate, who, does = obeyed[name], f"{who}: follows the instruction", "episodes"
     return (
         f"{who}: {rate['successes']} of {rate['episodes']} {does} "
         f"({rate['rate']:.0%}, 95 % interval {rate['low']:.0%} to {rate['high']:.0%})"

@@ -10,9 +10,8 @@ from importlib.util import find_spec
 import gymnasium
 import numpy as np
 import pytest
-from fluxvla_gymnasium.environment import GymnasiumEnvironment
+from fluxvla_gymnasium.environment import GymnasiumEnvironment, SuccessCriterion
 from fluxvla_gymnasium.parts import parts, pictures, state_row
-from fluxvla_gymnasium.success import Judge
 from fluxvla_mujoco import divergence
 
 from fluxvla_core import build_environment_from_cfg, build_runner_from_cfg
@@ -219,7 +218,7 @@ def test_what_does_not_fit_is_refused_before_the_first_step(arguments, error, me
         ),
         (
             {"instruction": "balance", "instruction_from": "mission"},
-            "instruction and instruction_from both say what a policy is told",
+            "instruction and instruction_from are two ways",
         ),
         ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
         ({"cameras": {"top": "render"}}, "the embodiment has no camera 'top'; it has none"),
@@ -254,16 +253,16 @@ def test_observations_are_taken_apart_by_name():
 @pytest.mark.parametrize(
     ("judge", "reward", "total", "terminated", "lasted", "info", "done"),
     [
-        (Judge(), 0, 0, False, False, {"is_success": np.True_}, True),
-        (Judge(), 0, 0, True, False, {"success": 0.0}, False),
-        (Judge(), 0, 0, False, False, {}, False),
-        (Judge("terminated"), 0, 0, True, False, {}, True),
-        (Judge("truncated"), 0, 0, False, True, {}, True),
-        (Judge("truncated"), 0, 0, True, True, {}, False),
-        (Judge(reward=4.0), 4.0, 0, False, False, {}, True),
-        (Judge(reward=4.0), 3.9, 9, True, False, {}, False),
-        (Judge(total=9.0), 1.0, 9.0, False, False, {}, True),
-        (Judge(total=9.0), 10.0, 8.9, True, True, {}, False),
+        (SuccessCriterion(), 0, 0, False, False, {"is_success": np.True_}, True),
+        (SuccessCriterion(), 0, 0, True, False, {"success": 0.0}, False),
+        (SuccessCriterion(), 0, 0, False, False, {}, False),
+        (SuccessCriterion("terminated"), 0, 0, True, False, {}, True),
+        (SuccessCriterion("truncated"), 0, 0, False, True, {}, True),
+        (SuccessCriterion("truncated"), 0, 0, True, True, {}, False),
+        (SuccessCriterion(reward=4.0), 4.0, 0, False, False, {}, True),
+        (SuccessCriterion(reward=4.0), 3.9, 9, True, False, {}, False),
+        (SuccessCriterion(total=9.0), 1.0, 9.0, False, False, {}, True),
+        (SuccessCriterion(total=9.0), 10.0, 8.9, True, True, {}, False),
     ],
 )
 def test_success_has_five_ways_of_being_said(judge, reward, total, terminated, lasted, info, done):
@@ -345,7 +344,7 @@ def errand(**arguments):
 
 
 class Obedient:
-    """Goes right as often as it is told: what it does follows from the words alone."""
+    """Goes right as often as the instruction says: what it does follows from the words alone."""
 
     def __init__(self):
         self.told = []

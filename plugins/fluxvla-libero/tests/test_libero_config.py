@@ -123,7 +123,7 @@ def test_the_specifications_parameters_are_taken(tmp_path):
     assert runner.workers == 3
     assert runner._source.precision == "bf16"
     assert runner._size == (224, 224)
-    assert runner._course.policy_seed == 7
+    assert runner._rollout.policy_seed == 7
     assert runner.model_family == "pi0"
 
 
@@ -224,5 +224,5 @@ def test_an_expert_acts_in_libero_only_and_with_noise_up_to_one():
     expert = LiberoExpert()
     with pytest.raises(ConfigError, match="in LiberoEnvironment only, not in object"):
         expert.enter(object())
-    with pytest.raises(ConfigError, match="must be told where it acts"):
+    with pytest.raises(ConfigError, match="does not know its environment"):
         expert.predict_action({})

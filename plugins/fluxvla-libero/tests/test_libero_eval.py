@@ -16,7 +16,7 @@ from fluxvla_libero.inference_runner import LiberoInferenceRunner
 from fluxvla_libero.suites import init_states, suite_tasks
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch, UsageError
-from fluxvla_core.evaluation import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation import RolloutSettings, run_episode
 from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera, RunContext
 
@@ -50,24 +50,25 @@ class Replay:
         return self.actions
 
 
-def act(environment, policy, seed=0, course=None, told=None, watch=None):
-    task = find_task(environment.spec.tasks, SALAD)
-    told = None if told is None else find_task(environment.spec.tasks, told)
-    return run_episode(environment, policy, task, seed, course or RolloutSettings(), told, watch)
+def act(environment, policy, seed=0, settings=None, instructed=None, on_step=None):
+    task = environment.spec.task(SALAD)
+    other = None if instructed is None else environment.spec.task(instructed)
+    settings = settings or RolloutSettings()
+    return run_episode(environment, policy, task, seed, settings, other, on_step)
 
 
 def test_recorded_actions_replayed_give_the_recorded_success(environment, stock):
     actions = []
 
-    def watch(world, steps):
+    def record_step(world, steps):
         if steps:
             actions.append(world.action)
 
-    recorded = act(environment, LiberoExpert(), watch=watch)
+    recorded = act(environment, LiberoExpert(), on_step=record_step)
     assert recorded["success"]
     assert recorded["steps"] == len(actions) < 280
     replay = Replay(np.array(actions))
-    replayed = act(environment, replay, course=RolloutSettings(policy_seed=7))
+    replayed = act(environment, replay, settings=RolloutSettings(policy_seed=7))
     assert (replayed["success"], replayed["steps"]) == (True, recorded["steps"])
     assert replayed["state_hash"] == recorded["state_hash"]
     assert (replayed["calls"], replay.seed) == (1, 7)
@@ -82,13 +83,13 @@ def test_recorded_actions_replayed_give_the_recorded_success(environment, stock)
     own.close()
     # The other way round the gripper is never closed on anything.
     flipped = np.array(actions) * [1, 1, 1, 1, 1, 1, -1]
-    assert not act(environment, Replay(flipped), course=RolloutSettings(max_steps=len(actions)))[
+    assert not act(environment, Replay(flipped), settings=RolloutSettings(max_steps=len(actions)))[
         "success"
     ]
 
 
 def test_an_episode_ends_at_the_step_limit_and_counts_what_libero_cuts(environment):
-    found = act(environment, Replay(np.full((5, 7), 1.5)), course=RolloutSettings((), 3, 8))
+    found = act(environment, Replay(np.full((5, 7), 1.5)), settings=RolloutSettings((), 3, 8))
     assert not found["success"]
     assert (found["steps"], found["calls"], found["clamped"]) == (8, 3, 8)
 
@@ -115,16 +116,16 @@ def test_each_trial_begins_in_its_fixed_state_and_ten_steps_later(environment):
     assert environment.state_hash() != first
 
 
-def test_what_is_told_is_done_and_counted(environment):
+def test_another_instruction_is_followed_and_counted(environment):
     """Told to take the ketchup, the expert does that, and not the scene's own task."""
-    assert KETCHUP in environment.others(SALAD)
-    assert SALAD not in environment.others(SALAD)
-    found = act(environment, LiberoExpert(), told=KETCHUP)
+    assert KETCHUP in environment.other_tasks(SALAD)
+    assert SALAD not in environment.other_tasks(SALAD)
+    found = act(environment, LiberoExpert(), instructed=KETCHUP)
     assert (found["success"], found["behaviours"][KETCHUP]) == (False, True)
     assert found["instruction"] == "pick up the ketchup and place it in the basket"
     environment.reset(0, SALAD)
     with pytest.raises(ConfigError, match=r"'pick_up_the_butter.* cannot be done in the scene of"):
-        environment.tell("pick_up_the_butter_and_place_it_in_the_basket")
+        environment.set_instruction("pick_up_the_butter_and_place_it_in_the_basket")
 
 
 def test_pictures_come_by_every_name_and_in_every_size(environment):
@@ -150,7 +151,7 @@ def test_mixed_tasks_are_named_by_what_and_where(libero):
     assert pairs == [(2, 2), (2, 4), (4, 2), (4, 4), (6, 4), (6, 6)]
     names = [task.name for task in mixed.spec.tasks]
     assert names[1] == f"{KETCHUP}-in-scene-2"
-    assert mixed.others(names[1]) == (names[0],)
+    assert mixed.other_tasks(names[1]) == (names[0],)
     assert mixed.spec.tasks[1].max_steps == 280
 
 
@@ -161,7 +162,7 @@ def test_the_expert_refuses_what_it_cannot_do(scene):
 
 def test_a_demonstration_follows_from_its_seed_and_teaches_without_the_noise(environment):
     environment = LiberoEnvironment(tasks=[2, 4], mixed=True, begin="random")
-    task = find_task(environment.spec.tasks, f"{KETCHUP}-in-scene-2")
+    task = environment.spec.task(f"{KETCHUP}-in-scene-2")
     eye = [Camera("agentview", 16, 16)]
     recorded = []
     for noise in (0.3, 0.3, 0.0):
@@ -289,7 +290,7 @@ def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, list
         infer(tmp_path, listener, "wave at me", **limited)
     (summary,) = infer(tmp_path, listener, "wave at me", scene=2, **limited)
     assert (summary["success"], summary["outcome"], summary["steps"]) == (None, "ended", 2)
-    assert "nobody can judge it after 2 steps" in listener.lines
+    assert "success unknown after 2 steps" in listener.lines
     with pytest.raises(UsageError, match="cannot be done in the scene of"):
         infer(tmp_path, listener, "6", scene=2, **limited)
     with pytest.raises(UsageError, match="no task was given"):

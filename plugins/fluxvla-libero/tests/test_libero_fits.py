@@ -23,11 +23,11 @@ from fluxvla_core import build_environment_from_cfg
 from fluxvla_core.errors import FluxError, SpecMismatch
 from fluxvla_core.evaluation import (
     EnvironmentSpec,
+    PolicySource,
     RolloutSettings,
-    Source,
     TaskSpec,
-    fit,
     make_policy,
+    match_policy,
     worker,
 )
 from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
@@ -92,14 +92,14 @@ HERE = EnvironmentSpec("libero_object", libero_spec(SIDES), (TaskSpec("pick", "p
 
 
 def source(path, **values):
-    return Source("checkpoint", str(path), **values)
+    return PolicySource("checkpoint", str(path), **values)
 
 
 @pytest.mark.parametrize(("arguments", "message"), MISMATCHES)
 def test_a_checkpoint_that_means_something_else_is_refused(tmp_path, save, arguments, message):
     path = save(tmp_path / "work", **arguments)
     with pytest.raises(SpecMismatch) as caught:
-        fit(make_policy(source(path)), HERE)
+        match_policy(make_policy(source(path)), HERE)
     assert message in str(caught.value)
 
 
@@ -129,7 +129,7 @@ def test_an_aloha_policy_is_refused_with_every_difference():
     arm = tuple(Joint(f"left_{n}", "rad", -1, 1, 1, 1) for n in "abcdef")
     aloha = EmbodimentSpec("aloha", arm, (Camera("agentview", 9, 9),), 50.0)
     with pytest.raises(SpecMismatch) as caught:
-        fit(policy(aloha), HERE)
+        match_policy(policy(aloha), HERE)
     for what in ("joints and their order", "action mode", "frame", "rotation"):
         assert what in str(caught.value)
     assert "the policy (aloha) and libero_object (libero_panda)" in str(caught.value)
@@ -138,15 +138,15 @@ def test_an_aloha_policy_is_refused_with_every_difference():
 @pytest.mark.parametrize("name", ["agentview", "image", "agentview_image"])
 def test_names_of_public_datasets_are_understood(name):
     spec = libero_spec([Camera(name, 128, 100), Camera("wrist_image", 90, 90)])
-    cameras = fit(policy(spec, (name, "wrist_image")), HERE)
+    cameras = match_policy(policy(spec, (name, "wrist_image")), HERE)
     assert cameras == (Camera(name, 128, 100), Camera("wrist_image", 90, 90))
 
 
 def test_pictures_have_the_size_that_is_asked_for():
     spec = libero_spec([Camera("agentview", 128, 128)])
-    assert fit(policy(spec), HERE, (224, 224)) == (Camera("agentview", 224, 224),)
+    assert match_policy(policy(spec), HERE, (224, 224)) == (Camera("agentview", 224, 224),)
     unsized = replace(spec, cameras=())
-    assert fit(policy(unsized), HERE) == (Camera("agentview", PICTURE, PICTURE),)
+    assert match_policy(policy(unsized), HERE) == (Camera("agentview", PICTURE, PICTURE),)
 
 
 def test_liberos_own_spec_survives_json():

@@ -86,7 +86,7 @@ def test_what_cannot_move_stands_where_libero_puts_it(stock):
         scene.step(NO_OP)
         env.step(NO_OP)
     np.testing.assert_array_equal(scene.data.qpos, env.sim.data.qpos)
-    judged = [t.index for t in suite_tasks("libero_goal") if scene.can_judge(t)]
+    judged = [t.index for t in suite_tasks("libero_goal") if scene.can_check(t)]
     assert judged == list(range(10)), "all tasks share the scene"
     env.close()
     scene.close()
@@ -257,5 +257,5 @@ def test_tasks_are_chosen_by_index_and_name(libero):
 def test_what_can_be_done_where_is_read_from_the_files(libero, scene):
     tasks = suite_tasks("libero_object")
     from_files = [t.index for t in tasks if can_be_done_in(t, tasks[2])]
-    assert from_files == [t.index for t in tasks if scene.can_judge(t)]
+    assert from_files == [t.index for t in tasks if scene.can_check(t)]
     assert from_files == [0, 1, 2, 4, 5, 7]

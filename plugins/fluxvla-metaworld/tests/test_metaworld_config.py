@@ -82,7 +82,7 @@ def test_an_expert_acts_in_meta_world_only():
     expert = MetaWorldExpert()
     with pytest.raises(ConfigError, match="in MetaWorldEnvironment only, not in object"):
         expert.enter(object())
-    with pytest.raises(ConfigError, match="must be told where it acts"):
+    with pytest.raises(ConfigError, match="does not know its environment"):
         expert.predict_action({})
 
 

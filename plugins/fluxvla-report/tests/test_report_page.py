@@ -60,8 +60,8 @@ def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
         "two arms",
         "trained policy succeeds 85% 34 of 40 episodes, interval 71% to 93%",
         "untrained policy succeeds 0%",
-        # It is told another task than the scene's: what it does then is what it was told.
-        "wrong instruction: does the task that it was told 100% 40 of 40 episodes",
+        # Its instruction is not that of the scene's task: it is scored by the instruction.
+        "wrong instruction: follows the instruction 100% 40 of 40 episodes",
         "The same task, side by side",
         "evaluated 2026-01-02 03:04:05 UTC · commit abc123 · mujoco 3.3.0 How it was evaluated",
         "machine x86_64, 2 CPUs versions mujoco 3.3.0",
@@ -70,7 +70,7 @@ def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
         "On the robot: lift the cube & hold it",
         "left_waist (rad) · 3 changed by a limit",
         "wrong instruction hand it over 20 1 1",
-        "from nothing to this page 15 min",
+        "total time 15 min",
         "train · 10 min 01 s",
         "2.13.0+cpu",
         "fluxvla-aloha 0.1.0",
@@ -96,7 +96,7 @@ def test_a_folder_of_recordings(tmp_path: Path, complete: Path) -> None:
         "6 of 6 judged ones succeeded",
         "18 commands; 1 safe stop",
         "The newest 4 follow.",
-        "What happened when",
+        "Timeline",
         "Latency by stage",
     ):
         assert page.shows(words), words
@@ -114,7 +114,7 @@ def test_one_recording_with_a_stop(tmp_path: Path, complete: Path) -> None:
     page = page_of(root, tmp_path)
     assert page.shows("On the robot: lift the cube & hold it")
     assert page.shows("failed the chunk is not finite")
-    assert page.shows("nobody judged")
+    assert page.shows("none judged")
 
 
 def test_it_stands_alone(complete: Path, tmp_path: Path) -> None:

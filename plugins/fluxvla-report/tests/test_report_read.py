@@ -29,7 +29,7 @@ def test_a_complete_work_dir(complete: Path) -> None:
     assert evaluation.groups[0].total.low == pytest.approx(0.709, abs=1e-3)
     assert evaluation.details["checkpoint"] == "checkpoints/step-000000300"
     assert evaluation.details["speed"] == "300 steps/s in 2 processes, 120 episodes in 100 s"
-    assert evaluation.details["the policy's answer"] == "12.3 ms on average"
+    assert evaluation.details["policy call"] == "12.3 ms on average"
     assert evaluation.details["replan_every"] == 5
     assert evaluation.behaviours[1].group == "wrong instruction"
     assert evaluation.behaviours[1].counts == {"neither": 1, "lift_hold": 1}

@@ -7,14 +7,13 @@ import json
 import numpy as np
 import pytest
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.aloha.noise import smooth_noise
+from fluxvla_sim.aloha.expert import smooth_noise
 from fluxvla_sim.collect_command import CollectCommand
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.check import check_class
-from fluxvla_core.evaluation import find_task
 from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera
 
@@ -29,7 +28,7 @@ def environment():
 
 
 def act(environment, name, **arguments):
-    task = find_task(environment.spec.tasks, name)
+    task = environment.spec.task(name)
     return demonstrate(environment, SimExpert(**arguments), task, 3, [CAMERA])
 
 

@@ -16,7 +16,7 @@ from fluxvla_sim.operators import AlohaSimOperator
 from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.contracts.check import check_class
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.evaluation import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation import RolloutSettings, run_episode
 from fluxvla_core.operators import BaseInferenceRunner, Camera, RunContext
 
 LIFT = "pick up the cube with the right arm and hold it"
@@ -29,11 +29,11 @@ def aloha():
     environment.close()
 
 
-def episode(environment, actor, task, seed, told=None, **course):
-    tasks = environment.spec.tasks
-    other = None if told is None else find_task(tasks, told)
-    course = RolloutSettings(**{"replan_every": 5, **course})
-    return run_episode(environment, actor, find_task(tasks, task), seed, course, other)
+def episode(environment, actor, task, seed, instructed=None, **settings):
+    spec = environment.spec
+    other = None if instructed is None else spec.task(instructed)
+    settings = RolloutSettings(**{"replan_every": 5, **settings})
+    return run_episode(environment, actor, spec.task(task), seed, settings, other)
 
 
 @pytest.mark.parametrize("cls", [AlohaSimEnvironment, URSimEnvironment])
@@ -52,8 +52,8 @@ def test_only_tasks_of_one_scene_can_be_told_instead_of_each_other():
     environment = AlohaSimEnvironment()
     names = [task.name for task in environment.spec.tasks]
     assert names == ["transfer_cube", "lift_hold", "insertion"]
-    assert environment.others("lift_hold") == ("transfer_cube",)
-    assert environment.others("insertion") == ()
+    assert environment.other_tasks("lift_hold") == ("transfer_cube",)
+    assert environment.other_tasks("insertion") == ()
     with pytest.raises(ConfigError, match="there is no task 'juggle'; there are transfer_cube"):
         environment.reset(0, "juggle")
 
@@ -79,7 +79,7 @@ def test_an_episode_follows_from_its_seed_alone(aloha):
 
 
 def test_whoever_is_told_the_other_task_does_that(aloha):
-    found = episode(aloha, SimExpert(), "transfer_cube", 31, told="lift_hold")
+    found = episode(aloha, SimExpert(), "transfer_cube", 31, instructed="lift_hold")
     assert found["instruction"] == LIFT
     assert found["behaviours"] == {"transfer_cube": False, "lift_hold": True}
     assert (found["success"], found["steps"]) == (False, 300)

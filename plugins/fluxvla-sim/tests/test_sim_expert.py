@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha.arms import HOME
+from fluxvla_sim.aloha.cube import CUBE_HIGH, CUBE_LOW, MAX_STEPS, AlohaScene, Facts
 from fluxvla_sim.aloha.expert import Expert, arm_ik
-from fluxvla_sim.aloha.scene import CUBE_HIGH, CUBE_LOW, AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS, Facts
 from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
 from fluxvla_sim.motion import minimum_jerk, quaternion_product, quaternion_share, turn
 from fluxvla_sim.ur.scene import HOME as UR_HOME
-from fluxvla_sim.ur.tasks import LiftFacts
+from fluxvla_sim.ur.scene import LiftFacts
 from fluxvla_sim.ur.world import UR5E
 
 TASKS = {task.name: task for task in CUBE.tasks}

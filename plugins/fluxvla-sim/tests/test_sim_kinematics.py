@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fluxvla_aloha.workspace import AlohaWorkspaceBox
-from fluxvla_sim.aloha.scene import AlohaScene
+from fluxvla_sim.aloha.cube import AlohaScene
 from fluxvla_sim.ur.scene import URScene
 from fluxvla_ur.embodiment import JOINTS
 from fluxvla_ur.workspace import URWorkspaceBox

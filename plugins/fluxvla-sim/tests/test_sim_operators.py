@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha.arms import HOME, load_model
+from fluxvla_sim.aloha.cube import AlohaScene, sample_cube
 from fluxvla_sim.aloha.expert import Expert
-from fluxvla_sim.aloha.scene import AlohaScene, sample_cube
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.operators import AlohaSimOperator, URSimOperator
 from fluxvla_sim.ros2.operators import AlohaSimROSOperator
@@ -228,7 +228,7 @@ def test_an_operator_that_is_not_connected_says_so():
 
 
 def test_a_machine_without_an_egl_driver_gets_one_clear_message():
-    code = "from fluxvla_sim.aloha.scene import AlohaScene as S; s = S(); s.render('top', 48, 64)"
+    code = "from fluxvla_sim.aloha.cube import AlohaScene as S; s = S(); s.render('top', 48, 64)"
     nowhere = {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "MUJOCO_GL": "egl"}
     run = subprocess.run(
         [sys.executable, "-c", code], env={**nowhere}, capture_output=True, text=True, check=False
@@ -251,7 +251,7 @@ def test_a_machine_without_egl_gets_one_clear_message():
 
 def test_pictures_work_whoever_imported_mujoco_first():
     code = (
-        "import mujoco; from fluxvla_sim.aloha.scene import AlohaScene;"
+        "import mujoco; from fluxvla_sim.aloha.cube import AlohaScene;"
         "print(AlohaScene().render('top', 48, 64).shape)"
     )
     run = subprocess.run(

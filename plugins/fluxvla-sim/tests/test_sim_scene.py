@@ -10,8 +10,7 @@ import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha import arms
 from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, load_model, to_metres, to_normalized
-from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import Facts
+from fluxvla_sim.aloha.cube import AlohaScene, Facts
 from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
 from fluxvla_sim.render import Renderer, import_mujoco
 from fluxvla_sim.ur.world import CUBE as LIFT
@@ -223,7 +222,7 @@ def test_loading_the_model_leaves_gymnasium_alone():
     import subprocess
 
     code = (
-        "import sys; from fluxvla_sim.aloha.scene import AlohaScene; AlohaScene();"
+        "import sys; from fluxvla_sim.aloha.cube import AlohaScene; AlohaScene();"
         "print(sorted({'gymnasium', 'dm_control', 'torch'} & set(sys.modules)))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

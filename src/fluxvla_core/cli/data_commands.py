@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -261,7 +261,7 @@ def arguments(env: str, policy: str, settings: Sequence[str]) -> dict[str, Any]:
     from fluxvla_core.config.check import examine
     from fluxvla_core.config.overrides import parse_value
     from fluxvla_core.config.tree import Config
-    from fluxvla_core.evaluation.policies import EXPERT, resolve_name
+    from fluxvla_core.evaluation.policies import EXPERT, resolve_policy
 
     tables: dict[str, Any] = {"environment": {"type": env}, "policy": {"type": policy}}
     origins = {"environment": f"--env {env}", "policy": f"--policy {policy}"}
@@ -275,15 +275,14 @@ def arguments(env: str, policy: str, settings: Sequence[str]) -> dict[str, Any]:
             )
         tables[_SIDES[side]][name] = parse_value(value.strip())
         origins[f"{_SIDES[side]}.{name}"] = f"--set {text}"
-    if policy == EXPERT:
-        # Which class that is, the environment's says.
+    environment = None
+    if policy == EXPERT:  # the environment's class names it
         from fluxvla_core.plugins.registry import ENVIRONMENTS
 
-        named = resolve_name(EXPERT, ENVIRONMENTS.get(env))
-        assert isinstance(named, dict)
-        tables["policy"] = {**tables["policy"], **named}
-    elif isinstance(named := resolve_name(policy, None), dict):
-        tables["policy"] = {**tables["policy"], **named}
+        environment = ENVIRONMENTS.get(env)
+    named = resolve_policy(policy, environment)
+    if isinstance(named, Mapping):
+        tables["policy"] |= named
     checked = examine(Config(tables, origins, "fluxvla data collect"))
     if checked.problems:
         raise ConfigError.from_problems(checked.problems)

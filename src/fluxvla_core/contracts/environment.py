@@ -1,4 +1,4 @@
-"""Any simulator behind a small contract, so that one engine evaluates and collects in all of them.
+"""The contract of environments: simulators in which policies are evaluated and data is collected.
 
 An environment's constructor is light: what ``spec`` says is known before a scene is built, which
 the first ``reset`` does. Everything random in an episode follows from its seed; then its outcome
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class TaskSpec:
 
     Args:
         name: unique in its environment; used in file names and as a key.
-        instruction: what a policy is told.
+        instruction: the language instruction that a policy gets.
         max_steps: control steps after which an episode ends.
         record_steps: how many of a demonstration's steps teach something; all by default.
     """
@@ -69,16 +70,36 @@ class EnvironmentSpec:
         if self.limited and self.embodiment.action_mode != "absolute":
             raise ValueError("limits can only be kept for absolute joint targets")
 
+    def task(self, name: str) -> TaskSpec:
+        """The task called ``name``, which is one of ``tasks``."""
+        return next(task for task in self.tasks if task.name == name)
+
+    def select_tasks(self, names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
+        """The tasks called ``names``, in their order; all of them for None.
+
+        Raises:
+            ConfigError: there is none of that name, or one is named twice.
+        """
+        if names is None:
+            return self.tasks
+        known = {task.name: task for task in self.tasks}
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
+        if not names or len(set(names)) != len(names):
+            raise ConfigError(f"tasks must name each task once, got {list(names)}")
+        return tuple(known[name] for name in names)
+
 
 @dataclass(frozen=True)
 class Step:
-    """What came of one action.
+    """The result of one action.
 
     Args:
         reward: of this step.
         success: whether the task of the scene is done, now or at any moment before.
         ended: whether the episode ends here; a success need not end it.
-        behaviours: the success of every task that can be judged in this scene, by name.
+        behaviours: the success of every task that can be checked in this scene, by name.
     """
 
     reward: float
@@ -88,10 +109,10 @@ class Step:
 
 
 class Environment(Contract):
-    """Simulated tasks, in the process that made them."""
+    """A simulator with tasks, in the process that made it."""
 
     expert: ClassVar[str | None] = None
-    """``type`` of the registered policy that does its tasks."""
+    """``type`` of the registered policy that solves its tasks: ``policy = "expert"`` in configs."""
 
     @required
     def spec(self) -> EnvironmentSpec:
@@ -111,22 +132,27 @@ class Environment(Contract):
 
     @abstractmethod
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """What is there now, with a picture of each camera, in its size where that can be had.
+        """The current observation, with a picture of each camera, in its size if possible.
 
-        ``task_description`` is what the policy is told: the task's instruction, or words of the
-        environment's own for this episode.
+        ``task_description`` is the language instruction: the task's, or one of the environment's
+        own for this episode.
 
-        Called when somebody looks, not after every step: drawing is what takes the time.
+        Called when the policy or a video needs it, not after every step: rendering is what takes
+        the time.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give everything back; any number of times."""
+        """Free all resources; may be called more than once."""
 
     # -- optional abilities ----------------------------------------------------------------------
 
     def divergence(self) -> str | None:
-        """What went wrong in the simulation since the last reset; asked after every step."""
+        """Why the simulation diverged since the last reset, None if it did not.
+
+        Called after every step; a state that is not finite is noticed without it. For MuJoCo, whose
+        simulations reset themselves, ``fluxvla_mujoco.divergence(data)`` answers it.
+        """
         return None
 
     def drawn_by(self) -> str:
@@ -135,18 +161,19 @@ class Environment(Contract):
 
     @attribute
     def distributions(self) -> Sequence[str]:
-        """Installed packages that outcomes follow from, beside those that its own requires."""
+        """Installed packages that outcomes follow from, besides those that its plugin requires."""
         return ()
 
     def state_hash(self) -> str | None:
         """Equal for equal courses of an episode; None: the states of all steps are hashed."""
         return None
 
-    def others(self, task: str) -> Sequence[str]:
-        """Tasks that could also be done in the scene of ``task``; none of them is it."""
+    def other_tasks(self, task: str) -> Sequence[str]:
+        """Names of other tasks that could be done in the scene of ``task``."""
         return ()
 
-    def tell(self, task: str) -> None:
-        """After ``reset``: the policy is told the instruction of ``task`` in this episode, which
-        ends when that is done, too. ``success`` stays that of the scene's own task."""
+    def set_instruction(self, task: str) -> None:
+        """After ``reset``: give the policy the instruction of ``task``, one of ``other_tasks``, in
+        this episode, which then also ends when that is done. ``success`` stays that of the scene's
+        own task."""
         raise NotImplementedError(f"{type(self).__name__} has no scene with two tasks")

@@ -1,7 +1,7 @@
-"""Environments and evaluation: what a simulator, a benchmark or a demonstration is written with.
+"""Public API for simulation environments, evaluation runners and data collection.
 
-An environment offers tasks and steps a simulation; an evaluation runner plays episodes in it and
-counts successes.
+An environment has tasks and steps a simulation; an evaluation runner runs episodes in it and counts
+successes.
 """
 
 from __future__ import annotations
@@ -17,15 +17,11 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.environment import TaskSpec as TaskSpec
     from fluxvla_core.contracts.policy import Actor as Actor
     from fluxvla_core.evaluation.collect import Collection as Collection
-    from fluxvla_core.evaluation.divergence import Diverged as Diverged
-    from fluxvla_core.evaluation.policies import FROM_CHECKPOINT as FROM_CHECKPOINT
-    from fluxvla_core.evaluation.policies import Source as Source
-    from fluxvla_core.evaluation.policies import chosen_checkpoint as chosen_checkpoint
-    from fluxvla_core.evaluation.policies import fit as fit
+    from fluxvla_core.evaluation.policies import PolicySource as PolicySource
     from fluxvla_core.evaluation.policies import make_policy as make_policy
-    from fluxvla_core.evaluation.policies import resolve_name as resolve_name
+    from fluxvla_core.evaluation.policies import match_policy as match_policy
+    from fluxvla_core.evaluation.rollout import Diverged as Diverged
     from fluxvla_core.evaluation.rollout import RolloutSettings as RolloutSettings
-    from fluxvla_core.evaluation.rollout import find_task as find_task
     from fluxvla_core.evaluation.rollout import run_episode as run_episode
     from fluxvla_core.evaluation.runner import EvalRunner as EvalRunner
 
@@ -40,16 +36,8 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.contracts.policy": ["Actor"],
         "fluxvla_core.evaluation.collect": ["Collection"],
-        "fluxvla_core.evaluation.divergence": ["Diverged"],
-        "fluxvla_core.evaluation.policies": [
-            "FROM_CHECKPOINT",
-            "Source",
-            "chosen_checkpoint",
-            "fit",
-            "make_policy",
-            "resolve_name",
-        ],
-        "fluxvla_core.evaluation.rollout": ["RolloutSettings", "find_task", "run_episode"],
+        "fluxvla_core.evaluation.policies": ["PolicySource", "make_policy", "match_policy"],
+        "fluxvla_core.evaluation.rollout": ["Diverged", "RolloutSettings", "run_episode"],
         "fluxvla_core.evaluation.runner": ["EvalRunner"],
     },
 )

@@ -1,17 +1,15 @@
-"""Demonstrations of a policy, a scripted expert as a rule, in any environment.
+"""Collect demonstrations of a policy, usually a scripted expert, in any environment.
 
-Episode ``k`` is acted out with seed ``seed + k``; where the expert fails, or the simulation
-diverges, with the next of that episode's own spare seeds. What it shows follows from ``k`` alone,
-so the dataset is the same for any number of workers, and a collection that was interrupted can go
-on.
+Episode ``k`` is run with seed ``seed + k``; where the expert fails, or the simulation diverges,
+with the next of that episode's own spare seeds. Its content follows from ``k`` alone, so the
+dataset is the same for any number of workers, and an interrupted collection can be continued.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,14 +23,12 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
-from fluxvla_core.evaluation.divergence import Diverged, check_step
-from fluxvla_core.evaluation.policies import fit, resolve_name
-from fluxvla_core.evaluation.pool import Outcome, run_jobs
-from fluxvla_core.evaluation.rollout import ChunkCommands, shaped
-from fluxvla_core.evaluation.worker import choose_tasks
+from fluxvla_core.evaluation.policies import match_policy, resolve_policy
+from fluxvla_core.evaluation.pool import Outcome, WorkerPool
+from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
 from fluxvla_core.robot.control.chunks import not_finite
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
-from fluxvla_core.untrusted import checked, read_json
+from fluxvla_core.untrusted import read_json
 
 META, SETTINGS = "meta", "collection.json"
 _GO_ON = "run the same command with --resume"
@@ -45,7 +41,7 @@ SPARE_STRIDE = 500_000_000
 
 @dataclass(frozen=True)
 class Collection:
-    """What a dataset follows from.
+    """Settings of a collection, from which its dataset follows.
 
     Args:
         environment: the table of a registered environment.
@@ -102,8 +98,8 @@ def collect(
     spec: EnvironmentSpec = environment.spec
     actor = _actor(collection, environment)
     environment.close()
-    choose_tasks(spec.tasks, collection.tasks)
-    fit(actor, spec)
+    spec.select_tasks(collection.tasks)
+    match_policy(actor, spec)
     cameras = _cameras(collection, spec)
     fps = spec.embodiment.rate_hz / frame_stride(actor, spec)
     return collect_episodes(
@@ -120,14 +116,14 @@ def collect(
 
 
 class Demonstrator:
-    """A worker: acts out the episode of a number, with spare seeds where the expert fails."""
+    """A worker: runs the episode of a number, with spare seeds where the expert fails."""
 
     def __init__(self, collection: Collection) -> None:
         self._collection = collection
         self._environment = Environment.adapt(build_environment_from_cfg(collection.environment))
         self._spec = self._environment.spec
         self._actor = _actor(collection, self._environment)
-        self._tasks = choose_tasks(self._spec.tasks, collection.tasks)
+        self._tasks = self._spec.select_tasks(collection.tasks)
         self._cameras = _cameras(collection, self._spec)
 
     def __call__(self, episode: int) -> Demonstration:
@@ -161,20 +157,20 @@ class Demonstrator:
 def demonstrate(
     environment: Environment, actor: Actor, task: TaskSpec, seed: int, cameras: Sequence[Camera]
 ) -> tuple[Demonstration, bool]:
-    """Act out ``task`` and record its first ``record_steps`` steps.
+    """Run an episode of ``task`` and record its first ``record_steps`` steps.
 
-    A frame is what is seen before its steps; its action is what the actor wants to have reached at
-    the next frame: the first action of its chunk. What is executed on the way there is the actor's
-    ``executed``, or leads straight to it. So noise can be in what is done and not in what is
-    taught, which leads back (Laskey et al., "DART", CoRL 2017).
+    A frame is the observation before its steps; its action is the actor's target for the next
+    frame: the first action of its chunk. The commands on the way there are the actor's
+    ``executed``, or a straight line. So noise can be in the executed commands and not in the
+    recorded actions, which lead back (Laskey et al., "DART", CoRL 2017).
 
     Returns:
-        The episode, and whether the task was done, judged over all of it.
+        The episode, and whether the task was done at its end.
 
     Raises:
         SpecMismatch: the actor's chunk is of another shape.
         RunFailed: it is not finite.
-        Diverged: the simulation is not what it was.
+        Diverged: the simulation diverged.
     """
     environment, actor = Environment.adapt(environment), Actor.adapt(actor)
     spec = environment.spec
@@ -211,7 +207,7 @@ def demonstrate(
 
 
 def frame_stride(actor: Actor, spec: EnvironmentSpec) -> int:
-    """Control steps from frame to frame: a frame is an action of the actor.
+    """Control steps from one frame to the next; there is one frame for each of the actor's actions.
 
     Raises:
         ConfigError: the actor's rate does not divide the environment's.
@@ -244,13 +240,13 @@ def _checked(chunk: Any, spec: EnvironmentSpec) -> npt.NDArray[np.float64]:
 
 
 def _actor(collection: Collection, environment: Environment) -> Actor:
-    what = resolve_name(collection.policy, environment)
-    if isinstance(what, str):
+    policy = resolve_policy(collection.policy, environment)
+    if isinstance(policy, str):
         raise ConfigError(
-            f"policy {what!r} demonstrates nothing: its actions are what was learned",
+            f"policy {policy!r} demonstrates nothing: its actions are what was learned",
             next="evaluate it: fluxvla run --section eval",
         )
-    return Actor.adapt(build_policy_from_cfg(what))
+    return Actor.adapt(build_policy_from_cfg(policy))
 
 
 def _cameras(collection: Collection, spec: EnvironmentSpec) -> tuple[Camera, ...]:
@@ -273,12 +269,12 @@ def _cameras(collection: Collection, spec: EnvironmentSpec) -> tuple[Camera, ...
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode.
+    """One recorded episode.
 
     Args:
         images: camera name -> ``(N, H, W, 3)`` uint8.
         states: ``(N, S)``; actions: ``(N, D)``, in the embodiment's units.
-        instruction: what was done.
+        instruction: the language instruction of the task.
         retried: how many attempts failed before.
     """
 
@@ -340,8 +336,8 @@ def collect_episodes(
             raise explain_disk(error, out, "no episode was lost", next) from error
         kept = writer.episodes
         jobs = range(kept, episodes)
-        with closing(run_jobs(factory, jobs, workers)) as outcomes:
-            for number, found in _in_order(outcomes, jobs):
+        with WorkerPool(factory, workers) as pool:
+            for number, found in _in_order(pool.run(jobs), jobs):
                 for frame in range(len(found.states)):
                     pictures = {name: stack[frame] for name, stack in found.images.items()}
                     writer.add_frame(
@@ -352,7 +348,7 @@ def collect_episodes(
                 frames += len(found.states)
                 pace = (number + 1 - kept) / (time.monotonic() - began)
                 reporter.progress("demonstrations", number + 1, episodes, per_s=round(pace, 2))
-    # Where it stays: whoever evaluates what was trained on it knows which seeds it has seen.
+    # It stays with the dataset, so that an evaluation knows the seeds of the training data.
     write_json(out / META / SETTINGS, dict(settings))
     seconds = time.monotonic() - began
     result = {
@@ -395,51 +391,3 @@ def _check_same(note: Path, settings: Mapping[str, Any]) -> None:
             f"the interrupted collection had other settings: {'; '.join(other)}",
             next=f"use the same settings, or delete {note.parent} and begin anew",
         )
-
-
-def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | None:
-    """Whether none of ``seeds`` was among those that demonstrations were collected with.
-
-    Args:
-        tables: of a checkpoint's config, from which its datasets are found.
-        environment: the ``type`` of what is evaluated; seeds of another one mean something else.
-
-    Returns:
-        None where a dataset does not say how it was collected.
-    """
-    roots = list(_roots(tables))
-    collections = [_collection(Path(root)) for root in roots]
-    if not roots or None in collections:
-        return None
-    for collection in collections:
-        assert collection is not None
-        if collection["environment"].get("type") != environment:
-            continue
-        first, count = collection["seed"], collection["episodes"]
-        if any((seed - first) % SPARE_STRIDE < count for seed in seeds):
-            return False
-    return True
-
-
-def _roots(table: Any) -> Iterator[str]:
-    """Every ``data_root_path`` below ``table``."""
-    if isinstance(table, Mapping):
-        roots = table.get("data_root_path")
-        for root in roots if isinstance(roots, (list, tuple)) else [roots]:
-            if isinstance(root, str):
-                yield root
-        table = list(table.values())
-    if isinstance(table, (list, tuple)):
-        for value in table:
-            yield from _roots(value)
-
-
-def _collection(root: Path) -> dict[str, Any] | None:
-    try:
-        found = read_json(root / META / SETTINGS, dict[str, Any], DataError)
-        whole = {"environment": dict[str, Any], "seed": int, "episodes": int}
-        return {
-            name: checked(found.get(name), kind, DataError, name) for name, kind in whole.items()
-        }
-    except DataError:
-        return None

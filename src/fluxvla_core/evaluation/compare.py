@@ -1,4 +1,4 @@
-"""Two evaluations of the same episodes, from their folders: is the difference more than chance?"""
+"""Compare two evaluations of the same episodes: is the difference statistically significant?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episode_log import DONE, FORMAT, FORMER, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, whole_lines
 from fluxvla_core.evaluation.statistics import all_of, mcnemar_test, rate, verdict
 
 NAMED = 5
@@ -17,7 +17,7 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Evaluated:
-    """One side: a group of an evaluation's finished episodes.
+    """One side of a comparison: the finished episodes of a group.
 
     Args:
         folder: where it is.

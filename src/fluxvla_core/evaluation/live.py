@@ -1,21 +1,20 @@
-"""LIVE: the simulator runs on the wall clock, and what comes too late is missed.
+"""Live (real-time) evaluation: the simulation does not wait for the policy's inference.
 
-In a stepped episode time stands still while a policy thinks; on a robot it does not. Here the
+In a stepped episode simulated time stands still during inference; on a robot it does not. Here the
 environment is driven like a robot, by the inference runner with its control loop and its safety:
-the world goes on at its control rate, holds the last command while none comes, and a slow policy
-misses ticks. Such an outcome depends on the machine and cannot be repeated exactly, so it is never
-counted together with stepped ones.
+the simulation advances at its control rate on the wall clock, holds the last command while none
+comes, and a slow policy misses ticks. Such an outcome depends on the machine and cannot be repeated
+exactly, so it is never counted together with stepped ones.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,30 +27,71 @@ from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
-from fluxvla_core.evaluation.divergence import check_step
-from fluxvla_core.evaluation.live_settings import Live
+from fluxvla_core.evaluation.rollout import check_step
 from fluxvla_core.robot.control.clock import MonotonicClock
-from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 
+LIVE_OPTIONS = (
+    "action_chunk",
+    "action_filters",
+    "chunk_joining",
+    "execute_horizon",
+    "gripper_threshold",
+    "safety",
+)
+"""Keys of an evaluation's ``live`` table: arguments of an inference runner that say how a policy
+drives a robot."""
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How live episodes are run.
+
+    Args:
+        options: arguments of ``BaseInferenceRunner``, of those in ``LIVE_OPTIONS``.
+        folder: where each episode's recording goes.
+        video_fps: of the recorded videos; None records none.
+    """
+
+    options: Mapping[str, Any]
+    folder: str
+    video_fps: float | None = None
+
+
+def live_options(live: bool | Mapping[str, Any]) -> dict[str, Any] | None:
+    """The options of a live evaluation, None for a stepped one.
+
+    ``chunk_joining`` is ``latest_only`` by default: the newest chunk replaces the one before.
+
+    Raises:
+        ConfigError: there is no such option.
+    """
+    if live is False:
+        return None
+    given = {} if live is True else dict(live)
+    unknown = sorted(set(given) - set(LIVE_OPTIONS))
+    if unknown:
+        raise ConfigError(f"takes no {', '.join(unknown)}; it takes {', '.join(LIVE_OPTIONS)}")
+    return {"chunk_joining": "latest_only", **given}
+
 
 class EnvironmentOperator(Operator):
-    """An environment as a robot that lives in real time.
+    """An environment as a robot in real time.
 
-    Physics is stepped in whole control periods as they become due, whenever somebody looks or
-    sends; the last command holds. Time begins with the first command, when the policy is warm.
+    Physics is stepped in whole control periods as they become due, at each reading and each
+    command; the last command holds. Time begins with the first command, when the policy is warm.
 
     Args:
         environment: takes joint targets (``spec.limited``).
-        actor: told where it acts, if it wants to know.
+        actor: its ``enter`` is called with the environment when an episode begins.
         cameras: what ``get_frame`` shows.
 
     Attributes:
-        ticks: control periods that have passed; ``late``: those of them that were stepped together
-            with others, because nobody came in time; ``failed``: the error of the environment that
-        ended the episode, if one did.
+        ticks: control periods that have passed.
+        late: those of them that were stepped together with others, because no call came in time.
+        failed: the error of the environment that ended the episode, if one did.
     """
 
     api: ClassVar[str] = "1.0"
@@ -79,7 +119,7 @@ class EnvironmentOperator(Operator):
         self._lock = threading.RLock()
         self._began: float | None = None
         self._target: Array | None = None
-        self._found: Step | None = None
+        self._last_step: Step | None = None
 
     def connect(self) -> None:
         """Nothing: ``begin_episode`` resets."""
@@ -89,7 +129,7 @@ class EnvironmentOperator(Operator):
         with self._lock:
             self._environment.reset(self._seed, self._task.name)
             self._actor.enter(self._environment)
-            self._began = self._target = self._found = None
+            self._began = self._target = self._last_step = None
             self.ticks = self.late = 0
 
     def get_frame(self) -> Frame:
@@ -123,7 +163,7 @@ class EnvironmentOperator(Operator):
     def task_success(self) -> bool:
         """Whether the task is done as of now."""
         with self._lock:
-            return self._found is not None and bool(self._found.success)
+            return self._last_step is not None and bool(self._last_step.success)
 
     def task_done(self) -> bool:
         """Whether the episode ends here."""
@@ -135,10 +175,10 @@ class EnvironmentOperator(Operator):
         """Hold: the last command stays."""
 
     def close(self) -> None:
-        """Nothing: the environment belongs to whoever made it."""
+        """Nothing: whoever made the environment closes it."""
 
     def _over(self) -> bool:
-        ended = self._found is not None and bool(self._found.ended)
+        ended = self._last_step is not None and bool(self._last_step.ended)
         return ended or self.ticks >= self._limit
 
     def _catch_up(self) -> None:
@@ -148,7 +188,7 @@ class EnvironmentOperator(Operator):
         self.late += max(0, min(due, self._limit) - self.ticks - 1)
         while self.ticks < due and not self._over():
             try:
-                self._found = self._environment.step(self._target)
+                self._last_step = self._environment.step(self._target)
                 check_step(self._environment, self.ticks + 1)
             except Exception as error:
                 self.failed = error
@@ -169,8 +209,8 @@ class EnvironmentOperator(Operator):
         return target
 
 
-class _Driver(Policy):
-    """An actor with all that the Policy contract asks for."""
+class _TimedPolicy(Policy):
+    """An actor as a ``Policy``; ``seconds`` is its total inference time."""
 
     embodiment: EmbodimentSpec
     cameras: tuple[str, ...]
@@ -199,11 +239,11 @@ class _Driver(Policy):
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
         return self._timed(self._actor.continue_action, observation, rest)
 
-    def _timed(self, ask: Callable[..., Array], *arguments: Any) -> Array:
+    def _timed(self, predict: Callable[..., Array], *arguments: Any) -> Array:
         began = time.perf_counter()
-        chunk = ask(*arguments)
+        chunk = predict(*arguments)
         self.seconds += time.perf_counter() - began
-        # An expert's chunks may be of any length; what a policy said, it has to keep.
+        # An expert's chunks may be of any length; a policy has to keep to its horizon.
         own = self._actor.horizon
         self.horizon = len(chunk) if own is None else own
         return chunk
@@ -218,16 +258,16 @@ def run_live(
     policy_seed: int,
     cameras: tuple[Camera, ...],
     max_steps: int,
-    live: Live,
+    live: LiveSettings,
 ) -> dict[str, Any]:
     """One episode on the wall clock.
 
     Args:
-        name: of the folder of its record.
+        name: of the folder of its recording.
 
     Returns:
         JSON values: ``success``, ``outcome``, ``problem`` (of a safety stop), ``steps`` (commands
-        that were sent), ``ticks``, ``missed_ticks`` (beats at which the policy had no target),
+        that were sent), ``ticks``, ``missed_ticks`` (those at which the policy had no target),
         ``skipped_beats`` and ``late_ticks`` (of the machine), ``calls``, ``trips``,
         ``instruction``, ``record`` (the episode's folder) and ``timing``.
 
@@ -235,6 +275,8 @@ def run_live(
         ConfigError: the environment takes no joint targets, or an option does not fit.
         RunFailed: the environment's simulation diverged; or what its ``step`` raised.
     """
+    from fluxvla_core.robot.runner import BaseInferenceRunner
+
     if not environment.spec.limited:
         raise ConfigError(
             f"{environment.spec.name} takes no joint targets: the safety of a robot cannot be kept "
@@ -244,26 +286,26 @@ def run_live(
     folder = Path(live.folder) / name
     shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was cut short
     operator = EnvironmentOperator(environment, actor, task, seed, cameras, max_steps)
-    driver = _Driver(actor, environment, cameras)
+    policy = _TimedPolicy(actor, environment, cameras)
     runner = BaseInferenceRunner(
         context=RunContext(work_dir=folder, task=task.name),
         seed=policy_seed,
-        policy=driver,
+        policy=policy,
         operator=operator,
         task_descriptions={task.name: task.instruction},
-        # The operator tells when it is over; this only ends an episode in which nothing moves.
+        # task_done() of the operator ends an episode; this ends one in which nothing moves.
         max_publish_step=2 * max_steps,
         record_fps=live.video_fps,
         **live.options,
     )
     runner.run_setup()
-    with suppress(SafetyStop):  # what the safety stopped has failed; its record says why
+    with suppress(SafetyStop):  # what the safety stopped has failed; the summary says why
         runner.run()
     if operator.failed is not None:  # to the runner a robot that broke, which no policy can help
         raise operator.failed
-    record = next((folder / "inference").glob("*/episode.json"))
-    summary = json.loads(record.read_text(encoding="utf-8"))
-    policy = summary["timings"].get("policy", {})
+    assert runner.recorder is not None
+    summary = runner.recorder.summary
+    answers = summary["timings"].get("policy", {})
     return {
         "success": bool(summary["success"]) and summary["outcome"] == "done",
         "outcome": summary["outcome"],
@@ -276,11 +318,11 @@ def run_live(
         "skipped_beats": summary["skipped_beats"],
         "trips": [trip["rule"] for trip in summary["trips"]],
         "instruction": task.instruction,
-        "record": str(record.parent.relative_to(live.folder)),
+        "record": str(runner.recorder.folder.relative_to(live.folder)),
         "timing": {
             "seconds": operator.ticks / operator.embodiment.rate_hz,
-            "policy_seconds": driver.seconds,
-            "policy_p50_ms": policy.get("p50_ms"),
-            "policy_p99_ms": policy.get("p99_ms"),
+            "policy_seconds": policy.seconds,
+            "policy_p50_ms": answers.get("p50_ms"),
+            "policy_p99_ms": answers.get("p99_ms"),
         },
     }

@@ -1,15 +1,17 @@
-"""Which policy is evaluated: a checkpoint's, its untrained twin, or a registered one."""
+"""Policies that are evaluated: of a checkpoint, its untrained baseline, or a registered one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import build_policy_from_cfg
+from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor
@@ -18,28 +20,28 @@ from fluxvla_core.spec.embodiment import Camera, check_match
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy
-from pathlib import Path
 
 CHECKPOINT, UNTRAINED, EXPERT, RANDOM = "checkpoint", "untrained", "expert", "random"
-NAMES = (CHECKPOINT, UNTRAINED, EXPERT, RANDOM)
 FROM_CHECKPOINT = (CHECKPOINT, UNTRAINED)
 
 
 @dataclass(frozen=True)
-class Source:
-    """Where a policy comes from; sent to worker processes.
+class PolicySource:
+    """From what a policy is built or loaded; sent to worker processes.
 
     Args:
-        what: ``checkpoint`` or ``untrained``, or the table of a registered policy.
-        ckpt_path: its folder, where one is needed.
-        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
-        norm_stats_key: which of its statistics; what it was trained with by default.
+        policy: ``checkpoint`` or ``untrained``, or the table of a registered policy; before
+            ``resolve`` also ``expert``, ``random`` or another ``type``.
+        ckpt_path: the checkpoint's folder, where one is needed; before ``resolve`` also a work dir,
+            or None for that of the run.
+        dataset, denormalize_action: override those of the checkpoint, see ``load_policy``.
+        norm_stats_key: which of its statistics; those it was trained with by default.
         device: of torch.
         precision: ``float32`` or ``bf16``.
-        batch_size: how many rows every forward pass has; results follow from it.
+        batch_size: rows of every forward pass; results follow from it.
     """
 
-    what: str | Mapping[str, Any]
+    policy: str | Mapping[str, Any]
     ckpt_path: str | None = None
     dataset: Any = None
     denormalize_action: Any = None
@@ -48,12 +50,25 @@ class Source:
     precision: str = "float32"
     batch_size: int = 1
 
+    def resolve(self, environment: Environment, work_dir: str | Path) -> PolicySource:
+        """This source with the name of its policy resolved, and its checkpoint found and verified.
 
-def resolve_name(policy: str | Mapping[str, Any], environment: Any) -> str | Mapping[str, Any]:
+        Raises:
+            ConfigError: the environment names no expert.
+            CheckpointError: there is no checkpoint, or the one that is named is damaged.
+        """
+        policy = resolve_policy(self.policy, environment)
+        if policy not in FROM_CHECKPOINT:
+            return replace(self, policy=policy)
+        found = chosen_checkpoint(self.ckpt_path, Path(work_dir))
+        return replace(self, policy=policy, ckpt_path=found["path"])
+
+
+def resolve_policy(policy: str | Mapping[str, Any], environment: Any) -> str | Mapping[str, Any]:
     """``checkpoint`` or ``untrained`` as they are; everything else as a table with a ``type``.
 
     Args:
-        environment: its class may say, as ``expert``, which registered policy is its expert.
+        environment: the environment or its class, whose ``expert`` may be asked for.
 
     Raises:
         ConfigError: the environment names no expert.
@@ -64,30 +79,30 @@ def resolve_name(policy: str | Mapping[str, Any], environment: Any) -> str | Map
         return {"type": "RandomPolicy"}
     if policy != EXPERT:
         return {"type": policy}
-    expert = getattr(environment, "expert", None)
-    if expert is None:
+    if not implements(environment, Environment, "expert"):
+        cls = environment if isinstance(environment, type) else type(environment)
         raise ConfigError(
-            f"{getattr(environment, '__name__', type(environment).__name__)} names no expert",
+            f"{cls.__name__} names no expert",
             next=f"choose another policy: {CHECKPOINT}, {RANDOM}, or dict(type='...')",
         )
-    return {"type": expert}
+    return {"type": environment.expert}
 
 
-def make_policy(source: Source) -> Actor:
-    """Build or load it.
+def make_policy(source: PolicySource) -> Actor:
+    """Build or load the policy of a resolved source.
 
     Raises:
         SpecMismatch: the checkpoint has no statistics under ``norm_stats_key``.
         CheckpointError, ConfigError, PluginError: see ``load_policy``, ``build_from_cfg``.
     """
-    if not isinstance(source.what, str):
-        return Actor.adapt(build_policy_from_cfg(source.what))
+    if not isinstance(source.policy, str):
+        return Actor.adapt(build_policy_from_cfg(source.policy))
     return load(source)
 
 
-def load(source: Source) -> LocalPolicy:
-    """The policy of a checkpoint, or its untrained twin: the same model with fresh random weights
-    and everything else as it is, which tells what the pipeline does without having learned."""
+def load(source: PolicySource) -> LocalPolicy:
+    """The policy of a checkpoint, or its untrained baseline: the same model with fresh random
+    weights and everything else unchanged, which shows what the pipeline does without training."""
     from fluxvla_core.policies.loading import load_policy
 
     assert source.ckpt_path is not None
@@ -95,20 +110,20 @@ def load(source: Source) -> LocalPolicy:
     if source.norm_stats_key is not None:
         dataset, denormalize = _with_statistics(source)
     policy = load_policy(source.ckpt_path, source.device, dataset, denormalize, source.precision)
-    if source.what == UNTRAINED:
+    if source.policy == UNTRAINED:
         policy.model = untrained_model(source.ckpt_path, policy.device)
     policy.batch_size = source.batch_size
     return policy
 
 
-def fit(
+def match_policy(
     policy: Actor, spec: EnvironmentSpec, size: tuple[int, int] | None = None
 ) -> tuple[Camera, ...]:
-    """The cameras that ``policy`` looks at, in the sizes that it was trained with.
+    """Check that ``policy`` fits the environment; the cameras that it looks at.
 
     Args:
-        policy: where it has no ``embodiment`` it is taken to be made for this environment.
-        size: height and width of all pictures instead.
+        policy: if it has no ``embodiment`` it is taken to be made for this environment.
+        size: height and width of all pictures; as in the policy's training data by default.
 
     Raises:
         SpecMismatch: its numbers mean something else here: joints, units, frames, rotations,
@@ -141,7 +156,7 @@ def fit(
 
 
 class RandomPolicy(Actor):
-    """Uniform within the limits of every joint; what chance alone does.
+    """Actions drawn uniformly within the limits of every joint: the success rate of chance alone.
 
     Args:
         horizon: actions in a chunk.
@@ -170,8 +185,8 @@ class RandomPolicy(Actor):
         return self._rng.uniform(self._low, self._high, (self.horizon, len(self._low)))
 
 
-def _with_statistics(source: Source) -> tuple[Any, Any]:
-    """The section's tables with the statistics' key in both."""
+def _with_statistics(source: PolicySource) -> tuple[Any, Any]:
+    """Dataset and denormalization tables with the source's ``norm_stats_key`` in both."""
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.data.mixture import first_dataset
 
@@ -199,7 +214,7 @@ def _with_statistics(source: Source) -> tuple[Any, Any]:
 
 
 def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
-    """The checkpoint that is meant, checked: ``path``, ``step`` and ``sha256`` of its manifest.
+    """Find and verify a checkpoint: ``path``, ``step`` and ``sha256`` of its manifest.
 
     Args:
         ckpt_path: checkpoint or work dir; the newest whole one of ``work_dir`` by default.
@@ -218,7 +233,7 @@ def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
 
 
 def policy_tables(path: str) -> list[Any]:
-    """Of a checkpoint's config, the tables that its policy is built from."""
+    """The tables of a checkpoint's config from which its policy is built."""
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
 
     config = Checkpoint.open(path).config()

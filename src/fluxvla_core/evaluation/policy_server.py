@@ -1,10 +1,11 @@
-"""One policy on one device for the episodes of all worker processes.
+"""Batched inference: one policy on one device for the episodes of all worker processes.
 
-Workers simulate and ask; a thread of the parent answers in batches of a fixed, padded size. A
-batch is made of whatever waits when the device becomes free, so that nobody waits for the slowest.
-Because every forward pass has the same shape, and a row's noise follows from the episode's seed
-and the number of its call, an answer does not depend on who else was in the batch; that a model
-and device keep this promise bit for bit is checked before the first episode.
+Workers simulate and send requests; a thread of the parent answers them in batches of a fixed,
+padded size. A batch is made of the requests that wait when the device becomes free, so that no
+worker waits for the slowest. Because every forward pass has the same shape, and a row's noise
+follows from the episode's seed and the number of its call, an answer does not depend on the other
+rows of its batch; that a model and device keep to this bit for bit is checked before the first
+episode.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ _Answer = tuple[str, Any]
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What a worker needs to know of a policy that it does not have."""
+class PolicyFacts:
+    """The attributes of a served policy, for the worker's side of it."""
 
     embodiment: EmbodimentSpec
     cameras: tuple[str, ...]
@@ -45,19 +46,20 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Request:
     connection: Connection
     name: str
     question: Question
 
     @property
     def kind(self) -> tuple[str, bool]:
-        """What those in one batch have in common: the policy, and whether they go on."""
+        """What the requests of one batch have in common: the policy, and whether they continue a
+        chunk."""
         return self.name, self.question.rest is None
 
 
 class PolicyServer:
-    """Answers until it is closed; use as a context manager.
+    """Serves policies until it is closed; use as a context manager.
 
     Args:
         policies: name -> loader, called in the thread that answers.
@@ -65,16 +67,16 @@ class PolicyServer:
             answers equal to theirs.
 
     Attributes:
-        facts: name -> what there is to know; complete when the constructor returns.
-        batches, rows: how many forward passes there were, and how many questions they answered.
+        facts: name -> the policy's attributes; complete when the constructor returns.
+        batches, rows: how many forward passes there were, and how many requests they answered.
 
     Raises:
         FluxError: what a loader raised.
-        ConfigError: a row's answer depends on its company.
+        ConfigError: a row's answer depends on the other rows.
     """
 
     def __init__(self, policies: Mapping[str, Load], threads: int = 1) -> None:
-        self.facts: dict[str, Facts] = {}
+        self.facts: dict[str, PolicyFacts] = {}
         self.batches = self.rows = 0
         self._loaders = dict(policies)
         self._policies: dict[str, LocalPolicy] = {}
@@ -93,7 +95,7 @@ class PolicyServer:
         """A worker's end of a connection of its own; to be closed here once it has it.
 
         Raises:
-            RunFailed: nobody is there any more to answer on it.
+            RunFailed: the thread with the policy has ended.
         """
         if not self._thread.is_alive():
             raise RunFailed("the thread with the policy has ended")
@@ -124,7 +126,7 @@ class PolicyServer:
                 policy = load()
                 check_rows(policy)
                 self._policies[name] = policy
-                self.facts[name] = Facts(
+                self.facts[name] = PolicyFacts(
                     policy.embodiment,
                     policy.cameras,
                     policy.action_rate_hz,
@@ -138,14 +140,14 @@ class PolicyServer:
         connections: list[Connection] = []
         try:
             self._answer_all(connections)
-        finally:  # whatever ends this: nobody waits for an answer that will not come
+        finally:  # whatever ends this: no worker waits for an answer that will not come
             for connection in connections:
                 connection.close()
 
     def _answer_all(self, connections: list[Connection]) -> None:
-        waiting: deque[_Asked] = deque()
+        waiting: deque[_Request] = deque()
         while True:
-            # With questions in hand one only looks, else one sleeps.
+            # With requests waiting only look, else sleep.
             ready = wait([self._awake, *connections], timeout=0 if waiting else None)
             for connection in ready:
                 if connection is self._awake:
@@ -158,34 +160,34 @@ class PolicyServer:
                 assert isinstance(connection, Connection)
                 try:
                     name, question = connection.recv()
-                    waiting.append(_Asked(connection, name, question))
+                    waiting.append(_Request(connection, name, question))
                 except (EOFError, OSError):  # the worker is gone
                     connections.remove(connection)
                     connection.close()
             if waiting:
                 self._answer_some(waiting)
 
-    def _answer_some(self, waiting: deque[_Asked]) -> None:
-        """One forward pass for the oldest question and those that fit into its batch."""
+    def _answer_some(self, waiting: deque[_Request]) -> None:
+        """One forward pass for the oldest request and those that fit into its batch."""
         oldest = waiting[0]
         policy = self._policies[oldest.name]
-        alike = [asked for asked in waiting if asked.kind == oldest.kind]
-        mine = alike[: policy.batch_size]
-        for asked in mine:
-            waiting.remove(asked)
-        answers = self._answers(policy, [asked.question for asked in mine])
-        self.rows += len(mine)
-        for asked, answer in zip(mine, answers, strict=True):
+        alike = [request for request in waiting if request.kind == oldest.kind]
+        batch = alike[: policy.batch_size]
+        for request in batch:
+            waiting.remove(request)
+        answers = self._answers(policy, [request.question for request in batch])
+        self.rows += len(batch)
+        for request, answer in zip(batch, answers, strict=True):
             try:
-                asked.connection.send(answer)
-            except OSError:  # the worker is gone; reading its connection will tell so
+                request.connection.send(answer)
+            except OSError:  # the worker is gone; reading its connection will show it
                 continue
 
     def _answers(self, policy: LocalPolicy, questions: Sequence[Question]) -> list[_Answer]:
-        """What to send to each of those who asked.
+        """The answer to each question.
 
-        Where a batch fails each question is asked alone: one that cannot be answered is no reason
-        for the others' episodes to end.
+        If a batch fails each question is answered alone: one that cannot be answered must not end
+        the episodes of the others.
         """
         self.batches += 1
         try:
@@ -219,7 +221,7 @@ class ServedPolicy(Policy):
     horizon: int
     continues: bool
 
-    def __init__(self, connection: Connection, name: str, facts: Facts) -> None:
+    def __init__(self, connection: Connection, name: str, facts: PolicyFacts) -> None:
         self.embodiment = facts.embodiment
         self.cameras = facts.cameras
         self.action_rate_hz = facts.action_rate_hz
@@ -261,7 +263,7 @@ class ServedPolicy(Policy):
 
 
 def check_rows(policy: LocalPolicy) -> None:
-    """Refuse a batch in which a row's answer depends on its place or its company.
+    """Refuse a batch size with which a row's answer depends on its place or on the other rows.
 
     Raises:
         ConfigError: with what to set instead.
@@ -294,6 +296,6 @@ def _probe(policy: LocalPolicy, share: float) -> Question:
             for camera in spec.cameras
             if camera.name in policy.cameras
         },
-        "task_description": "do what is asked for",
+        "task_description": "do the task",
     }
     return Question(observation, int(1000 * share), 3)

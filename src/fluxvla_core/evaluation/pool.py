@@ -1,4 +1,4 @@
-"""Jobs for worker processes that may crash.
+"""A pool of worker processes for jobs that may crash.
 
 A worker is built once per process by a factory and then called with one job after another. A
 process that dies, hangs or raises is replaced: what made one job fail may be broken for good in it,
@@ -38,12 +38,14 @@ ONE_THREAD: Mapping[str, str] = {
 """Environment of workers: each is one of several, and sums must not depend on a thread count.
 ``LP_NUM_THREADS`` is the software renderer's."""
 
+ATTEMPTS = 2
+"""How often a job is tried."""
 _GRACE_S = 5.0
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job.
+    """The result of one job, or its error.
 
     Args:
         index: the job's place in the sequence that was given.
@@ -56,18 +58,6 @@ class Outcome:
     result: Any
     error: str | None
     attempts: int
-
-
-def run_jobs(
-    factory: Factory,
-    jobs: Sequence[Any],
-    workers: int,
-    retries: int = 1,
-    timeout_s: float | None = None,
-) -> Generator[Outcome, None, None]:
-    """Outcomes of ``jobs`` from a :class:`WorkerPool` of their own; see there."""
-    with WorkerPool(factory, workers, retries, timeout_s) as pool:
-        yield from pool.run(jobs)
 
 
 class _Worker:
@@ -91,7 +81,7 @@ class _Worker:
     def give(self, index: int, job: Any, timeout_s: float | None) -> None:
         self.job = index
         self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        with suppress(OSError):  # it died since; its end of the pipe tells so when it is read
+        with suppress(OSError):  # it died since; reading its end of the pipe will show it
             self.connection.send(job)
 
     def end(self, grace_s: float = 0.0) -> None:
@@ -111,7 +101,6 @@ class WorkerPool:
     Args:
         factory: makes the worker, in its process; it, the jobs and the results are pickled.
         workers: processes; never more than there are jobs.
-        retries: how often a job that failed is tried again.
         timeout_s: how long one attempt may take before its process is ended.
         link: gives each new process a connection of its own to something in this one; the factory
             is called with it then.
@@ -127,7 +116,6 @@ class WorkerPool:
         self,
         factory: Factory,
         workers: int,
-        retries: int = 1,
         timeout_s: float | None = None,
         link: Link | None = None,
     ) -> None:
@@ -136,7 +124,6 @@ class WorkerPool:
         self.ready_s: float | None = None
         self._factory = factory
         self._most = workers
-        self._retries = retries
         self._timeout_s = timeout_s
         self._link = link
         self._workers: list[_Worker] = []
@@ -256,7 +243,7 @@ class WorkerPool:
         return outcome
 
     def _again(self, index: int, why: str) -> Outcome | None:
-        if self._attempts[index] > self._retries:
+        if self._attempts[index] == ATTEMPTS:
             return Outcome(index, None, why, self._attempts[index])
         self._waiting.appendleft(index)
         for worker in self._workers:
@@ -296,9 +283,9 @@ def _serve(
     plugins: tuple[str, ...],
     link: Connection | None,
 ) -> None:
-    """A worker process's life: build the worker, answer jobs until the pipe closes."""
+    """Main function of a worker process: build the worker, run jobs until the pipe closes."""
     leave_stopping_to_the_parent()
-    with suppress(EOFError, OSError):  # the parent is gone, and so is whoever wanted an answer
+    with suppress(EOFError, OSError):  # the parent is gone: no answer is needed
         try:
             load_plugin_files(plugins)
             work = factory() if link is None else factory(link)

@@ -1,4 +1,4 @@
-"""What results come from beside their settings: code, versions, machine, commit and date.
+"""Provenance of results: code, versions, machine, commit, date, and seeds that were trained on.
 
 An episode's outcome follows from its key, the evaluation's settings, the code that ran it and the
 libraries below. The last two are a ``Code``: every episode log holds the one that its episodes are
@@ -18,12 +18,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.errors import DataError
+from fluxvla_core.evaluation.collect import META, SETTINGS, SPARE_STRIDE
 from fluxvla_core.plugins import _metadata
 from fluxvla_core.plugins.files import plugin_files
+from fluxvla_core.untrusted import checked, read_json
 
 SOURCES = (".py", ".xml")
 WITHOUT_INFLUENCE = ("cli", "testing")
-"""Rooms of the core that no episode passes through."""
+"""Packages of the core that no episode uses."""
 DEPTH = 2
 """A plugin requires a simulator, which requires a physics engine. What these require, in turn, are
 hundreds of tools that no outcome follows from."""
@@ -31,7 +34,7 @@ hundreds of tools that no outcome follows from."""
 
 @dataclass(frozen=True)
 class Code:
-    """What ran.
+    """The versions and the source code that ran.
 
     Args:
         versions: distribution -> version: the core, the plugins that provide what a config names,
@@ -49,7 +52,7 @@ class Code:
 
 
 def code_of(tables: Iterable[Any], simulators: Iterable[str], computes: Iterable[str]) -> Code:
-    """The code that what ``tables`` name by ``type`` runs.
+    """The code of the plugins that ``tables`` name by ``type``, and of what they compute with.
 
     Args:
         tables: of a config, or of a checkpoint's.
@@ -75,21 +78,6 @@ def code_of(tables: Iterable[Any], simulators: Iterable[str], computes: Iterable
     return Code(dict(sorted(versions.items())), _hash(sorted(packages)))
 
 
-def differences(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> list[str]:
-    """What is another in ``now``, in words; both as :meth:`Code.to_dict` gives them."""
-    if before is None:
-        return ["the code is not known: a former version of FluxVLA kept these episodes"]
-    old, new = before.get("versions", {}), now["versions"]
-    lines = [
-        f"{name} {old.get(name, 'not there')} -> {new.get(name, 'not there')}"
-        for name in sorted({*old, *new})
-        if old.get(name) != new.get(name)
-    ]
-    if before.get("hash") != now["hash"]:
-        lines.append(f"source code {before.get('hash')} -> {now['hash']}")
-    return lines
-
-
 def provenance(code: Code) -> dict[str, Any]:
     """``date`` (UTC), ``commit``, ``versions``, ``code`` and ``machine``, as JSON values."""
     return {
@@ -105,7 +93,7 @@ def commit(folder: Path) -> str | None:
     """Of the git checkout that ``folder`` is tracked in, with ``+changes`` where files were
     changed since; None where there is none, or no git."""
     if _git(folder, "ls-files", "--error-unmatch", ".") is None:
-        return None  # an environment within somebody else's repository
+        return None  # an environment within another repository
     head = _git(folder, "rev-parse", "HEAD")
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
     return f"{head}+changes" if head and changed else head
@@ -120,8 +108,56 @@ def machine() -> str:
     return f"{platform.machine()}, {cpus}, {platform.system()} {platform.release()}"
 
 
-def drawn(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How the pictures of ``records`` were drawn: ``sizes`` (camera -> height, width), and ``by``
+def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | None:
+    """Whether none of ``seeds`` was among those that demonstrations were collected with.
+
+    Args:
+        tables: of a checkpoint's config, from which its datasets are found.
+        environment: the ``type`` of what is evaluated; seeds of another one mean something else.
+
+    Returns:
+        None where a dataset does not say how it was collected.
+    """
+    roots = list(_dataset_folders(tables))
+    collections = [_collection(Path(root)) for root in roots]
+    if not roots or None in collections:
+        return None
+    for collection in collections:
+        assert collection is not None
+        if collection["environment"].get("type") != environment:
+            continue
+        first, count = collection["seed"], collection["episodes"]
+        if any((seed - first) % SPARE_STRIDE < count for seed in seeds):
+            return False
+    return True
+
+
+def _dataset_folders(table: Any) -> Iterator[str]:
+    """Every ``data_root_path`` below ``table``."""
+    if isinstance(table, Mapping):
+        roots = table.get("data_root_path")
+        for root in roots if isinstance(roots, (list, tuple)) else [roots]:
+            if isinstance(root, str):
+                yield root
+        table = list(table.values())
+    if isinstance(table, (list, tuple)):
+        for value in table:
+            yield from _dataset_folders(value)
+
+
+def _collection(root: Path) -> dict[str, Any] | None:
+    try:
+        found = read_json(root / META / SETTINGS, dict[str, Any], DataError)
+        whole = {"environment": dict[str, Any], "seed": int, "episodes": int}
+        return {
+            name: checked(found.get(name), kind, DataError, name) for name, kind in whole.items()
+        }
+    except DataError:
+        return None
+
+
+def rendering(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How pictures of ``records`` were rendered: ``sizes`` (camera -> height, width), and ``by``
     (GL backend and renderer), which has several entries where machines differ."""
     pictures = [record["pictures"] for record in records if record.get("pictures")]
     return {

@@ -6,7 +6,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,29 @@ from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
 from fluxvla_core.config.snapshot import write_json
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluation.episode_log import DONE, EpisodeKey
+from fluxvla_core.evaluation.episodes import DONE, EpisodeKey, reason
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.statistics import all_of, describe_problem, describe_rate, reason
+from fluxvla_core.evaluation.statistics import all_of, describe_problem, describe_rate
 
 FORMAT = "fluxvla-eval-1"
 NAMED = 5
 """How many different problems are reported; all are in the results."""
 
 
+def save_results(folder: Path, results: Mapping[str, Any], context: RunContext) -> None:
+    """Write ``results.json`` and the config that ran into ``folder``, and report the rates.
+
+    Raises:
+        RunFailed: the disk is full, or the folder was taken away.
+    """
+    write_results(folder / "results.json", results)
+    keep_config(folder, context)
+    context.reporter.artifact("evaluation", folder / "results.json")
+    report_results(context.reporter, results, folder)
+
+
 def write_results(path: Path, results: Mapping[str, Any]) -> None:
-    """Write JSON, so that what is there is whole.
+    """Write ``results`` as JSON, atomically.
 
     Raises:
         RunFailed: the disk is full, or the folder was taken away.
@@ -99,18 +111,18 @@ def timing(
 
 
 def ticks(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What became of the ticks of live episodes, as JSON values.
+    """Statistics of the control ticks of live episodes, as JSON values.
 
-    ``missed_share``: of all beats, those at which the policy had no target ready;
+    ``missed_share``: of all commands, those for which the policy had no target ready;
     ``skipped_beats`` and ``late_ticks`` are the machine's; ``stopped_by``: rule -> episodes.
     """
     done = [r for r in records if r["status"] == DONE]
-    beats = sum(r["steps"] for r in done)
+    commands = sum(r["steps"] for r in done)
     rules = [rule for r in done for rule in r["trips"][:1]]
     return {
         "ticks": sum(r["ticks"] for r in done),
         "missed_ticks": sum(r["missed_ticks"] for r in done),
-        "missed_share": sum(r["missed_ticks"] for r in done) / max(beats, 1),
+        "missed_share": sum(r["missed_ticks"] for r in done) / max(commands, 1),
         "skipped_beats": sum(r["skipped_beats"] or 0 for r in done),
         "late_ticks": sum(r["late_ticks"] for r in done),
         "stopped_by": {rule: rules.count(rule) for rule in dict.fromkeys(rules)},
@@ -118,7 +130,7 @@ def ticks(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def check_any_done(records: Sequence[Mapping[str, Any]], log: Path) -> None:
-    """Refuse to call it a result when every episode ended in an error.
+    """Fail if every episode ended in an error.
 
     Raises:
         RunFailed: with the last episode's reason.
@@ -132,7 +144,7 @@ def check_any_done(records: Sequence[Mapping[str, Any]], log: Path) -> None:
 
 
 def check_all_done(records: Sequence[Mapping[str, Any]], log: Path) -> None:
-    """Let nobody take rates for those of all episodes when some gave no result.
+    """Fail if some episodes gave no result: the rates are not those of all episodes.
 
     Raises:
         RunFailed: with how many there are, and the last one's reason.
@@ -148,7 +160,7 @@ def check_all_done(records: Sequence[Mapping[str, Any]], log: Path) -> None:
 
 
 def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path) -> None:
-    """Say the rates of each group and task, what went wrong, the speed, where the videos are."""
+    """Report the rates of each group and task, problems, the speed, and the videos."""
     for group, found in results["groups"].items():
         for task, counted in found["tasks"].items():
             reporter.info(describe_rate(f"{group} {task}", counted))
@@ -175,13 +187,13 @@ def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path)
         stopped = ", ".join(f"{rule} {count}" for rule, count in live["stopped_by"].items())
         reporter.info(
             f"live: {live['missed_share']:.1%} of {live['ticks']} ticks without a target of the "
-            f"policy, {live['skipped_beats']} beats skipped; stopped by safety: {stopped or 'none'}"
+            f"policy, {live['skipped_beats']} ticks skipped; stopped by safety: {stopped or 'none'}"
         )
     for video in results["videos"]:
         reporter.artifact("video", folder / video["path"])
 
 
-# -- videos: failures teach more than successes, so they come first
+# -- videos: failures show more than successes, so they come first
 
 # Tasks of which every group is shown.
 _COMPARED = 2
@@ -235,7 +247,7 @@ def record_videos(
     make_job: Callable[[EpisodeKey, str], Any],
     reporter: Reporter,
 ) -> list[dict[str, Any]]:
-    """Run the episodes of ``records`` once more, watched: they go as they went before.
+    """Run the episodes of ``records`` again to record videos: they repeat exactly.
 
     Args:
         pool: its workers return a result with ``state_hash``, as the records have it.
@@ -286,20 +298,21 @@ def record_videos(
 
 
 def recorded_videos(
-    records: Sequence[Mapping[str, Any]], folder: Path, below: str
+    recordings: Iterable[tuple[Mapping[str, Any], Path]], folder: Path
 ) -> list[dict[str, Any]]:
-    """The videos that were made while the episodes ran, as :func:`record_videos` lists its own.
+    """The videos that were recorded while the episodes ran, as :func:`record_videos` lists its own.
 
     Args:
-        records: of live episodes, with ``record``: their folders, relative to ``folder/below``.
+        recordings: each episode's record with the folder of its recording.
+        folder: of the results, to which the videos' paths are relative.
     """
     return [
         {
             **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": video.relative_to(folder).as_posix(),
+            "path": Path(os.path.relpath(video, folder)).as_posix(),
         }
-        for record in records
-        for video in sorted((folder / below / record["record"]).glob("*.mp4"))[:1]
+        for record, place in recordings
+        for video in sorted(place.glob("*.mp4"))[:1]
     ]
 
 

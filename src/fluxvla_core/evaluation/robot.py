@@ -1,14 +1,15 @@
-"""``RobotEvalRunner``: a policy's success rate on a robot, one episode after the other.
+"""``RobotEvalRunner``: evaluates a policy's success rate on a robot.
 
-What drives the robot is the config's inference section as it stands: its runner, its operator, all
-of its safety, in real time. A simulated robot begins every episode from a seed and tells whether
-the task was done; with a real one a person puts things in place and says so. Episodes that ended
-are kept, so an evaluation that was interrupted goes on.
+The robot is driven by the config's inference section as it stands: its runner, its operator, all
+of its safety, in real time. A simulated robot begins every episode from a seed and reports whether
+the task was done; with a real one a person sets up the scene and answers whether it was. Finished
+episodes are kept, so an evaluation that was interrupted can continue.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 from fluxvla_core.evaluation import results
-from fluxvla_core.evaluation.episode_log import (
+from fluxvla_core.evaluation.episodes import (
     DONE,
     ERROR,
     EpisodeKey,
@@ -30,13 +31,11 @@ from fluxvla_core.evaluation.episode_log import (
 )
 from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
 from fluxvla_core.evaluation.provenance import Code, code_of, provenance
-from fluxvla_core.evaluation.results import choose_episodes
 from fluxvla_core.evaluation.statistics import problems, summarise
-from fluxvla_core.robot.runner import FOLDER as EPISODES
 
 FOLDER = "eval_robot"
 GROUP = "policy"
-POLICYS_FAULT = ("chunk", "policy", "starvation", "tracking")
+POLICY_RULES = ("chunk", "policy", "starvation", "tracking")
 """Rules of a safety stop that the policy is to blame for: the episode counts as a failure. After
 any other stop it counts as an error, which says nothing about the policy."""
 
@@ -57,10 +56,10 @@ class RobotEvalRunner(Runner):
         seed: of each task's first episode, for the policy and, where the section's operator takes
             one, for the scene; the others count up from it.
         go_on: after a safety stop, go on with the next episode. Only for robots that can hurt
-            nobody: else somebody must look first, and start the same command again.
+            nobody: with any other a person must look first, and start the same command again.
         record_videos: how many episodes the results show: failures first, then successes.
         answer: reads a person's line; stdin by default.
-        reuse: also count episodes that other code ran; without it that is asked.
+        reuse: also count existing episodes that other code ran, which is an error otherwise.
 
     Raises:
         ConfigError: there is no such section, it has no such task, or a value is impossible.
@@ -124,7 +123,7 @@ class RobotEvalRunner(Runner):
         """Run the episodes that are not there yet, write ``results.json``, return what is in it.
 
         Raises:
-            RunFailed: nobody can tell whether a task was done; an episode gave no result (the
+            RunFailed: it is unknown whether a task was done; an episode gave no result (the
                 results of the others are written).
             UsageError: there are episodes that other code ran, and ``reuse`` is not set.
             SafetyStop, OperatorError: what ended an episode, unless ``go_on``.
@@ -147,6 +146,8 @@ class RobotEvalRunner(Runner):
             done = len(log.records(keys)) + len(errors)
             reporter.progress("episodes", done, len(keys), successes=succeeded)
         records = [errors[key] if key in errors else log.records([key])[0] for key in keys]
+        shown = results.choose_episodes(records, self.record_videos)
+        recordings = [(r, Path(self.context.work_dir) / r["folder"]) for r in shown]
         results.check_any_done(records, log.path)
         found = {
             "format": results.FORMAT,
@@ -161,14 +162,10 @@ class RobotEvalRunner(Runner):
                 "seeds": results.seeds(records),
                 "reused": {"episodes": len(log.reused), "changed": log.changed},
             },
-            "videos": self._videos(records),
+            "videos": results.recorded_videos(recordings, self.folder),
             "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
         }
-        path = self.folder / "results.json"
-        results.write_results(path, found)
-        results.keep_config(self.folder, self.context)
-        reporter.artifact("evaluation", path)
-        results.report_results(reporter, found, self.folder)
+        results.save_results(self.folder, found, self.context)
         results.check_all_done(records, log.path)
         return found
 
@@ -208,22 +205,29 @@ class RobotEvalRunner(Runner):
         simulated = runner.robot.simulated
         if not simulated:
             self._ask(f"{key.task}, episode {key.seed}: put things in place, then press Enter: ")
-        before, began, failure = set(self._folders()), time.monotonic(), None
+        began, failure = time.monotonic(), None
         try:
             runner.run()
         except FluxError as error:
             failure = error
-        made = sorted(set(self._folders()) - before)
-        summary = _summary(made[-1]) if made else {}
-        if failure is not None and not summary:
+        if failure is not None and (runner.recorder is None or not runner.recorder.summary):
             raise failure
-        record = {**_head(key), "attempts": 1, **_tail(summary, time.monotonic() - began)}
-        record["folder"] = made[-1].relative_to(self.context.work_dir).as_posix()
+        summary = runner.recorder.summary
+        folder = os.path.relpath(runner.recorder.folder, self.context.work_dir)
+        record: dict[str, Any] = {
+            "group": key.group,
+            "task": key.task,
+            "seed": key.seed,
+            "status": DONE,
+            "attempts": 1,
+            **_counted(summary, time.monotonic() - began),
+            "folder": Path(folder).as_posix(),
+        }
         record |= Operator.adapt(runner.ros_operator).episode_facts()
         rules = [trip["rule"] for trip in summary["trips"]]
         if failure is None and record["success"] is None:
-            record["success"] = self._judged(key)
-        elif failure is not None and rules[:1] and rules[0] in POLICYS_FAULT:
+            record["success"] = self._ask_success(key)
+        elif failure is not None and rules[:1] and rules[0] in POLICY_RULES:
             record["success"] = False
         elif failure is not None:
             record |= {"status": ERROR, "error": str(failure)}
@@ -235,7 +239,7 @@ class RobotEvalRunner(Runner):
             self.context.reporter.warn(f"{key.task}, episode {key.seed}: {failure}")
         return record
 
-    def _judged(self, key: EpisodeKey) -> bool:
+    def _ask_success(self, key: EpisodeKey) -> bool:
         while True:
             said = self._ask(f"{key.task}, episode {key.seed}: was the task done? [y/n] ")
             if said[:1].casefold() in ("y", "n"):
@@ -252,18 +256,6 @@ class RobotEvalRunner(Runner):
         self.context.reporter.settle()
         return input(question).strip()
 
-    def _folders(self) -> list[Path]:
-        return [p for p in (Path(self.context.work_dir) / EPISODES).glob("*-*") if p.is_dir()]
-
-    def _videos(self, records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        shown = []
-        for record in choose_episodes(records, self.record_videos):
-            folder = Path(self.context.work_dir) / record["folder"]
-            for video in sorted(folder.glob("*.mp4"))[:1]:
-                kept = {key: record[key] for key in ("group", "task", "seed", "success")}
-                shown.append({**kept, "path": f"../{record['folder']}/{video.name}"})
-        return shown
-
     def _wrong(self, name: str, what: str) -> ConfigError:
         where = self.context.where(f"{self.context.section}.{name}")
         return ConfigError(f"{name}: {what}", where=where)
@@ -278,11 +270,7 @@ def _named(
     return {str(task): str(task) for task in (known if tasks is None else tasks)}
 
 
-def _head(key: EpisodeKey) -> dict[str, Any]:
-    return {"group": key.group, "task": key.task, "seed": key.seed, "status": DONE}
-
-
-def _tail(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
+def _counted(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     """Of an episode's summary what evaluations count, as JSON values."""
     kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_beats")
     answers = summary["timings"].get("policy", {"count": 0, "p50_ms": 0.0})
@@ -295,14 +283,6 @@ def _tail(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
             "policy_seconds": answers["count"] * answers["p50_ms"] / 1e3,
         },
     }
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    path = folder / "episode.json"
-    if not path.is_file():
-        return {}
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
 
 
 def _kept_time(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +19,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.policy import Actor
-from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.evaluation.divergence import check_state, check_step
+from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
 from fluxvla_core.robot.control.commands import CommandFormer
 from fluxvla_core.robot.control.limits import CommandLimiter, PassThrough
@@ -28,17 +27,17 @@ from fluxvla_core.robot.control.tracking import action_columns
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]
-Watch = Callable[[Environment, int], None]
+OnStep = Callable[[Environment, int], None]
 
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How an episode is run, beside its environment, policy and key.
+    """How an episode is run, besides its environment, policy, task and seed.
 
     Args:
         cameras: the pictures that the policy gets.
-        replan_every: how many actions of a chunk are used before the next is asked for; all of
-            them by default.
+        replan_every: how many actions of a chunk are executed before the policy is queried again;
+            all of them by default.
         max_steps: instead of the task's.
         policy_seed: the policy's seed is this more than the episode's.
     """
@@ -50,10 +49,10 @@ class RolloutSettings:
 
 
 class ChunkCommands:
-    """From a policy's chunks to the commands of an environment, formed as a robot's are.
+    """Turns a policy's chunks into commands of an environment, as for a robot.
 
-    ``clamped`` of them were changed, or were beyond the limits of an environment that takes no
-    joint targets.
+    ``clamped`` counts the commands that were changed by a limit, or that are beyond the limits of
+    an environment that takes no joint targets.
 
     Args:
         spec: of the environment.
@@ -93,24 +92,26 @@ def run_episode(
     actor: Actor,
     task: TaskSpec,
     seed: int,
-    course: RolloutSettings,
-    instructed: TaskSpec | None = None,
-    watch: Watch | None = None,
+    settings: RolloutSettings,
+    instruction_of: TaskSpec | None = None,
+    on_step: OnStep | None = None,
 ) -> dict[str, Any]:
-    """Run one episode; its course follows from the arguments alone.
+    """Run one episode; everything in it follows from the arguments alone.
 
     A chunk that is not finite ends it: the policy has failed, as on a robot, where safety stops
-    it. A simulation that diverges is the environment's affair, and says nothing about the policy.
+    it. A simulation that diverges is an error of the environment, and says nothing about the
+    policy.
 
     Args:
-        seed: of environment and, with ``course.policy_seed``, policy.
-        instructed: the task whose instruction the policy is told instead; the environment is
-            one whose scenes have several tasks (``others``).
-        watch: called with the number of steps before the first and after each, for a video.
+        seed: of environment and, with ``settings.policy_seed``, policy.
+        instruction_of: the task whose instruction the policy gets instead of that of ``task``, one
+            of the environment's ``other_tasks``.
+        on_step: called with the environment and the number of steps, before the first step and
+            after each, for a video.
 
     Returns:
         JSON values: ``success``, ``problem`` (what the policy did wrong, else None),
-        ``behaviours`` (where the environment tells), ``steps``, ``calls`` (of the policy),
+        ``behaviours`` (if the environment reports them), ``steps``, ``calls`` (of the policy),
         ``clamped`` (actions beyond the limits), ``return`` (sum of rewards), ``state_hash``,
         ``instruction``, and ``timing`` in seconds: ``seconds``, ``policy_seconds``,
         ``step_seconds``, ``observe_seconds``.
@@ -123,30 +124,29 @@ def run_episode(
     spent = dict.fromkeys(("policy", "step", "observe"), 0.0)
     environment, actor = Environment.adapt(environment), Actor.adapt(actor)
     environment.reset(seed, task.name)
-    if instructed is not None:
-        environment.tell(instructed.name)
+    if instruction_of is not None:
+        environment.set_instruction(instruction_of.name)
     actor.enter(environment)
-    actor.reset(course.policy_seed + seed)
-    spec, limit = environment.spec, course.max_steps or task.max_steps
+    actor.reset(settings.policy_seed + seed)
+    spec, limit = environment.spec, settings.max_steps or task.max_steps
     commands = ChunkCommands(spec, actor.action_rate_hz)
     start = check_step(environment, 0)
     commands.start(start)
     own_hash = implements(environment, Environment, "state_hash")
-    digest = hashlib.sha256(start.tobytes())
+    state_digest = hashlib.sha256(start.tobytes())
     steps = calls = 0
     total, success, ended = 0.0, False, False
     behaviours: dict[str, bool] | None = None
     problem: str | None = None
-    instruction = (
-        instructed or task
-    ).instruction  # the environment may have words for each episode
-    if watch is not None:
-        watch(environment, 0)
+    # The environment may have another instruction for each episode.
+    instruction = (instruction_of or task).instruction
+    if on_step is not None:
+        on_step(environment, 0)
     while not ended and steps < limit:
         at = time.perf_counter()
-        observation = environment.observe(course.cameras)
+        observation = environment.observe(settings.cameras)
         instruction = observation["task_description"]
-        # Before the policy is asked: what it makes of such a state is not its fault.
+        # Before the policy is queried: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
         seen = time.perf_counter()
         chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
@@ -159,7 +159,7 @@ def run_episode(
         if problem is not None:
             success = False
             break
-        for target in commands.targets(chunk[: course.replan_every]):
+        for target in commands.targets(chunk[: settings.replan_every]):
             at = time.perf_counter()
             found = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
@@ -170,9 +170,9 @@ def run_episode(
             success, ended = bool(found.success), bool(found.ended)
             behaviours = None if found.behaviours is None else dict(found.behaviours)
             if not own_hash:
-                digest.update(state.tobytes())
-            if watch is not None:
-                watch(environment, steps)
+                state_digest.update(state.tobytes())
+            if on_step is not None:
+                on_step(environment, steps)
             if ended or steps >= limit:
                 break
     return {
@@ -183,7 +183,7 @@ def run_episode(
         "calls": calls,
         "clamped": commands.clamped,
         "return": float(total),
-        "state_hash": environment.state_hash() if own_hash else digest.hexdigest()[:16],
+        "state_hash": environment.state_hash() if own_hash else state_digest.hexdigest()[:16],
         "instruction": instruction,
         "timing": {
             "seconds": time.perf_counter() - began,
@@ -207,6 +207,36 @@ def shaped(chunk: Any, dim: int) -> Array:
     return array
 
 
-def find_task(tasks: Sequence[TaskSpec], name: str) -> TaskSpec:
-    """The task called ``name``, which is one of ``tasks``."""
-    return next(task for task in tasks if task.name == name)
+class Diverged(RunFailed):
+    """A simulation diverged, so the episode's outcome says nothing about the policy."""
+
+
+def check_step(environment: Environment, steps: int) -> Array:
+    """The environment's state after so many steps.
+
+    Raises:
+        Diverged: it is not finite, or the environment's ``divergence()`` says what went wrong.
+    """
+    state = environment.state
+    check_state(state, steps)
+    why = environment.divergence()
+    if why is not None:
+        raise Diverged(
+            f"the simulation diverged in the first {steps} steps: {why}",
+            cause="what happened was too fast for the simulator's time step, as two bodies that "
+            "are pressed into each other; the episode says nothing about the policy",
+        )
+    return state
+
+
+def check_state(state: Any, steps: int) -> None:
+    """Refuse a state that is not finite after so many steps.
+
+    Raises:
+        Diverged: the message says after how many.
+    """
+    if not np.isfinite(state).all():
+        raise Diverged(
+            f"the environment's state is not finite after {steps} steps",
+            cause="the simulation diverged",
+        )

@@ -1,4 +1,4 @@
-"""``EvalRunner``: a policy's success rate in any environment.
+"""``EvalRunner``: evaluates a policy's success rate in any environment.
 
 Every episode's outcome follows from the policy, its task and its seed. Neither the number of
 processes, nor the machines, nor an interruption changes anything but the time.
@@ -21,29 +21,31 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results
-from fluxvla_core.evaluation.collect import unseen_seeds
-from fluxvla_core.evaluation.episode_log import (
+from fluxvla_core.evaluation.episodes import (
     POLICY,
     SWAPPED,
     EpisodeKey,
     EpisodeLog,
+    Shard,
+    episode_keys,
     open_episode_log,
+    run_in_pool,
+    shard_of,
 )
-from fluxvla_core.evaluation.episodes import Shard, episode_keys, run_in_pool, shard_of
-from fluxvla_core.evaluation.live_settings import Live, live_options
+from fluxvla_core.evaluation.live import LiveSettings, live_options
 from fluxvla_core.evaluation.policies import (
     CHECKPOINT,
     FROM_CHECKPOINT,
     UNTRAINED,
-    Source,
+    PolicySource,
     chosen_checkpoint,
     load,
     policy_tables,
-    resolve_name,
+    resolve_policy,
 )
 from fluxvla_core.evaluation.policy_server import PolicyServer
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.provenance import Code, code_of, drawn, provenance
+from fluxvla_core.evaluation.provenance import Code, code_of, provenance, rendering, unseen_seeds
 from fluxvla_core.evaluation.results import (
     choose_episodes,
     record_videos,
@@ -63,7 +65,6 @@ from fluxvla_core.evaluation.worker import (
     Job,
     Settings,
     Video,
-    choose_tasks,
 )
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
@@ -89,16 +90,17 @@ class EvalRunner(Runner):
         seed: of each task's first episode; the others count up from it.
         policy_seed: the policy's seed is this more than the episode's.
         tasks: names of the tasks; all by default.
-        replan_every: how many actions of a chunk are used before the policy is asked again; all of
-            them by default.
+        replan_every: how many actions of a chunk are executed before the policy is queried again;
+            all of them by default.
         max_steps: control steps after which an episode ends, instead of the environment's.
         instruction_swap: also give the policy another task's instruction, and test whether the
             right one does better.
         swap_seed: of the first of these episodes; by default they repeat those of the policy.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
         live: on the wall clock, through the control loop and the safety of a robot, into
-            ``<work_dir>/eval_live/``: True, or a table with the keys ``live.TAKEN`` of an
-            inference runner. Slow policies miss ticks; outcomes depend on the machine.
+            ``<work_dir>/eval_live/``: True, or a table with those keys of an inference runner
+            that ``live.LIVE_OPTIONS`` lists. Slow policies miss ticks; outcomes depend on the
+            machine.
         workers: processes that simulate, 2 by default and 1 live; ``--nproc`` overrides it.
         batch_size: rows of every forward pass of the policy. Results follow from it, because sums
             do; they do not follow from how many of the rows were in use.
@@ -114,8 +116,8 @@ class EvalRunner(Runner):
         height, width: of the policy's pictures; as in its training data by default.
         device, mixed_precision_dtype: of the policy.
         episode_timeout_s: an episode that takes longer is tried again in a new process.
-        reuse: also count episodes that other code ran (other versions, changed plugins) which are
-            there; without it that is asked.
+        reuse: also count existing episodes that other code ran (other versions, changed plugins),
+            which is an error otherwise.
 
     Raises:
         ConfigError: a value is impossible.
@@ -168,7 +170,7 @@ class EvalRunner(Runner):
         try:
             self._live: dict[str, Any] | None = plain(live_options(live))
         except ConfigError as error:
-            raise self.wrong("live", error.what) from error
+            raise self.config_error("live", error.what) from error
         usual = 2 if self._live is None else 1
         self.workers = nproc or (usual if workers is None else workers)
         self.ckpt_path = ckpt_path
@@ -181,7 +183,8 @@ class EvalRunner(Runner):
         self.episode_timeout_s = episode_timeout_s
         self.reuse = reuse
         self.folder = Path(self.context.work_dir) / (FOLDER if self._live is None else LIVE_FOLDER)
-        self._given = tasks
+        self.task_names = tasks
+        """Of the tasks to evaluate, None for all; a subclass may set it before ``run_setup``."""
         for name, value, least in (
             ("episodes", episodes, 1),
             ("workers", self.workers, 1),
@@ -193,13 +196,13 @@ class EvalRunner(Runner):
             ("swap_seed", swap_seed, 0),
         ):
             if value is not None and value < least:
-                raise self.wrong(name, f"must be at least {least}, got {value}")
+                raise self.config_error(name, f"must be at least {least}, got {value}")
         if (height is None) != (width is None):
-            raise self.wrong("height", "and width belong together: give both or none")
+            raise self.config_error("height", "and width belong together: give both or none")
         if video_fps <= 0:
-            raise self.wrong("video_fps", f"must be positive, got {video_fps:g}")
+            raise self.config_error("video_fps", f"must be positive, got {video_fps:g}")
         if self._live is not None and instruction_swap:
-            raise self.wrong("instruction_swap", "cannot be live: evaluate it stepped")
+            raise self.config_error("instruction_swap", "cannot be live: evaluate it stepped")
         if environment is None:
             raise ConfigError(
                 f"{type(self).__name__} has no environment: where is the policy to act?",
@@ -209,8 +212,8 @@ class EvalRunner(Runner):
         self._environment = plain(environment)
         self._video = (video_cameras, video_height, video_width, video_fps)
         self._policy = policy if isinstance(policy, str) else plain(policy)
-        self._source = Source(
-            what=CHECKPOINT,
+        self._source = PolicySource(
+            policy=CHECKPOINT,
             dataset=dataset,
             denormalize_action=denormalize_action,
             norm_stats_key=norm_stats_key,
@@ -220,7 +223,7 @@ class EvalRunner(Runner):
         )
         served = batch_size > 1 or not device.startswith("cpu")
         self._serve = served if serve_policy is None else serve_policy
-        self._course = RolloutSettings((), replan_every, max_steps, policy_seed)
+        self._rollout = RolloutSettings((), replan_every, max_steps, policy_seed)
         self._size = None if height is None or width is None else (height, width)
         self._checkpoint: dict[str, Any] | None = None
         self._spec: EnvironmentSpec | None = None
@@ -238,31 +241,31 @@ class EvalRunner(Runner):
         """
         environment = Environment.adapt(build_environment_from_cfg(self._environment))
         self._spec = environment.spec
-        what = resolve_name(self._policy, environment)
+        policy = resolve_policy(self._policy, environment)
         environment.close()
         names, height, width, fps = self._video
         try:
             video = Video.of(self._spec, names, height, width, fps)
         except ConfigError as error:
-            raise self.wrong("video_cameras", error.what) from error
-        self._tasks = choose_tasks(self._spec.tasks, self._given)
-        if what in FROM_CHECKPOINT or self.baseline:
+            raise self.config_error("video_cameras", error.what) from error
+        self._tasks = self._spec.select_tasks(self.task_names)
+        if policy in FROM_CHECKPOINT or self.baseline:
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]
-        sources = {POLICY: replace(self._source, what=what, ckpt_path=path)}
+        sources = {POLICY: replace(self._source, policy=policy, ckpt_path=path)}
         if self.baseline:
-            sources[UNTRAINED] = replace(sources[POLICY], what=UNTRAINED)
+            sources[UNTRAINED] = replace(sources[POLICY], policy=UNTRAINED)
         self._settings = Settings(
             environment=self._environment,
             tasks=tuple(task.name for task in self._tasks),
             sources=sources,
-            course=self._course,
+            rollout=self._rollout,
             size=self._size,
             video=video,
             live=self._live_settings(self._spec),
         )
-        tables = [self._environment, what, self._source.dataset, self._source.denormalize_action]
+        tables = [self._environment, policy, self._source.dataset, self._source.denormalize_action]
         if path is not None:
             tables += policy_tables(path)
         simulators = environment.distributions
@@ -284,10 +287,10 @@ class EvalRunner(Runner):
                 written), or results cannot be written.
         """
         reporter, keys = self.context.reporter, self.keys()
-        what = self.what()
+        identity = self.identity()
         log = open_episode_log(
             self.folder / self.shard.log_name,
-            what,
+            identity,
             reporter,
             "episodes*.jsonl",
             self._code.to_dict(),
@@ -300,7 +303,7 @@ class EvalRunner(Runner):
             run_in_pool(pool, mine, log, reporter)
             # Loading libraries and models is not what is measured.
             seconds = time.monotonic() - began - (pool.ready_s or 0.0)
-            log.look_beside()
+            log.read_other_logs()
             records = log.settled(keys)
             if records is None:
                 return self._leave_to_others(keys, log)
@@ -309,11 +312,13 @@ class EvalRunner(Runner):
             if self._live is None:
                 videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
             else:
-                videos = recorded_videos(shown, self.folder, RECORDS)
+                recordings = [(r, self.folder / RECORDS / r["record"]) for r in shown]
+                videos = recorded_videos(recordings, self.folder)
+        policy = identity["policy"]
         found = {
             "format": results.FORMAT,
-            "policy": what["policy"] if isinstance(what["policy"], str) else what["policy"]["type"],
-            "environment": what["environment"]["type"],
+            "policy": policy if isinstance(policy, str) else policy["type"],
+            "environment": identity["environment"]["type"],
             "mode": "stepped" if self._live is None else "live",
             "groups": summarise(records),
             "problems": problems(records),
@@ -321,12 +326,12 @@ class EvalRunner(Runner):
             "behaviours": count_behaviours(records),
             "obeyed": count_obeyed(records),
             "checkpoint": self._checkpoint,
-            "settings": what["settings"],
+            "settings": identity["settings"],
             "provenance": {
                 **provenance(self._code),
                 "seeds": results.seeds(records),
                 "unseen_seeds": self._unseen,
-                "pictures": drawn(records),
+                "pictures": rendering(records),
                 "reused": {"episodes": len(log.reused), "changed": log.changed},
             },
             "videos": videos,
@@ -334,11 +339,7 @@ class EvalRunner(Runner):
         }
         if self._live is not None:
             found["live"] = results.ticks(records)
-        path = self.folder / "results.json"
-        results.write_results(path, found)
-        results.keep_config(self.folder, self.context)
-        reporter.artifact("evaluation", path)
-        results.report_results(reporter, found, self.folder)
+        results.save_results(self.folder, found, self.context)
         if new:  # what others have to try again is theirs: failing here would end them, too
             results.check_all_done(records, log.path)
         return found
@@ -351,15 +352,15 @@ class EvalRunner(Runner):
         tasks = [task.name for task in self._tasks]
         return episode_keys(groups, tasks, self.episodes, self._ready()[0].keep_together)
 
-    def what(self) -> dict[str, Any]:
-        """What outcomes follow from, beside each episode's key; JSON values."""
+    def identity(self) -> dict[str, Any]:
+        """What outcomes follow from, besides each episode's key, as JSON values."""
         spec, settings = self._ready()
         source = asdict(settings.sources[POLICY])
-        policy = source.pop("what")
+        policy = source.pop("policy")
         del source["ckpt_path"]
-        course = asdict(settings.course)
-        del course["cameras"]
-        values: dict[str, Any] = {**course, "size": settings.size, **source, **spec.details}
+        rollout = asdict(settings.rollout)
+        del rollout["cameras"]
+        values: dict[str, Any] = {**rollout, "size": settings.size, **source, **spec.details}
         if self._live is not None:
             values["live"] = self._live
         if self.instruction_swap:
@@ -374,10 +375,10 @@ class EvalRunner(Runner):
         )
         return about
 
-    def wrong(self, name: str, what: str) -> ConfigError:
+    def config_error(self, key: str, problem: str) -> ConfigError:
         """An error about a key of this section."""
-        where = self.context.where(f"{self.context.section}.{name}")
-        return ConfigError(f"{name} {what}", where=where)
+        where = self.context.where(f"{self.context.section}.{key}")
+        return ConfigError(f"{key} {problem}", where=where)
 
     @contextmanager
     def _pool(self) -> Iterator[WorkerPool]:
@@ -385,7 +386,7 @@ class EvalRunner(Runner):
         loaders = {
             name: partial(load, source)
             for name, source in settings.sources.items()
-            if self._serve and source.what in FROM_CHECKPOINT
+            if self._serve and source.policy in FROM_CHECKPOINT
         }
         timeout = self.episode_timeout_s
         if not loaders:
@@ -402,25 +403,25 @@ class EvalRunner(Runner):
         left = sum(log.settled([key]) is None for key in keys)
         part: Shard = self.shard
         self.context.reporter.info(
-            f"part {part.index} of {part.count} is done; {left} episodes of others are not, and "
-            "whoever ends last writes the results"
+            f"part {part.index} of {part.count} is done; {left} episodes of other parts are not: "
+            "the process that ends last writes the results"
         )
         return {"shard": part.index, "episodes_left": left}
 
-    def _live_settings(self, spec: EnvironmentSpec) -> Live | None:
+    def _live_settings(self, spec: EnvironmentSpec) -> LiveSettings | None:
         if self._live is None:
             return None
         if not spec.limited:
-            raise self.wrong(
+            raise self.config_error(
                 "live",
                 f"needs an environment that takes joint targets; {spec.name} does not, and the "
                 "safety of a robot cannot be kept for its actions",
             )
         options = dict(self._live)
-        if self._course.replan_every is not None:
-            options.setdefault("execute_horizon", self._course.replan_every)
+        if self._rollout.replan_every is not None:
+            options.setdefault("execute_horizon", self._rollout.replan_every)
         fps = self._video[3] if self.record_videos else None
-        return Live(options, str(self.folder / RECORDS), fps)
+        return LiveSettings(options, str(self.folder / RECORDS), fps)
 
     def _ready(self) -> tuple[EnvironmentSpec, Settings]:
         assert self._spec is not None, "run_setup() comes first"

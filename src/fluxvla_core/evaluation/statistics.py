@@ -26,7 +26,7 @@ from statistics import NormalDist, mean
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episode_log import DONE, POLICY, SWAPPED
+from fluxvla_core.evaluation.episodes import DONE, POLICY, SWAPPED, reason
 
 CONFIDENCE = 0.95
 
@@ -123,13 +123,6 @@ def describe_problem(row: Mapping[str, Any]) -> str:
     return f"{row['group']}: {many} {failed}: {row['what']}"
 
 
-def reason(text: str) -> str:
-    """What a message or a traceback says in one line: the last that is no advice."""
-    lines = text.strip().splitlines()
-    said = [line for line in lines if not line.startswith(("  likely cause: ", "  next: "))]
-    return (said or lines)[-1].strip()
-
-
 def all_of(tasks: int) -> str:
     """What the row over several tasks is called: they may be few of those that there are."""
     return f"all {tasks} tasks" if tasks > 1 else "the task"
@@ -155,7 +148,7 @@ def _counted(records: list[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def count_behaviours(records: Records) -> dict[str, Any]:
-    """Which tasks were done after which instruction.
+    """Count which tasks were done under which instruction.
 
     Returns:
         ``{group: {instruction: {"episodes": n, "neither": n, task: n, …}}}``, with the tasks that
@@ -177,8 +170,10 @@ def count_behaviours(records: Records) -> dict[str, Any]:
 
 
 def obeyed(record: Mapping[str, Any], records: Records) -> bool | None:
-    """Whether the task of the episode's instruction was done, whatever its scene is for; None
-    where it is not known: what an instruction asks for is what it means where nothing is swapped.
+    """Whether the task of the episode's instruction was done, whatever the scene's own task is.
+
+    None if it is not known which task that is: the one that has this instruction in the policy's
+    own episodes.
     """
     tasks = {r["instruction"]: r["task"] for r in records if r["group"] == POLICY}
     return (record.get("behaviours") or {}).get(tasks.get(record["instruction"]))
@@ -307,7 +302,7 @@ def smallest_difference(pairs: int, level: float = 0.05, power: float = 0.8) -> 
 
 
 def verdict(comparison: Mapping[str, Any], level: float = 0.05) -> str:
-    """What a test's numbers, as :meth:`Comparison.to_dict` has them, say and do not say."""
+    """A test's result, as :meth:`Comparison.to_dict` gives it, in words."""
     if comparison["p_different"] <= level:
         return "a difference"
     least, pairs = comparison["smallest_difference"], comparison["pairs"]

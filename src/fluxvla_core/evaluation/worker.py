@@ -1,4 +1,4 @@
-"""What an evaluation's worker processes do; imported there, and light until then."""
+"""Worker processes of an evaluation: environment, policy, and one episode after another."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluation.episode_log import POLICY, SWAPPED, EpisodeKey
-from fluxvla_core.evaluation.live_settings import Live
-from fluxvla_core.evaluation.policies import Source, fit, make_policy
-from fluxvla_core.evaluation.policy_server import Facts, ServedPolicy
-from fluxvla_core.evaluation.rollout import RolloutSettings, find_task, run_episode
+from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
+from fluxvla_core.evaluation.live import LiveSettings, run_live
+from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
+from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
+from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.spec.embodiment import Camera
 
 
@@ -69,34 +69,34 @@ class Job:
 
 @dataclass(frozen=True)
 class Settings:
-    """What workers need to know; every outcome follows from it and the episode's key.
+    """Settings of the worker processes; every outcome follows from them and the episode's key.
 
     Args:
         environment: the table of a registered environment.
-        tasks: names of the tasks that are evaluated; a wrong instruction is one of theirs if it
-            can be.
+        tasks: names of the tasks that are evaluated; a wrong instruction is of one of them if
+            possible.
         sources: where the policy of ``policy`` and that of ``untrained`` come from.
-        course: how episodes are run; its cameras are filled in for each policy.
+        rollout: how episodes are run; its cameras are filled in for each policy.
         size: height and width of the policy's pictures; as it was trained by default.
-        served: policies that the parent answers for, by group.
+        served: attributes of the policies that the parent serves, by group.
         live: on the wall clock instead of stepped.
     """
 
     environment: Mapping[str, Any]
     tasks: tuple[str, ...]
-    sources: Mapping[str, Source]
-    course: RolloutSettings
+    sources: Mapping[str, PolicySource]
+    rollout: RolloutSettings
     size: tuple[int, int] | None = None
     video: Video = field(default_factory=Video)
-    served: Mapping[str, Facts] = field(default_factory=dict)
-    live: Live | None = None
+    served: Mapping[str, PolicyFacts] = field(default_factory=dict)
+    live: LiveSettings | None = None
 
 
 class EpisodeWorker:
     """Runs episodes in one process: a function from a job to the record of its episode.
 
-    Environment and policy are made at once, the untrained twin when it is first needed; all are
-    kept.
+    Environment and policy are made at once, the untrained baseline when it is first needed; all
+    are kept.
 
     Args:
         link: to a ``PolicyServer``, where there are served policies.
@@ -126,43 +126,41 @@ class EpisodeWorker:
             job = Job(job)
         settings, key = self._settings, job.key
         actor, cameras = self.actor(key.group)
-        tasks = self.environment.spec.tasks
+        spec = self.environment.spec
         if settings.live is not None:
             return self._live(settings.live, key, actor, cameras)
-        instructed = None
+        instruction_of = None
         if key.group == SWAPPED:
-            instructed = find_task(tasks, swapped_task(self.environment, key.task, settings.tasks))
-        film = None if job.video is None else Film(Path(job.video), settings.video)
+            instruction_of = spec.task(swapped_task(self.environment, key.task, settings.tasks))
+        video = None if job.video is None else VideoRecorder(Path(job.video), settings.video)
         try:
             record = run_episode(
                 self.environment,
                 actor,
-                find_task(tasks, key.task),
+                spec.task(key.task),
                 key.seed,
-                replace(settings.course, cameras=cameras),
-                instructed,
-                film,
+                replace(settings.rollout, cameras=cameras),
+                instruction_of,
+                video,
             )
         finally:
-            if film is not None:
-                film.close()
+            if video is not None:
+                video.close()
         return self._completed(record, cameras)
 
     def _live(
-        self, live: Live, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
+        self, live: LiveSettings, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
     ) -> dict[str, Any]:
-        from fluxvla_core.evaluation.live import run_live
-
-        task, course = find_task(self.environment.spec.tasks, key.task), self._settings.course
+        task, rollout = self.environment.spec.task(key.task), self._settings.rollout
         record = run_live(
             f"{key.group}-{key.task}-{key.seed}",
             self.environment,
             actor,
             task,
             key.seed,
-            course.policy_seed + key.seed,
+            rollout.policy_seed + key.seed,
             cameras,
-            course.max_steps or task.max_steps,
+            rollout.max_steps or task.max_steps,
             live,
         )
         return self._completed(record, cameras)
@@ -183,13 +181,13 @@ class EpisodeWorker:
                 actor = ServedPolicy(self._link, name, self._settings.served[name])
             else:
                 actor = make_policy(self._settings.sources[name])
-            cameras = fit(actor, self.environment.spec, self._settings.size)
+            cameras = match_policy(actor, self.environment.spec, self._settings.size)
             self._actors[name] = actor, cameras
         return self._actors[name]
 
 
-class Film:
-    """A video of an episode: call it at every step, then close it."""
+class VideoRecorder:
+    """Records a video of an episode: call it at every step, then close it."""
 
     def __init__(self, path: Path, video: Video) -> None:
         self._path = path
@@ -219,16 +217,18 @@ class Film:
             self._writer.close()
 
 
-def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> str:
-    """The task to ask for instead of ``task``: the next one, round and round, that could be done
-    in its scene; one of ``wanted`` if there is one.
+def swapped_task(environment: Environment, task: str, evaluated: Sequence[str]) -> str:
+    """The task whose instruction the policy gets instead of that of ``task``.
+
+    It is the next one, cyclically, that could be done in the same scene, and one of ``evaluated``
+    if possible.
 
     Raises:
         ConfigError: the environment's scenes allow no other task.
     """
     names: list[str] = [each.name for each in environment.spec.tasks]
-    others = list(environment.others(task))
-    others = [name for name in others if name in wanted] or others
+    others = list(environment.other_tasks(task))
+    others = [name for name in others if name in evaluated] or others
     if not others:
         raise ConfigError(
             f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
@@ -240,7 +240,7 @@ def swapped_task(environment: Environment, task: str, wanted: Sequence[str]) -> 
 
 
 def memory_mb() -> float:
-    """The most memory that this process ever had (resident), in MiB; 0 where nobody tells."""
+    """The most memory that this process ever had (resident), in MiB; 0 if unknown."""
     status = Path("/proc/self/status")
     if status.exists():
         # Not getrusage: on Linux a new process begins with the peak of the one that started it.
@@ -253,20 +253,3 @@ def memory_mb() -> float:
         return 0.0
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(most / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
-
-
-def choose_tasks(tasks: Sequence[TaskSpec], names: Sequence[str] | None) -> tuple[TaskSpec, ...]:
-    """The tasks that are meant, in the order of ``names``; all of them for None.
-
-    Raises:
-        ConfigError: there is none of that name, or one is named twice.
-    """
-    if names is None:
-        return tuple(tasks)
-    known = {task.name: task for task in tasks}
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"there is no task {name!r}; there are {', '.join(known)}")
-    if not names or len(set(names)) != len(names):
-        raise ConfigError(f"tasks must name each task once, got {list(names)}")
-    return tuple(known[name] for name in names)

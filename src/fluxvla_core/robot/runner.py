@@ -203,6 +203,8 @@ class BaseInferenceRunner(Runner):
             each.bind(self.embodiment)
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
+        self.recorder: EpisodeRecorder | None = None
+        """Of the last episode."""
         self._history = RunHistory()
 
     def run_setup(self) -> None:
@@ -336,7 +338,7 @@ class BaseInferenceRunner(Runner):
         assert self.policy is not None, "run_setup() comes before run()"
         reporter, session, joiner = self.context.reporter, self._session, self._joiner()
         root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
-        recorder = EpisodeRecorder(
+        self.recorder = EpisodeRecorder(
             next_folder(root, task.name), self.robot, self.policy, self._cameras, self.record_fps,
             self.record is not None, reporter,
         )  # fmt: skip
@@ -366,10 +368,10 @@ class BaseInferenceRunner(Runner):
             interrupts=session.interrupts,
             thread=session.thread,
             reporter=reporter,
-            observers=(recorder, *self._observers),
+            observers=(self.recorder, *self._observers),
         )
         session.play(equipment, settings, task)
-        return recorder.summary
+        return self.recorder.summary
 
     def _look(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None

@@ -12,7 +12,8 @@ its task and seed alone, not on earlier episodes or on which cameras are drawn.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,9 +23,8 @@ import pytest
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.evaluation.divergence import Diverged
 from fluxvla_core.evaluation.policies import RandomPolicy
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.plugins.registry import ENVIRONMENTS
 from fluxvla_core.spec.embodiment import Camera
 
@@ -32,7 +32,15 @@ SEED = 11
 
 
 class DivergingPolicy(RandomPolicy):
-    """Acts at random and, before its third answer, gives everything an impossible velocity."""
+    """Acts at random and, before its third chunk, sets impossible velocities in the simulation.
+
+    Args:
+        data: from an environment to its ``mujoco.MjData``.
+    """
+
+    def __init__(self, data: Callable[[Environment], Any]) -> None:
+        super().__init__()
+        self._data = data
 
     def enter(self, environment: Environment) -> None:
         super().enter(environment)
@@ -41,7 +49,7 @@ class DivergingPolicy(RandomPolicy):
     def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
         self.calls += 1
         if self.calls == 3:
-            self.environment.simulation.qvel[:] = 1e12  # type: ignore[attr-defined]
+            self._data(self.environment).qvel[:] = 1e12
         return super().predict_action(observation)
 
 
@@ -59,7 +67,7 @@ class EnvironmentConformance:
     picture: ClassVar[tuple[int, int] | None] = (48, 64)
     """Height and width of the pictures here; None for environments that draw in one size only."""
     seeds_differ: ClassVar[bool] = True
-    """Whether another seed is another course."""
+    """Whether another seed makes another episode."""
 
     def make(self) -> Environment:
         """A new environment."""
@@ -71,6 +79,13 @@ class EnvironmentConformance:
         made = self.make()
         yield made
         made.close()
+
+    def simulation(self, environment: Environment) -> Any:
+        """``mujoco.MjData`` of the episode, which a test makes diverge; None without MuJoCo.
+
+        By default the attribute ``simulation``, as ``fluxvla_mujoco.MujocoEnvironment`` has it.
+        """
+        return getattr(environment, "simulation", None)
 
     def tried(self, environment: Environment) -> tuple[TaskSpec, ...]:
         """The tasks that are tried."""
@@ -85,16 +100,16 @@ class EnvironmentConformance:
             return known
         return tuple(Camera(camera.name, *self.picture) for camera in known)
 
-    def course(
+    def episode(
         self,
         environment: Environment,
         task: TaskSpec,
         seed: int = SEED,
         cameras: tuple[Camera, ...] = (),
     ) -> dict[str, Any]:
-        """What an episode of random actions came to, without how long it took."""
-        course = RolloutSettings(cameras=cameras, max_steps=self.steps)
-        record = run_episode(environment, RandomPolicy(), task, seed, course)
+        """The record of an episode of random actions, without its timing."""
+        settings = RolloutSettings(cameras=cameras, max_steps=self.steps)
+        record = run_episode(environment, RandomPolicy(), task, seed, settings)
         return {name: value for name, value in record.items() if name != "timing"}
 
     def test_the_spec_is_there_before_anything_is_built(self) -> None:
@@ -121,7 +136,7 @@ class EnvironmentConformance:
                 image = seen["images"][camera.name]
                 assert image.dtype == np.uint8
                 assert image.shape == (camera.height, camera.width, 3)
-            assert environment.observe(())["images"] == {}, "nothing is drawn unasked"
+            assert environment.observe(())["images"] == {}, "nothing is rendered unasked"
 
     def test_states_belong_to_whoever_asked(self, environment: Environment) -> None:
         environment.reset(SEED, self.tried(environment)[0].name)
@@ -133,25 +148,25 @@ class EnvironmentConformance:
 
     def test_a_course_follows_from_task_and_seed_alone(self, environment: Environment) -> None:
         tasks = self.tried(environment)
-        first = {task.name: self.course(environment, task) for task in tasks}
+        first = {task.name: self.episode(environment, task) for task in tasks}
         for task in reversed(tasks):
-            self.course(environment, task, SEED + 1)
-            assert self.course(environment, task) == first[task.name], "after other episodes"
+            self.episode(environment, task, SEED + 1)
+            assert self.episode(environment, task) == first[task.name], "after other episodes"
         other = self.make()
-        assert self.course(other, tasks[0]) == first[tasks[0].name], "in a new environment"
+        assert self.episode(other, tasks[0]) == first[tasks[0].name], "in a new environment"
         other.close()
 
     def test_another_seed_is_another_course(self, environment: Environment) -> None:
         if not self.seeds_differ:
             pytest.skip("this environment begins every episode alike")
         task = self.tried(environment)[0]
-        hashes = {self.course(environment, task, seed)["state_hash"] for seed in (1, 2, 3)}
+        hashes = {self.episode(environment, task, seed)["state_hash"] for seed in (1, 2, 3)}
         assert len(hashes) > 1
 
     def test_looking_changes_nothing(self, environment: Environment) -> None:
         task = self.tried(environment)[0]
-        unseen = self.course(environment, task)
-        assert self.course(environment, task, cameras=self.cameras(environment)) == unseen
+        unseen = self.episode(environment, task)
+        assert self.episode(environment, task, cameras=self.cameras(environment)) == unseen
 
     def test_a_simulation_that_diverges_is_an_error_and_no_outcome(
         self, environment: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -159,12 +174,19 @@ class EnvironmentConformance:
         monkeypatch.chdir(tmp_path)  # where MuJoCo leaves its log
         task = self.tried(environment)[0]
         environment.reset(SEED, task.name)
-        if getattr(environment, "simulation", None) is None:
+        if self.simulation(environment) is None:
             pytest.skip("no MuJoCo simulation below")
-        course = RolloutSettings(max_steps=self.steps)
-        with pytest.raises(Diverged, match=r"BADQVEL|not finite"):
-            run_episode(environment, DivergingPolicy(), task, SEED, course)
-        assert self.course(environment, task), "the next episode is a whole one again"
+        settings = RolloutSettings(max_steps=self.steps)
+        why = ""
+        try:
+            run_episode(environment, DivergingPolicy(self.simulation), task, SEED, settings)
+        except Diverged as error:
+            why = error.what
+        assert re.search(r"BADQVEL|not finite", why), (
+            "the simulation diverged and divergence() did not say so: inherit from "
+            "fluxvla_mujoco.MujocoEnvironment, or return fluxvla_mujoco.divergence(data)"
+        )
+        assert self.episode(environment, task), "the next episode is a whole one again"
 
     def test_it_can_be_closed_any_number_of_times(self, environment: Environment) -> None:
         environment.reset(SEED, self.tried(environment)[0].name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,12 +20,67 @@ from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMisma
 from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera, EmbodimentSpec
 from fluxvla_gymnasium.parts import parts, pictures, state_row, text
-from fluxvla_gymnasium.success import KEYS, Judge, told
 
 if TYPE_CHECKING:
     from fluxvla_core.models import Observation
 
 Array = npt.NDArray[np.float64]
+KEYS = ("is_success", "success")
+SUCCESS = ("info", "terminated", "truncated")
+
+
+@dataclass(frozen=True)
+class SuccessCriterion:
+    """When a task is done: Gymnasium itself does not define it.
+
+    Args:
+        by: ``info``: by its ``is_success`` or ``success``; ``terminated``: by the end;
+            ``truncated``: by lasting until the time is up.
+        reward: instead: by a step's reward of at least this.
+        total: instead: by a return, the sum of rewards, of at least this.
+
+    Raises:
+        ConfigError: there is no such way, or there are two.
+    """
+
+    by: str = "info"
+    reward: float | None = None
+    total: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.by not in SUCCESS:
+            raise ConfigError(f"success {self.by!r} is none of {', '.join(SUCCESS)}")
+        if self.reward is not None and self.total is not None:
+            raise ConfigError("success_reward and success_return are two ways: give one of them")
+
+    @property
+    def needs_info(self) -> bool:
+        """Whether ``info`` must say it."""
+        return self.by == "info" and self.reward is None and self.total is None
+
+    def done(
+        self, reward: float, total: float, terminated: bool, lasted: bool, info: Mapping[str, Any]
+    ) -> bool:
+        """Whether the task was done by a step.
+
+        Args:
+            total: rewards so far, this one included.
+            lasted: the time was up with this step.
+        """
+        if self.reward is not None:
+            return reward >= self.reward
+        if self.total is not None:
+            return total >= self.total
+        if self.by == "terminated":
+            return terminated
+        if self.by == "truncated":
+            return lasted and not terminated
+        return any(bool(info[key]) for key in KEYS if key in info)
+
+
+def reports_success(info: Mapping[str, Any]) -> bool:
+    """Whether ``info`` says if the task is done."""
+    return any(key in info for key in KEYS)
 
 
 class GymnasiumEnvironment(MujocoEnvironment):
@@ -39,7 +95,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
             are the action's numbers in their order, ``state_joints`` the state's.
         module: an installed package that registers the id when it is imported, ``gym_aloha``.
         make: further arguments of ``gymnasium.make``.
-        instruction: what a policy is told; the id by default.
+        instruction: the language instruction; the id by default.
         instruction_from: instead: a text of the observation, which may be another in each episode.
         max_steps: steps after which an episode ends at the latest.
         state: parts of the observation that are the state, in this order, keys of nested parts
@@ -84,9 +140,9 @@ class GymnasiumEnvironment(MujocoEnvironment):
             )
         if module is not None and not module.isidentifier():
             raise ConfigError(f"module {module!r} is no name of an installed package")
-        self._judge = Judge(success, success_reward, success_return)
+        self._criterion = SuccessCriterion(success, success_reward, success_return)
         if instruction is not None and instruction_from is not None:
-            raise ConfigError("instruction and instruction_from both say what a policy is told")
+            raise ConfigError("instruction and instruction_from are two ways: give one of them")
         if max_steps < 1:
             raise ConfigError(f"max_steps must be at least 1, got {max_steps}")
         if not isinstance(embodiment, EmbodimentSpec):
@@ -117,7 +173,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         self._render = render
         self._env: Any = None
         self._parts: dict[str, npt.NDArray[Any]] = {}
-        self._done = self._told = False
+        self._done = self._checked = False
 
     @property
     def state(self) -> Array:
@@ -156,9 +212,9 @@ class GymnasiumEnvironment(MujocoEnvironment):
                 cause=f"the observation's parts are {_shapes(self._parts)}",
                 next="mend state_joints, or name the parts that are the state: state = ['...']",
             )
-        if self._judge.needs_info and not self._told:
-            _check_told(self._env, self._max_steps)
-            self._told = True
+        if self._criterion.needs_info and not self._checked:
+            _check_reports_success(self._env, self._max_steps)
+            self._checked = True
             self.reset(seed, task)
 
     def step(self, action: Array) -> Step:
@@ -176,7 +232,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         self._steps += 1
         self._return += reward
         lasted = bool(truncated) or self._steps >= self._max_steps
-        self._done |= self._judge.done(reward, self._return, terminated, lasted, info)
+        self._done |= self._criterion.done(reward, self._return, terminated, lasted, info)
         return Step(reward, self._done, terminated or bool(truncated) or self._done)
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
@@ -258,7 +314,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         return env
 
 
-def _check_told(env: Any, max_steps: int) -> None:
+def _check_reports_success(env: Any, max_steps: int) -> None:
     """Refuse an environment whose ``info`` never says whether the task is done: by one step as a
     rule, by a whole episode of random actions where it might say so only at the end.
 
@@ -270,7 +326,7 @@ def _check_told(env: Any, max_steps: int) -> None:
     info: Mapping[str, Any] = {}
     for _ in range(max_steps):
         _, _, terminated, truncated, info = env.step(env.action_space.sample())
-        if told(info):
+        if reports_success(info):
             return
         if terminated or truncated:
             break

@@ -84,7 +84,7 @@ def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float6
     if words:
         raise SpecMismatch(
             f"state: the observation's part {words[0]!r} is a text",
-            next=f"leave it out; a policy is told it by instruction_from = {words[0]!r}",
+            next=f"leave it out; as an instruction it is given by instruction_from = {words[0]!r}",
         )
     rows = [np.asarray(found[key], dtype=np.float64).ravel() for key in keys]
     return np.concatenate(rows) if rows else np.zeros(0)

@@ -52,12 +52,12 @@ class LiberoEnvironment(MujocoEnvironment):
         mixed: each of these tasks in the scenes of all of them where it can be done: then the
             scene does not say what to do. Tasks are called ``<task>-in-scene-<index>``.
         cameras: of the scene, also by the names that public datasets give them.
-        height, width: of their pictures, where nobody asks for another size.
+        height, width: of their pictures, if no other size is requested.
         render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
         begin: ``fixed`` or ``random``.
         num_steps_wait: they do not count.
         protocol: ``fluxvla`` or ``openvla``; results of one do not compare with the other's.
-        instruction: what a policy is told instead of the task's own words.
+        instruction: language instruction for the policy instead of the task's own.
 
     Raises:
         ConfigError: a value is impossible.
@@ -108,8 +108,8 @@ class LiberoEnvironment(MujocoEnvironment):
         self._protocol = protocol
         self._instruction = instruction
         self._scene: LiberoScene | None = None
-        self._name = self._told = ""
-        self._judged: dict[str, SuiteTask] = {}
+        self._name = self._instructed = ""
+        self._checked: dict[str, SuiteTask] = {}
         self._did: dict[str, bool] = {}
 
     @cached_property
@@ -168,8 +168,8 @@ class LiberoEnvironment(MujocoEnvironment):
 
     @property
     def task(self) -> SuiteTask:
-        """What the policy is told to do."""
-        return self._judged[self._told]
+        """The task of the policy's instruction."""
+        return self._checked[self._instructed]
 
     def reset(self, seed: int, task: str) -> None:
         """Begin an episode of ``task``.
@@ -197,12 +197,12 @@ class LiberoEnvironment(MujocoEnvironment):
         else:
             scene.reset(state, resets=seed + 1 if self._protocol == OPENVLA else 1)
         scene.settle(self._wait)
-        self._name = self._told = task
+        self._name = self._instructed = task
         here = {name: pair[1] for name, pair in self.pairs.items() if self._shares(name, where)}
-        self._judged = {name: each for name, each in here.items() if scene.can_judge(each)}
-        self._did = dict.fromkeys(self._judged, False)
+        self._checked = {name: each for name, each in here.items() if scene.can_check(each)}
+        self._did = dict.fromkeys(self._checked, False)
 
-    def others(self, task: str) -> tuple[str, ...]:
+    def other_tasks(self, task: str) -> tuple[str, ...]:
         """Tasks with other words that could also be done in the scene of ``task``."""
         where, own = self.pairs[task]
         return tuple(
@@ -211,15 +211,15 @@ class LiberoEnvironment(MujocoEnvironment):
             if other.language != own.language and self._shares(name, where)
         )
 
-    def tell(self, task: str) -> None:
-        """After ``reset``: the policy is told the instruction of ``task``.
+    def set_instruction(self, task: str) -> None:
+        """After ``reset``: give the policy the instruction of ``task``.
 
         Raises:
             ConfigError: that cannot be done in this scene.
         """
-        if task not in self._judged:
+        if task not in self._checked:
             raise ConfigError(f"{task!r} cannot be done in the scene of {self._name!r}")
-        self._told = task
+        self._instructed = task
 
     def step(self, action: npt.NDArray[np.float64]) -> Step:
         """One control step, 1/20 s.
@@ -230,9 +230,9 @@ class LiberoEnvironment(MujocoEnvironment):
         scene = self.scene
         scene.step(action)
         self.action = np.array(action)
-        self._did = {n: was or scene.done(self._judged[n]) for n, was in self._did.items()}
-        success, told = self._did[self._name], self._did[self._told]
-        return Step(float(success), success, success or told, dict(self._did))
+        self._did = {n: was or scene.done(self._checked[n]) for n, was in self._did.items()}
+        success, instructed = self._did[self._name], self._did[self._instructed]
+        return Step(float(success), success, success or instructed, dict(self._did))
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
         """State, instruction, and pictures in the sizes that are asked for.

@@ -37,7 +37,7 @@ class LiberoEvalRunner(EvalRunner):
         tasks: which of the suite's, by index or name; all by default.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         norm_stats_key: which of the checkpoint's statistics.
-        eval_chunk_size: how many actions of a chunk are executed before the next is asked for.
+        eval_chunk_size: how many actions of a chunk are executed before the next query.
         resize_size: side of the policy's pictures, which are drawn in that size; as it was
             trained by default.
         num_trials_per_task: episodes for each task, from the first initial state on; at most 50.
@@ -101,17 +101,19 @@ class LiberoEvalRunner(EvalRunner):
         try:
             check_suite(task_suite_name)
         except ConfigError as error:
-            raise self.wrong("task_suite_name", f"is wrong: {error.what}") from error
+            raise self.config_error("task_suite_name", f"is wrong: {error.what}") from error
         if render not in RENDERS:
-            raise self.wrong("render", f"{render!r} is none of {', '.join(RENDERS)}")
+            raise self.config_error("render", f"{render!r} is none of {', '.join(RENDERS)}")
         if protocol not in (FLUXVLA, OPENVLA):
-            raise self.wrong("protocol", f"{protocol!r} is none of {FLUXVLA}, {OPENVLA}")
+            raise self.config_error("protocol", f"{protocol!r} is none of {FLUXVLA}, {OPENVLA}")
         if not 1 <= num_trials_per_task <= TRIALS:
-            raise self.wrong(
+            raise self.config_error(
                 "num_trials_per_task", f"must be 1 to {TRIALS}, got {num_trials_per_task}"
             )
         if video_fps > CONTROL_HZ:
-            raise self.wrong("video_fps", f"must be at most {CONTROL_HZ:g}, got {video_fps:g}")
+            raise self.config_error(
+                "video_fps", f"must be at most {CONTROL_HZ:g}, got {video_fps:g}"
+            )
         for name, value, least in (
             ("seed", seed, 0),
             ("eval_chunk_size", eval_chunk_size, 1),
@@ -119,7 +121,7 @@ class LiberoEvalRunner(EvalRunner):
             ("resize_size", resize_size, 16),
         ):
             if value is not None and value < least:
-                raise self.wrong(name, f"must be at least {least}, got {value}")
+                raise self.config_error(name, f"must be at least {least}, got {value}")
         self.model_family = model_family
         self._suite = task_suite_name
         self._chosen = tasks
@@ -172,12 +174,12 @@ class LiberoEvalRunner(EvalRunner):
             ConfigError: the suite has no such task.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
         """
-        self._given = tuple(task.name for task in choose_tasks(self._suite, self._chosen))
+        self.task_names = tuple(task.name for task in choose_tasks(self._suite, self._chosen))
         super().run_setup()
 
-    def what(self) -> dict[str, Any]:
-        """What outcomes follow from, beside each episode's key; JSON values."""
-        about = super().what()
+    def identity(self) -> dict[str, Any]:
+        """What outcomes follow from, besides each episode's key, as JSON values."""
+        about = super().identity()
         about["settings"]["task_suite_name"] = self._suite
         if self.model_family:
             about["settings"]["model_family"] = self.model_family

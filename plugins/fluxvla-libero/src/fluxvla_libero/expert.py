@@ -68,7 +68,7 @@ class Expert:
 
     def __init__(self, scene: LiberoScene, task: SuiteTask) -> None:
         wanted = goal(task)
-        if len(wanted) != 1 or wanted[0][0] != "in" or not scene.can_judge(task):
+        if len(wanted) != 1 or wanted[0][0] != "in" or not scene.can_check(task):
             raise ConfigError(
                 f"the scripted expert cannot do {task.name!r} in the scene of {scene.task.name!r}",
                 cause="it only puts one object that is there into a container (libero_object)",
@@ -163,10 +163,10 @@ class LiberoExpert(Policy):
         """``(1, 7)``; ``executed`` holds the same with the disturbance.
 
         Raises:
-            ConfigError: it was not told where it acts, or it cannot do the task.
+            ConfigError: ``enter`` was not called, or it cannot do the task.
         """
         if self._environment is None:
-            raise ConfigError("LiberoExpert must be told where it acts: call enter() first")
+            raise ConfigError("LiberoExpert does not know its environment: call enter() first")
         if self._expert is None:
             self._expert = Expert(self._environment.scene, self._environment.task)
         size = self._noise if self._expert.free else _CAREFUL * self._noise

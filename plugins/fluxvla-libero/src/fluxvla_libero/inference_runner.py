@@ -13,14 +13,10 @@ from fluxvla_mujoco import check_render
 
 from fluxvla_core.errors import ConfigError, RunFailed, UsageError
 from fluxvla_core.evaluation import (
-    FROM_CHECKPOINT,
+    PolicySource,
     RolloutSettings,
-    Source,
-    chosen_checkpoint,
-    find_task,
-    fit,
     make_policy,
-    resolve_name,
+    match_policy,
     run_episode,
 )
 from fluxvla_core.operators import (
@@ -128,10 +124,10 @@ class LiberoInferenceRunner:
         self.record_fps = record_fps
         self._wait = num_steps_wait
         self._videos = tuple(Camera(name, video_size, video_size) for name in SCENE_CAMERAS)
-        self._course = RolloutSettings((), eval_chunk_size, max_steps, seed)
-        self._named = policy
-        self._source = Source(
-            what="checkpoint",
+        self._rollout = RolloutSettings((), eval_chunk_size, max_steps, seed)
+        self._source = PolicySource(
+            policy=policy,
+            ckpt_path=ckpt_path,
             dataset=dataset,
             denormalize_action=denormalize_action,
             norm_stats_key=norm_stats_key,
@@ -149,13 +145,9 @@ class LiberoInferenceRunner:
             CheckpointError: there is none, or the one that is named is damaged.
         """
         environment = self._environment(None)
-        spec = environment.spec
-        source = replace(self._source, what=resolve_name(self._named, environment))
-        if source.what in FROM_CHECKPOINT:
-            found = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
-            source = replace(source, ckpt_path=found["path"])
-        self._policy = make_policy(source)
-        self._course = replace(self._course, cameras=fit(self._policy, spec, self.size))
+        self._policy = make_policy(self._source.resolve(environment, self.context.work_dir))
+        cameras = match_policy(self._policy, environment.spec, self.size)
+        self._rollout = replace(self._rollout, cameras=cameras)
 
     def run(self) -> list[dict[str, Any]]:
         """Run an episode for each task that is asked for; returns their summaries.
@@ -188,7 +180,7 @@ class LiberoInferenceRunner:
         )
         stride = round(CONTROL_HZ / self.record_fps)
 
-        def watch(world: Any, steps: int) -> None:
+        def record_step(world: Any, steps: int) -> None:
             if steps:
                 t = steps / CONTROL_HZ
                 event = {"event": "command", "t": t, "phase": "run", "command": world.action}
@@ -204,7 +196,7 @@ class LiberoInferenceRunner:
             "instruction": asked.instruction,
             "scene": where.name,
             "init_state": self.init_state,
-            "seed": self._course.policy_seed,
+            "seed": self._rollout.policy_seed,
             "robot": "LIBERO",
             "embodiment": body.name,
             "joints": list(body.joint_names),
@@ -215,15 +207,15 @@ class LiberoInferenceRunner:
             "success": None,
         }
         try:
-            told = None if task in (None, where) else find_task(spec.tasks, task.name)
+            other = None if task in (None, where) else spec.task(task.name)
             found = run_episode(
                 environment,
                 self._policy,
-                find_task(spec.tasks, where.name),
+                spec.task(where.name),
                 self.init_state,
-                self._course,
-                told,
-                watch,
+                self._rollout,
+                other,
+                record_step,
             )
             if found["problem"] is not None:
                 summary["problem"] = found["problem"]
@@ -239,7 +231,7 @@ class LiberoInferenceRunner:
         finally:
             trace.close(summary)
             environment.close()
-        word = {True: "success", False: "no success", None: "nobody can judge it"}[success]
+        word = {True: "success", False: "no success", None: "success unknown"}[success]
         reporter.info(f"{word} after {found['steps']} steps")
         reporter.artifact("episode", trace.folder)
         return summary
@@ -255,7 +247,7 @@ class LiberoInferenceRunner:
 
     @contextmanager
     def _live(self) -> Iterator[Any]:
-        """A function that shows pictures side by side; it does nothing where nobody looks."""
+        """A function that shows pictures side by side; it does nothing without a live view."""
         if self.live_port is None:
             yield lambda pictures: None
             return

@@ -1,4 +1,4 @@
-"""Importing LIBERO: quietly, told to draw without a display, or with a message on what to do."""
+"""Import LIBERO quietly, set to render without a display, or fail with instructions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def is_installed() -> bool:
 
 
 def require_libero() -> ModuleType:
-    """The package ``libero.libero``, told to draw by EGL if nothing else was said.
+    """The package ``libero.libero``, set to render by EGL if nothing else is set.
 
     Raises:
         MissingPlugin: it is not installed.

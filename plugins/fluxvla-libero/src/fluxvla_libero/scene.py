@@ -147,7 +147,7 @@ class LiberoScene:
         """Whether the goal of ``task`` (this scene's by default) holds now."""
         return all(self._env._eval_predicate(state) for state in goal(task or self.task))
 
-    def can_judge(self, task: SuiteTask) -> bool:
+    def can_check(self, task: SuiteTask) -> bool:
         """Whether everything that ``task``'s goal speaks of is in this scene."""
         there = self._env.object_states_dict
         return all(name in there for state in goal(task) for name in state[1:])

@@ -100,7 +100,7 @@ def suite_tasks(suite: str) -> tuple[SuiteTask, ...]:
 
 
 def instruction(suite: str, task: object, bddl: Path) -> str:
-    """What a policy is told: the task's file name in words, as everybody evaluates it.
+    """The language instruction: the task's file name in words, as in all published evaluations.
 
     LIBERO-PRO's ``_lan`` suites keep the file names and reword the sentence in the file.
     """

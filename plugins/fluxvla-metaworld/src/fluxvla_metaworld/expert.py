@@ -54,12 +54,12 @@ class MetaWorldExpert(Policy):
         """``(1, 4)``, cut to the action's range, as Meta-World would cut it.
 
         Raises:
-            ConfigError: it was not told where it acts.
+            ConfigError: ``enter`` was not called.
         """
         from metaworld.policies import ENV_POLICY_MAP
 
         if self._environment is None:
-            raise ConfigError("MetaWorldExpert must be told where it acts: call enter() first")
+            raise ConfigError("MetaWorldExpert does not know its environment: call enter() first")
         if self._expert is None:
             self._expert = ENV_POLICY_MAP[self._environment.task]()
         with warnings.catch_warnings():

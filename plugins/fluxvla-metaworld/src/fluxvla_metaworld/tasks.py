@@ -1,4 +1,4 @@
-"""Meta-World's 50 tasks and what a policy is told in each.
+"""Meta-World's 50 tasks and their language instructions.
 
 The names are the package's own. It has no instructions; these are plain sentences for what each
 task's success function asks for.

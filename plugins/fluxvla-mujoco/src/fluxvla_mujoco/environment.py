@@ -1,7 +1,7 @@
-"""Notice a MuJoCo simulation that diverged.
+"""Detect that a MuJoCo simulation diverged.
 
-MuJoCo resets itself when it diverges and goes on from the model's own pose: everything is finite
-again, and only a counter in its data, which a reset of the episode clears, remembers.
+MuJoCo resets itself when it diverges and continues from the model's initial pose: everything is
+finite again, and only a warning counter in its data, which a reset of the episode clears, shows it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
 
 
 class MujocoEnvironment(Environment):
-    """Base class of environments on MuJoCo: give it ``simulation``."""
+    """Base class of environments on MuJoCo: override ``simulation``."""
 
     @property
     def simulation(self) -> Any:
@@ -27,7 +27,7 @@ class MujocoEnvironment(Environment):
         return None
 
     def divergence(self) -> str | None:
-        """What went wrong in the simulation since the last reset; None if nothing did."""
+        """Why the simulation diverged since the last reset; None if it did not."""
         return divergence(self.simulation)
 
     def drawn_by(self) -> str:
@@ -36,7 +36,12 @@ class MujocoEnvironment(Environment):
 
 
 def divergence(data: Any) -> str | None:
-    """What went wrong in a simulation since its last reset; None if nothing did.
+    """Why a MuJoCo simulation diverged since its last reset; None if it did not.
+
+    For environments that do not inherit ``MujocoEnvironment``::
+
+        def divergence(self):
+            return fluxvla_mujoco.divergence(self.env.unwrapped.data)
 
     Args:
         data: ``mujoco.MjData``; None where there is no such simulation.

@@ -1,4 +1,4 @@
-"""One recorded episode as the page shows it: timeline, joint plots, latency by stage."""
+"""The view of one recorded episode: timeline, joint plots, latency by stage."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from fluxvla_report.svg import ROW_HEIGHT, Mark, Row, Series, Shade, line_chart,
 # Joint plots show at least this much (rad, m or gripper units).
 LEAST_RANGE = 0.1
 STAGES: Mapping[str, str] = {
-    "receipt": "how old the oldest stream was when the robot was looked at",
-    "sync": "gathering state and pictures that belong together",
-    "preprocess": "making the policy's input of them",
+    "receipt": "how old the oldest stream was when the robot was read",
+    "sync": "matching state and pictures in time",
+    "preprocess": "making the policy's input",
     "inference": "the model",
-    "postprocess": "making joint targets of its output",
-    "policy": "asking the policy, as a whole",
+    "postprocess": "making joint targets from its output",
+    "policy": "the policy call as a whole",
     "send": "handing one command to the robot",
 }
-"""Stage -> what it is, in the order of a picture's way to a command."""
+"""Stage -> what it is, in the order from a picture to a command."""
 
 
 def episode_view(episode: Episode, put: Callable[[Video], Mapping[str, Any]]) -> dict[str, Any]:
-    """What the template is given; ``put`` makes the source of a video."""
+    """The values for the template; ``put`` makes the source of a video."""
     clamped = sorted({time for joint in episode.joints for time, _ in joint.clamped})
     happened = bool(episode.phases)
     return {
@@ -39,7 +39,7 @@ def episode_view(episode: Episode, put: Callable[[Video], Mapping[str, Any]]) ->
             episode.chunks,
             clamped,
             episode.stops,
-            title="What happened when",
+            title="Timeline",
             clamp_css=clamp_css(episode),
         )
         if happened
@@ -74,7 +74,7 @@ def drawable(joint: JointTrace) -> bool:
 
 
 def clamp_css(episode: Episode) -> str:
-    """A limit that acted is the way of things where all went well, and may be the cause else."""
+    """The colour of clamped commands: neutral after a success, else that of problems."""
     return "bad" if episode.stops or episode.success is False else "s3"
 
 
@@ -93,7 +93,9 @@ def clamp_note(episode: Episode) -> str:
         "joint went as fast as it may towards its target, or as far as it may."
     )
     if pressed > sum(counts.values()) / 2:
-        text += " Most are a gripper's: it is told to be closed, or open, at once, and takes time."
+        text += (
+            " Most are a gripper's: its command jumps between open and closed, and it takes time."
+        )
     return text
 
 
@@ -142,7 +144,7 @@ def joint_chart(joint: JointTrace, episode: Episode) -> dict[str, Any]:
 
 
 def stage_times(episode: Episode) -> list[StageTime]:
-    """The budget's rows; the policy as a whole only where it does not tell its stages."""
+    """The budget's rows; the policy as a whole only if it does not report its stages."""
     found: list[StageTime] = []
     if episode.simulated:
         return found

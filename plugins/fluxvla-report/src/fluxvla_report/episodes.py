@@ -1,4 +1,4 @@
-"""From the records of episodes to the facts of a report; whole, cut short or damaged."""
+"""Read recorded episodes for a report; they may be complete, cut short or damaged."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
         "rate": f"{summary['rate_hz']:g} Hz" if summary.get("rate_hz") else None,
         "chunks of the policy": summary.get("chunks"),
         "seed": summary.get("seed"),
-        "beats that were skipped": summary.get("skipped_beats"),
-        "beats without a chunk, held": summary.get("held_beats"),
+        "control ticks skipped": summary.get("skipped_beats"),
+        "control ticks without a chunk, held": summary.get("held_beats"),
         "trips": _trips(summary.get("trips", [])),
         "clamped commands": clamp_counts(summary.get("clamps")),
         "not recorded": ", ".join(f"{count} {what}" for what, count in dropped.items()),

@@ -1,4 +1,4 @@
-"""What a report is made of, whatever files it came from."""
+"""Data classes of a report's content: training, evaluations, recorded episodes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 WRONG_INSTRUCTION = "swapped"
-"""The group of an evaluation that is told another task than its scene is for."""
+"""The group of an evaluation whose policy gets another task's instruction."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Video:
-    """An mp4 of one episode and what to say of it; ``success`` None: nobody judged it.
+    """An mp4 of one episode with its caption; ``success`` is None if unknown.
 
     ``group`` and ``task`` are those of an evaluation's results.
     """
@@ -60,7 +60,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Group:
-    """Who acted and what it was told: ``name`` as results have it, ``label`` for people."""
+    """A policy with its instructions: ``name`` as results have it, ``label`` as displayed."""
 
     name: str
     label: str
@@ -70,7 +70,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What a group did after one instruction: how many of its episodes did which task."""
+    """In how many episodes of a group, with one instruction, which task was done."""
 
     group: str
     instruction: str
@@ -83,11 +83,10 @@ class Evaluation:
     """One evaluation: its groups, and videos in the order in which to show them.
 
     ``problems`` say in how many episodes what went wrong, the most frequent first. ``details`` are
-    plain values that the results state beside the rates; ``obeyed`` is how often a group did the
-    task that it was told, whatever its scene is for; ``live`` says that the world ran on the wall
-    clock and did not wait for the policy, ``unseen`` that the seeds of the training are known and
-    none of them was evaluated; ``made`` is a line on when it ran, of which commit, with which
-    versions.
+    plain values that the results state beside the rates. ``obeyed`` is how often a group did the
+    task of its instruction, whatever the scene's own task is. ``live``: the simulation ran on the
+    wall clock and did not wait for the policy. ``unseen``: the seeds of the training are known and
+    none of them was evaluated. ``made``: when it ran, of which commit, with which versions.
     """
 
     name: str
@@ -101,9 +100,9 @@ class Evaluation:
     unseen: bool = False
     obeyed: Mapping[str, Score] = field(default_factory=dict)
 
-    def listens(self, group: Group) -> bool:
-        """Whether what counts of the group is that it does what it is told: the scene's own task is
-        not what it is asked for."""
+    def scored_by_instruction(self, group: Group) -> bool:
+        """Whether the group's score is how often it follows its instruction, which is not that of
+        the scene's own task."""
         return group.name == WRONG_INSTRUCTION and group.name in self.obeyed
 
 
@@ -137,7 +136,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Moment:
-    """Something that happened, s from the first command, and what to say of it."""
+    """An event, s from the first command, with its description."""
 
     at: float
     name: str
@@ -151,7 +150,7 @@ class Episode:
     Args:
         name: its folder's.
         task: the instruction.
-        outcome: how it ended; ``success`` is None when nobody judged it.
+        outcome: how it ended; ``success`` is None if unknown.
         joints: in the robot's order; empty when no command was sent.
         timings: stage -> ``count``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``max_ms``.
         problem: why it ended before its time; empty if it did not.

@@ -1,4 +1,4 @@
-"""Write the HTML page: what was trained, how well it does, what it did."""
+"""Write the HTML page: training curves, success rates, recorded episodes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def build_report(work_dir: Path | str, out: Path | str | None = None, title: str
 
 
 def nothing_there(facts: Facts) -> UsageError:
-    """What to do about a folder of which there is nothing to show."""
+    """The error for a folder with nothing to show; names work dirs in it."""
     damaged = "; ".join(facts.problems[:MOST_PROBLEMS])
     inside = [str(path) for path in work_dirs_below(facts.work_dir)[:3]]
     return UsageError(
@@ -148,8 +148,8 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
     found = []
     for evaluation, group in ((e, g) for e in facts.evaluations for g in e.groups):
         score, does = group.total, "succeeds"
-        if evaluation.listens(group):
-            score, does = evaluation.obeyed[group.name], "does the task that it was told"
+        if evaluation.scored_by_instruction(group):
+            score, does = evaluation.obeyed[group.name], "follows the instruction"
         found.append(
             {
                 "name": f"{group.label}: {does}" if does != "succeeds" else f"{group.label} {does}",
@@ -177,7 +177,7 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
         total = sum(stage.seconds for stage in facts.stages)
         found.append(
             {
-                "name": "from nothing to this page",
+                "name": "total time",
                 "figure": duration(total) if total < 60 else f"{total / 60:.0f} min",
                 "detail": f"in {len(facts.stages)} stages",
             }
@@ -201,7 +201,7 @@ def _episode_tiles(episodes: Sequence[Episode]) -> list[dict[str, str]]:
             "figure": str(len(episodes)) if len(episodes) > 1 else episodes[0].outcome,
             "detail": f"{sum(judged)} of {len(judged)} judged ones succeeded"
             if judged
-            else "nobody judged",
+            else "none judged",
         },
         {
             "name": "commands",
@@ -240,15 +240,15 @@ def _evaluation(evaluation: Evaluation, sources: VideoSources) -> dict[str, Any]
     rows = []
     for number, group in enumerate(evaluation.groups):
         scores = group.tasks if len(group.tasks) > 1 else [group.total]
-        if evaluation.listens(group):
-            told = evaluation.obeyed[group.name]
+        if evaluation.scored_by_instruction(group):
+            followed = evaluation.obeyed[group.name]
             rows.append(
                 Interval(
-                    name=f"{group.label} · does what it was told",
-                    note=f"{told.successes} of {told.episodes}",
-                    low=told.low,
-                    value=told.rate,
-                    high=told.high,
+                    name=f"{group.label} · follows the instruction",
+                    note=f"{followed.successes} of {followed.episodes}",
+                    low=followed.low,
+                    value=followed.rate,
+                    high=followed.high,
                     css=f"s{number % 6}",
                 )
             )
@@ -269,7 +269,9 @@ def _evaluation(evaluation: Evaluation, sources: VideoSources) -> dict[str, Any]
     alone = [video for video in evaluation.videos if video not in beside]
     return {
         "facts": evaluation,
-        "listens": [g.name for g in evaluation.groups if evaluation.listens(g)],
+        "scored_by_instruction": [
+            g.name for g in evaluation.groups if evaluation.scored_by_instruction(g)
+        ],
         "problems": evaluation.problems[:MOST_PROBLEMS],
         "more_problems": max(0, len(evaluation.problems) - MOST_PROBLEMS),
         "chart": interval_chart(rows, title="Success rates with 95 % intervals"),

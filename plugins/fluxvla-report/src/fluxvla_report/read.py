@@ -56,7 +56,7 @@ def read_stages(reader: Reader, path: Path) -> list[Stage]:
 
 
 def read_dataset(reader: Reader, config: Mapping[str, Any]) -> dict[str, Any]:
-    """What the metadata of the training data say, if the data are where the config says."""
+    """The metadata of the training data, if the data are where the config says."""
     loader = dict(mappings(config)).get("train_dataloader", {})
     root = dict(mappings(loader)).get("dataset", {}).get("data_root_path")
     if not isinstance(root, str):
@@ -70,10 +70,10 @@ NAMES = {
     "swapped": "wrong instruction",
     "untrained": "untrained policy",
 }
-"""What people call the groups of an evaluation; an unknown one keeps its own name."""
+"""Labels of the groups of an evaluation; an unknown one keeps its own name."""
 
 MODES = {"robot": ", on the robot", "live": ", in real time"}
-"""What is added where the policy did not have all the time in the world."""
+"""Suffix of the labels of an evaluation that did not wait for the policy."""
 
 NAMED_VERSIONS = (
     "fluxvla",
@@ -144,7 +144,7 @@ def _score(name: str, counted: Any) -> Score | None:
 
 
 def _problems(names: Mapping[str, str], listed: Any) -> list[str]:
-    """Lines for people; episodes without a result are among nobody's successes or failures."""
+    """Lines for people; episodes without a result are neither successes nor failures."""
     lines = []
     for row in listed if isinstance(listed, list) else []:
         if isinstance(row, Mapping):
@@ -176,7 +176,7 @@ def _videos(folder: Path, names: Mapping[str, str], listed: Any) -> list[Video]:
             path=folder / str(row["path"]),
             caption=f"{names.get(str(row.get('group')), row.get('group', ''))} · "
             f"{row.get('task', '')} · seed {row.get('seed', '?')}"
-            + (f" · told “{row['instruction']}”" if row.get("instruction") else ""),
+            + (f" · instruction “{row['instruction']}”" if row.get("instruction") else ""),
             success=bool(row.get("success")),
             group=str(row.get("group", "")),
             task=str(row.get("task", "")),
@@ -199,7 +199,7 @@ def _details(results: Mapping[str, Any]) -> dict[str, Any]:
     live = tables.get("live", {})
     if live:
         stopped = ", ".join(f"{rule} {n}" for rule, n in dict(live.get("stopped_by", {})).items())
-        rows["on the wall clock"] = (
+        rows["in real time"] = (
             f"{number(live.get('missed_share')):.1%} of {live.get('ticks')} ticks without a target "
             f"of the policy; stopped by safety: {stopped or 'none'}"
         )
@@ -210,7 +210,7 @@ def _details(results: Mapping[str, Any]) -> dict[str, Any]:
             f"p = {number(tested.get('p_different')):.2g}, {tested.get('verdict', '')}"
         )
     if "policy_ms" in timing:
-        rows["the policy's answer"] = f"{number(timing['policy_ms']):.1f} ms on average"
+        rows["policy call"] = f"{number(timing['policy_ms']):.1f} ms on average"
     return {**_provenance(tables.get("provenance", {})), **rows, **tables.get("settings", {})}
 
 

@@ -35,7 +35,7 @@ class CollectCommand:
             type=float,
             default=0.0,
             metavar="RAD",
-            help="disturb what the arms are told by about this much; the labels stay clean",
+            help="size of smooth noise on the executed commands; the recorded actions stay clean",
         )
         parser.add_argument(
             "--resume", action="store_true", help="go on with an interrupted collection"

@@ -59,7 +59,7 @@ class SimEnvironment(MujocoEnvironment):
         )
         self._scenes: dict[int, Scene] = {}
         self.world: World = robot.worlds[0]
-        self._task = self._told = self.world.tasks[0]
+        self._task = self._instructed = self.world.tasks[0]
         self._facts = self.world.begin()
 
     @property
@@ -88,18 +88,18 @@ class SimEnvironment(MujocoEnvironment):
             RunFailed: its model files are not installed.
         """
         self.world, self._task = self.robot.find(task)
-        self._told = self._task
+        self._instructed = self._task
         self._facts = self.world.begin()
         self.scene.reset(seed)
 
-    def others(self, task: str) -> Sequence[str]:
+    def other_tasks(self, task: str) -> Sequence[str]:
         """The other tasks of the world that ``task`` is in."""
         world, _ = self.robot.find(task)
         return tuple(other.name for other in world.tasks if other.name != task)
 
-    def tell(self, task: str) -> None:
-        """After ``reset``: give the instruction of ``task``, with whose end the episode ends."""
-        _, self._told = self.robot.find(task)
+    def set_instruction(self, task: str) -> None:
+        """After ``reset``: give the policy the instruction of ``task``, with which it ends."""
+        _, self._instructed = self.robot.find(task)
 
     def step(self, action: Array) -> Step:
         """Drive to the joint targets ``(D,)`` for 20 ms."""
@@ -108,7 +108,7 @@ class SimEnvironment(MujocoEnvironment):
         return Step(
             reward=float(facts.reward),
             success=self._task.success(facts),
-            ended=self._ends and self._told.done(facts),
+            ended=self._ends and self._instructed.done(facts),
             behaviours={task.name: task.success(facts) for task in self.world.tasks},
         )
 
@@ -118,7 +118,7 @@ class SimEnvironment(MujocoEnvironment):
         return {
             "qpos": scene.state.astype(np.float32),
             "images": {c.name: scene.render(c.name, c.height, c.width) for c in cameras},
-            "task_description": self._told.instruction,
+            "task_description": self._instructed.instruction,
         }
 
     def state_hash(self) -> str:

@@ -1,4 +1,4 @@
-"""How often a policy does what it is told in simulation, over seeds it has not seen."""
+"""Evaluation runners of the simulated robots."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SimEvalRunner(EvalRunner):
         seed: of each task's first episode; the others count up from it.
         swap_seed: of the first episode with the other task's instruction; by default these repeat
             the policy's own seeds, so that right and wrong instructions are compared pair by pair.
-        replan_every: how many keyframes of a chunk are used before the policy is asked again.
+        replan_every: how many keyframes of a chunk are used before the policy is queried again.
         max_steps: control steps (20 ms) after which an episode ends, if later than by itself.
         render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
         video_height, video_width, video_fps: of the videos.
@@ -69,7 +69,7 @@ class SimEvalRunner(EvalRunner):
         )
         least = max(self.robot.find(name)[0].max_steps for name in names) if names else 0
         if max_steps is not None and max_steps < least:
-            raise self.wrong("max_steps", f"must be at least {least}, got {max_steps}")
+            raise self.config_error("max_steps", f"must be at least {least}, got {max_steps}")
 
 
 class AlohaSimEvalRunner(SimEvalRunner):

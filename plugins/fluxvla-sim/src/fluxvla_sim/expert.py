@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 class Place(Protocol):
     """Where an expert acts: a ``SimEnvironment``, or a ``SimOperator`` that is connected."""
 
-    robot: Any
+    robot: SimRobot
     world: World
 
     @property
@@ -66,12 +66,11 @@ class SimExpert(Policy):
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
-        """Of the robot that it acts with; None before it knows."""
-        robot: SimRobot | None = getattr(self._place, "robot", None)
-        return None if robot is None else robot.embodiment(())
+        """Of the robot that it acts with; None before ``enter``."""
+        return None if self._place is None else self._place.robot.embodiment(())
 
     def enter(self, environment: Any) -> None:
-        """Say where it acts; it looks there when an episode's first chunk is asked for.
+        """Set where it acts; it reads the scene when it plans an episode's first chunk.
 
         Raises:
             ConfigError: that is no simulated robot of this plugin.

@@ -58,7 +58,7 @@ class AlohaSimOperator(SimOperator):
 
     Args:
         task: ``transfer_cube``, ``lift_hold`` or ``insertion``: which scene, and what
-            :meth:`task_success` judges until an episode's instruction says otherwise.
+            :meth:`task_success` checks until an episode's instruction says otherwise.
         seed: places the objects in the first episode; each later one adds 1.
         camera_names: cameras of the scene, in the order of the images.
         height, width: of every picture, in pixels.

@@ -21,7 +21,7 @@ from fluxvla_core.errors import RunFailed
 
 
 def import_mujoco() -> Any:
-    """The ``mujoco`` module, told to use EGL if it has not been told anything.
+    """The ``mujoco`` module, set to use EGL if nothing else is set.
 
     Raises:
         RunFailed: EGL is wanted and its library is not installed.

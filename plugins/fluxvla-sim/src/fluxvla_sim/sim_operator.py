@@ -29,7 +29,7 @@ class SimOperator(Operator):
 
     Args:
         robot: which.
-        task: which of its worlds, and what :meth:`task_success` judges.
+        task: which of its worlds, and what :meth:`task_success` checks.
         cameras: in the order of the images.
         seed: of the first episode; :meth:`connect` resets to it.
         realtime: follow the wall clock.
@@ -99,7 +99,7 @@ class SimOperator(Operator):
         """Reset for episode number ``episode``, counted from 0; runners call this before each.
 
         Objects go where ``seed + episode`` puts them; the task that ``instruction`` asks for, if
-        any, is the one that is judged.
+        any, is the one that is checked.
         """
         with self._lock:
             found = task_of(self.world, instruction)
@@ -134,9 +134,9 @@ class SimOperator(Operator):
             return Frame(state=np.array(scene.state), images=images, stamps=stamps)
 
     def task_success(self) -> bool | None:
-        """Whether ``task`` is done, judged now, over everything since :meth:`reset`.
+        """Whether ``task`` is done by now, from everything since :meth:`reset`.
 
-        None in an episode whose instruction is none of the world's: nobody can judge that.
+        None if the episode's instruction is none of the world's.
         """
         with self._lock:
             return self.task.success(self._facts) if self._judged else None

@@ -62,7 +62,7 @@ class Scene(Protocol):
 
 
 class Facts(Protocol):
-    """What has happened in an episode so far: all that success is judged by.
+    """What has happened in an episode so far: everything that success depends on.
 
     ``steps`` were taken, the last one with ``reward``.
     """
@@ -126,7 +126,7 @@ class SimRobot:
 
     Args:
         name: as commands take it.
-        title: as people are told.
+        title: as displayed.
         cameras: of every one of its worlds.
         embodiment: its spec with the cameras that are given, at ``CONTROL_HZ``.
         worlds: what it can be put into.

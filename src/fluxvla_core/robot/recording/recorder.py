@@ -60,7 +60,7 @@ class EpisodeRecorder(EpisodeObserver):
         reporter: Reporter,
     ) -> None:
         self.summary: dict[str, Any] = {}
-        self._folder = folder
+        self.folder = folder
         self._robot = robot
         self._policy = policy
         self._cameras = cameras
@@ -120,7 +120,7 @@ class EpisodeRecorder(EpisodeObserver):
         source = robot.pictures_after
         names = {"state": spec.state_names, "action": spec.joint_names}
         recording = Recording(names, spec.camera_names, source) if self._everything else None
-        self._trace = EpisodeTrace(self._folder, self._video_fps, recording)
+        self._trace = EpisodeTrace(self.folder, self._video_fps, recording)
         self._write(
             episode_log.START,
             event.at,
@@ -189,8 +189,9 @@ class EpisodeRecorder(EpisodeObserver):
             skipped_beats=event.skipped,
             trips=[asdict(trip) for trip in event.trips],
         )
+        self.summary = self._counted.to_dict()
         try:
-            self.summary = self._trace.close(self._counted.to_dict())
+            self.summary = self._trace.close(self.summary)
             lost = [f"{count} {what}" for what, count in self._trace.dropped.items() if count]
             if lost:
                 self._reporter.warn(
@@ -202,10 +203,10 @@ class EpisodeRecorder(EpisodeObserver):
                 raise
             # A lost record must not hide why an episode ended.
             self._reporter.warn(str(error))
-        self._reporter.artifact("episode", self._folder)
+        self._reporter.artifact("episode", self.folder)
 
     def _note_stop(self, event: StoppedWhileHeld) -> None:
-        place = self._folder / episode_log.HELD
+        place = self.folder / episode_log.HELD
         fields = {"time": time.time(), **asdict(event.trip), "failure": event.failure}
         try:
             with place.open("a", encoding="utf-8") as file:

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, HOME, load_model
-from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS
+from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, DIM, HOME, load_model
+from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene
 from fluxvla_sim.ik import ArmIK
-from fluxvla_sim.motion import minimum_jerk, quaternion_product, turn
+from fluxvla_sim.motion import minimum_jerk, quaternion_product, slow_noise, turn
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -30,6 +29,8 @@ GRASP_HEIGHT = 0.02
 OPEN, CLOSED = 1.0, 0.0
 HOME_OPENING = float(HOME[6])
 TIP = (0.135, 0.0, 0.0)  # between the fingertips, in the gripper link's frame, metres
+# Steps in which a few millimetres decide: coming down on the cube, changing hands.
+_DELICATE = ((55, 112), (130, 215))
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def arm_ik(model: Any, arm: str) -> ArmIK:
 
 
 class Expert:
-    """Plans for the tasks of :mod:`fluxvla_sim.aloha.tasks`; knows the cube's true pose."""
+    """Plans for the tasks of :mod:`fluxvla_sim.aloha.cube`; knows the cube's true pose."""
 
     def __init__(self, model: Any = None) -> None:
         model = load_model(AlohaScene.file) if model is None else model
@@ -177,3 +178,11 @@ def _gripper(grips: tuple[Grip, ...]) -> Vector:
         opening[grip.start : grip.until] = before + share * (grip.opening - before)
         opening[grip.until :] = grip.opening
     return opening
+
+
+def smooth_noise(rng: np.random.Generator) -> Vector:
+    """``(300, 14)`` offsets of about unit size that disturb the expert within what the arms can do.
+
+    They are slow, smaller in delicate phases, and 0 for the grippers.
+    """
+    return slow_noise(rng, MAX_STEPS, DIM, _DELICATE, grippers=(6, 13))

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluxvla_sim.aloha.arms import ARMS, DIM, HOME
+from fluxvla_sim.aloha.cube import MAX_STEPS
 from fluxvla_sim.aloha.expert import CLOSED, HOME_OPENING, OPEN, arm_ik
 from fluxvla_sim.aloha.insertion import InsertionScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS
 from fluxvla_sim.motion import (
     minimum_jerk,
     quaternion_product,

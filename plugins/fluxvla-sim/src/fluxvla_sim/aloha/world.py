@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 
 from fluxvla_aloha.embodiment import aloha_spec
 
-from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene, Facts, LiftHold, TransferCube
+from fluxvla_sim.aloha.expert import Expert, smooth_noise
 from fluxvla_sim.aloha.insertion import Insertion, InsertionFacts, InsertionScene
 from fluxvla_sim.aloha.insertion_expert import InsertionExpert, insertion_noise
-from fluxvla_sim.aloha.noise import smooth_noise
-from fluxvla_sim.aloha.scene import AlohaScene
-from fluxvla_sim.aloha.tasks import MAX_STEPS, Facts, LiftHold, TransferCube
 from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
 
 if TYPE_CHECKING:

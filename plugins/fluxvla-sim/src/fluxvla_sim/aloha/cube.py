@@ -1,21 +1,68 @@
-"""The two tasks of the cube scene, and how to tell whether they were done.
+"""gym-aloha's cube scene, ``gym_aloha/AlohaTransferCube-v0``, and its two tasks.
 
-Both start from the same scene, so that the instruction alone decides what is right. Success
-of both is judged in every episode: a policy that hears the wrong instruction should do the other
+Both tasks start from the same scene, so that the instruction alone decides what is right. Success
+of both is determined in every episode: a policy that gets the other instruction should do the other
 task, and that can be counted.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from fluxvla_sim.aloha.scene import AlohaScene
+import numpy as np
+
+from fluxvla_sim.aloha.arms import TABLE, TwoArms
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 MAX_STEPS = 300
 """Control steps in an episode: gym-aloha's limit, six seconds."""
 
 LIFTED_M = 0.10
 """Height of the cube's centre that counts as lifted; it rests at about 0.02 on the table."""
+CUBE_LOW, CUBE_HIGH = (0.0, 0.4, 0.05), (0.2, 0.6, 0.05)  # metres, world frame
+_CUBE = "red_box"
+
+
+def sample_cube(seed: int) -> npt.NDArray[np.float64]:
+    """The cube's pose at the start, ``(7,)``: position in metres, quaternion wxyz."""
+    position = np.random.RandomState(seed).uniform(CUBE_LOW, CUBE_HIGH)
+    return np.concatenate([position, [1.0, 0.0, 0.0, 0.0]])
+
+
+class AlohaScene(TwoArms):
+    """The arms and one cube on the right arm's side."""
+
+    file = "bimanual_viperx_transfer_cube.xml"
+
+    def reset(self, seed: int) -> None:
+        self.reset_to(sample_cube(seed))
+
+    @property
+    def cube(self) -> npt.NDArray[np.float64]:
+        """``(7,)`` the cube's pose."""
+        return self.objects
+
+    def fingers_on_cube(self, arm: str) -> tuple[bool, bool]:
+        """Which of ``arm``'s two fingers (left, right) touch the cube."""
+        touching = self.touching(_CUBE)
+        left, right = self.fingers[arm]
+        return left in touching, right in touching
+
+    def reward(self) -> int:
+        """gym-aloha's reward: 1 right gripper touches, 2 lifted, 3 left touches, 4 handed over.
+
+        As there, one named finger of each arm stands for its gripper.
+        """
+        touching = self.touching(_CUBE)
+        on_table = self.geom[TABLE] in touching
+        if self.fingers["left"][0] in touching:
+            return 3 if on_table else 4
+        if self.fingers["right"][1] in touching:
+            return 1 if on_table else 2
+        return 0
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,21 @@ class StepPlan:
         return self.batch_size * self.accumulation * self.world
 
     @property
+    def shuffle_episodes(self) -> int | None:
+        """Episodes that are mixed at a time; None where all samples are."""
+        return self.shards.together if self.shards is not None else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``trainer.json`` says of it, as JSON values."""
+        return {
+            "seed": self.seed,
+            "n_train_examples": self.length,
+            "step_samples": self.step_samples,
+            "world_size": self.world,
+            "shuffle_episodes": self.shuffle_episodes,
+        }
+
+    @property
     def steps_per_epoch(self) -> int:
         return self.steps_left(Cursor())
 

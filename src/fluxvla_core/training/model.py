@@ -139,7 +139,7 @@ class ForwardArguments:
     def __init__(self, model: nn.Module, where: str | None = None) -> None:
         self._where = where
         parameters = inspect.signature(model.forward).parameters.values()
-        self._model = type(model).__name__
+        self.model_name = type(model).__name__
         self._any = any(p.kind is p.VAR_KEYWORD for p in parameters)
         named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
         self._taken = {p.name for p in named}
@@ -151,7 +151,7 @@ class ForwardArguments:
         if not self._needed <= batch.keys():
             missing = sorted(self._needed - batch.keys())
             raise ConfigError(
-                f"{self._model}.forward needs {', '.join(map(repr, missing))}, which the batch "
+                f"{self.model_name}.forward needs {', '.join(map(repr, missing))}, which the batch "
                 f"does not have; it has {', '.join(sorted(batch))}",
                 where=self._where,
                 next="let a transform of the dataset make it, and list it in the collator's keys",
@@ -166,7 +166,7 @@ class ForwardArguments:
         )
         if extra:
             raise ConfigError(
-                f"{self._model}.forward takes no {', '.join(map(repr, extra))}; "
+                f"{self.model_name}.forward takes no {', '.join(map(repr, extra))}; "
                 f"it takes {', '.join(sorted(self._taken))}",
                 where=self._where,
                 next="move what only describes from the collator's keys to meta_keys",
@@ -174,17 +174,15 @@ class ForwardArguments:
         return taken
 
 
-def loss_of(output: Any, model: nn.Module) -> Tensor:
-    """The scalar ``output["loss"]``.
+def loss_of(output: Any, model_name: str) -> Tensor:
+    """The scalar ``output["loss"]`` of a model of class ``model_name``.
 
     Raises:
         ConfigError: the model returned something else.
     """
     loss = output.get("loss") if isinstance(output, Mapping) else None
     if not (isinstance(loss, Tensor) and loss.ndim == 0):
-        raise ConfigError(
-            f"{type(model).__name__}.forward must return a mapping with a scalar tensor 'loss'"
-        )
+        raise ConfigError(f"{model_name}.forward must return a mapping with a scalar tensor 'loss'")
     return loss
 
 

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -27,12 +27,8 @@ from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, agree, on_first, texts
-from fluxvla_core.training.ema import Ema
-from fluxvla_core.training.state import rng_state, seeds_of
-from fluxvla_core.training.weights import LeftOut
-
-if TYPE_CHECKING:
-    from fluxvla_core.training.base_runner import BaseTrainRunner
+from fluxvla_core.training.optim import Ema
+from fluxvla_core.training.state import rng_state
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -159,44 +155,6 @@ def rng_file(rank: int) -> str:
 def part_file(rank: int) -> str:
     """Name of a rank's file with its parts of the optimizer's state."""
     return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
-
-
-def take_snapshot(run: BaseTrainRunner, train_loss: float | None, only_trainable: bool) -> Snapshot:
-    """The runner's present moment.
-
-    Args:
-        only_trainable: leave out frozen weights that the model brings itself.
-    """
-    without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
-    state, (optimizer, described) = run.model_tensors(), run.optimizer_tensors()
-    adapter = lora.adapter_names(run.model)
-    elsewhere = {*without.names, *adapter}
-    documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
-    if run.lora is not None:
-        documents[lora.CONFIG] = run.lora.for_peft(run.adapter_base)
-    trainer = {
-        **run.progress.to_dict(),
-        "train_loss": train_loss,
-        "scheduler": run.lr_scheduler.state_dict(),
-        "metric": run.metric.state_dict(),
-        "seed": run.plan.seed,
-        "data_seeds": seeds_of(run.dataset),
-        "n_train_examples": run.plan.length,
-        "step_samples": run.plan.step_samples,
-        "world_size": run.plan.world,
-        "shuffle_episodes": run.loader_options.shuffle_episodes,
-        "left_out": without.to_dict(),
-    }
-    return Snapshot(
-        {name: tensor for name, tensor in state.items() if name not in elsewhere},
-        optimizer,
-        described,
-        trainer,
-        run.ema,
-        {theirs: state[name] for name, theirs in adapter.items()},
-        documents,
-        run_folders(run.dataset, run.tokenizer),
-    )
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:

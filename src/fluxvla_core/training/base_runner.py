@@ -44,7 +44,7 @@ class BaseTrainRunner(Strategy):
         options: the settings, by the fields of ``TrainOptions``.
 
     Raises:
-        ConfigError: a setting that cannot be meant, with its place.
+        ConfigError: an invalid setting, with its place.
     """
 
     api: ClassVar[str] = "1.0"

@@ -1,4 +1,5 @@
-"""The batches of a run: which samples each optimizer step uses on this rank, and their way there.
+"""The batches of a run: which samples each optimizer step uses on this rank, and moving them to
+the device.
 
 A step uses ``per_device_batch_size * accumulation * world`` consecutive samples of the epoch's
 order, whatever they are split into: a run of eight processes, a run of one with eight-fold

@@ -15,15 +15,14 @@ from torch import Tensor, nn
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
     EMA,
-    FOLDER,
     MODEL,
     TRAINER,
     Checkpoint,
     folders,
     newest_whole,
-    step_name,
 )
 from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
+from fluxvla_core.checkpoints.manifest import FOLDER, step_name
 from fluxvla_core.checkpoints.owner import Claim, claim
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
@@ -341,7 +340,7 @@ HARMLESS = frozenset(
         *("init_from", "resume_from", "device"),
         # How samples are fetched.
         *("per_device_num_workers", "cache_frames"),
-        # What is told and saved, and how often.
+        # What is logged and saved, and how often.
         *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
         *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
         "early_stop_patience",  # how long it goes on

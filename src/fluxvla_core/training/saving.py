@@ -66,7 +66,7 @@ def save_snapshot(
     keep: int,
     spare: int | None = None,
 ) -> Path:
-    """Begin the checkpoint of ``step``; ``saver.settle`` tells when it is there.
+    """Begin the checkpoint of ``step``; ``saver.settle`` says when it is complete.
 
     Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
     but for that of step ``spare``; old ones that cannot be removed are only warned of.
@@ -134,7 +134,7 @@ def save_snapshot(
 
 def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
     model = snapshot.model
-    if saver.beside:
+    if saver.background:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
@@ -207,7 +207,7 @@ def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]
 
 @dataclass
 class _Job:
-    """A checkpoint on its way: ``copied`` when nothing of the training is needed any more."""
+    """A checkpoint being written; ``copied`` is set once the training may change its tensors."""
 
     step: int
     copied: threading.Event = field(default_factory=threading.Event)
@@ -227,19 +227,19 @@ class Saved:
 
 
 class Saver:
-    """Writes checkpoints of one run, in a thread of its own or at once.
+    """Writes checkpoints of one run, in a background thread or at once.
 
     Args:
         world: the processes that save together.
-        beside: use a thread.
+        background: write in a thread, from copies of the tensors.
         optimizer: waits, in its ``step``, for the copy; one without ``register_step_pre_hook``
             is copied before :meth:`start` returns.
     """
 
-    def __init__(self, world: World, beside: bool, optimizer: Any = None) -> None:
-        self.world, self.beside = world, beside
+    def __init__(self, world: World, background: bool, optimizer: Any = None) -> None:
+        self.world, self.background = world, background
         self._threads = world
-        if beside and world.size > 1:
+        if background and world.size > 1:
             # The threads of all ranks talk while the training talks on the other groups.
             self._threads = replace(world, control=dist.new_group(backend="gloo"))
         self._job: _Job | None = None
@@ -259,7 +259,7 @@ class Saver:
         """
         job = self._job = _Job(step)
         warn = job.warnings.append
-        if not self.beside:
+        if not self.background:
             self._run(job, lambda: write(self.world, files, warn))
             return
         gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
@@ -352,7 +352,7 @@ class Saver:
 
 
 def _reached(device: torch.device) -> AbstractContextManager[object]:
-    """Inside, a GPU copies beside the work that is enqueued later than now, and after the rest."""
+    """Inside, a GPU copies on another stream, after what has been enqueued up to now."""
     if device.type != "cuda":
         return nullcontext()
     stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]

@@ -133,8 +133,8 @@ class Strategy(TrainRunner):
     def optimizer_step(self) -> Tensor | None:
         """Clip, and let the optimizer step; the gradients' norm before, on the device.
 
-        Where ``clip_grad_norm`` tells none it is the norm of what the optimizer uses: gradients
-        that are not finite must not go unseen.
+        Where ``clip_grad_norm`` returns None it is computed here: gradients that are not finite
+        must not go unseen.
         """
         from fluxvla_core.training.optim import gradient_norm
 
@@ -196,7 +196,7 @@ class Strategy(TrainRunner):
             self.options.max_keep_ckpts,
             self.progress.best_step,
         )
-        if not self._saver.beside:
+        if not self._saver.background:
             self.settle_saves()
         return path
 

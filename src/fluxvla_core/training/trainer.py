@@ -77,7 +77,7 @@ class Trainer:
         if world.first:
             reported = run.progress.step - (run.progress.unvalidated is not None)
             run.metric.start(reported, context.config)
-        self._window = StepMetrics(world, getattr(dataset, "parts", {}))
+        self._window = StepMetrics(world, Dataset.adapt(dataset).parts)
         sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
         loader = make_loader(
             loader_source(dataset, run.collator, world.device),
@@ -101,18 +101,20 @@ class Trainer:
         Returns:
             The signal that asked for a stop, 0 if none did.
         """
-        run, stopped = self._run, self._catch_up()
-        if not (stopped or finished() or self._stops_early()):
+        run, every = self._run, self._run.options.log_iter_interval
+        stopped = self._catch_up()
+        over = stopped or finished() or self._stops_early()
+        if not over:
             self._look_ahead()
         self._window.restart_clock()
-        while not (stopped or finished() or self._stops_early()):
+        while not over:
             step = run.progress.step + 1
             run.hooks.call("before_step", step=step)
             self._step(step)
-            stopped = self._stop.wanted(step)
-            save = due() or finished()
-            validate = self._validates(save, finished())
-            log = step == 1 or step % run.options.log_iter_interval == 0
+            stopped, last = self._stop.wanted(step), finished()
+            save = due() or last
+            validate = self._validates(save, last)
+            log = step == 1 or step % every == 0
             if log or save or stopped or validate:
                 records, better = self._fetch(), False
                 if validate and not stopped:
@@ -127,6 +129,7 @@ class Trainer:
                 self.save()
             elif self._stop.due(step):
                 run.settle_saves(wait=False)
+            over = stopped or last or self._stops_early()
         return stopped
 
     def _step(self, step: int) -> None:
@@ -212,7 +215,7 @@ class Trainer:
         self._batches = chain([first], self._batches)
         shown = to_device(first, run.world.device)
         if run.flops is not None and run._arguments is not None:
-            trouble = run.flops.look(run._arguments(shown))
+            trouble = run.flops.count(run._arguments(shown))
             if trouble is not None and run.world.first:
                 run.context.reporter.warn(f"mfu is not reported: {trouble}")
         run.warm_up(shown)

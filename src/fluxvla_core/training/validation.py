@@ -147,8 +147,7 @@ def share_statistics(train: Any, val: Any) -> None:
     Raises:
         ConfigError: it is of a robot for which the training data have no statistics.
     """
-    parts = getattr(val, "datasets", None)
-    for dataset in parts if isinstance(parts, list) else [val]:
+    for dataset in Dataset.adapt(val).datasets or [val]:
         if not implements(dataset, Dataset, "use_statistics"):
             continue
         name = dataset.statistic_name

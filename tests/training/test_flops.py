@@ -80,8 +80,8 @@ def test_without_a_known_peak_there_is_nothing_to_tell():
 def test_the_share():
     meter = Meter.of(TinyVLA(), torch.device("cpu"), None, 2.0)
     assert meter.mfu(1, 1.0) is None
-    assert meter.look(batch()) is None
-    assert meter.look(batch()) is None
+    assert meter.count(batch()) is None
+    assert meter.count(batch()) is None
     assert meter.mfu(3, 0.5) == pytest.approx(meter.per_batch * 3 / 0.5 / 2e12)
     assert meter.mfu(3, 0.0) is None
 

@@ -55,7 +55,7 @@ def test_a_tensor_that_the_model_needs_and_does_not_get_is_refused():
 @pytest.mark.parametrize("output", [None, {}, {"loss": 1.0}, {"loss": torch.zeros(2)}])
 def test_a_model_without_a_scalar_loss_is_refused(output):
     with pytest.raises(ConfigError, match=r"Model\.forward must return a mapping with a scalar"):
-        loss_of(output, Model())
+        loss_of(output, "Model")
 
 
 def test_to_device_leaves_lists_alone():

@@ -19,7 +19,6 @@ and a robot that reads an embodiment use the same door as the trainer.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,8 +27,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from annotated_types import Ge
 
 from fluxvla_core.bounds import Count, Positive
+from fluxvla_core.checkpoints.manifest import (
+    FOLDER,
+    FileEntry,
+    Manifest,
+    hash_file,
+    read_manifest,
+    step_name,
+)
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file, read_manifest
+from fluxvla_core.checkpoints.manifest import step_of as step_of
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.untrusted import parse_json, read_bytes
 
@@ -39,7 +46,6 @@ if TYPE_CHECKING:
     from fluxvla_core.checkpoints.parts import Stored
     from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-FOLDER = "checkpoints"
 MODEL = "model.safetensors"
 EMA = "ema.safetensors"
 OPTIMIZER = "optimizer.safetensors"
@@ -56,18 +62,6 @@ PROCESSORS = "processors"
 
 _CHANGED = "it was changed, or the disk lost a part of it, after it was saved"
 _UNREADABLE = "its permissions, or a disk or mount that fails"
-_STEP = re.compile(r"step-(\d{9,})")
-
-
-def step_name(step: int) -> str:
-    """Folder name of a step's checkpoint; sorts by step."""
-    return f"step-{step:09d}"
-
-
-def step_of(path: Path) -> int | None:
-    """The step in a checkpoint folder's name; None for any other name."""
-    match = _STEP.fullmatch(path.name)
-    return int(match[1]) if match else None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import os
 import tempfile
 from pathlib import Path
 
-from fluxvla_core.checkpoints.checkpoint import FOLDER, folders, step_name, step_of
+from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.checkpoints.manifest import FOLDER, step_name, step_of
 from fluxvla_core.checkpoints.writer import PARTIAL, Disk, free_name
 from fluxvla_core.errors import UsageError
 

@@ -1,4 +1,4 @@
-"""The list of a checkpoint's files with their sizes and SHA-256 sums, which makes it a whole.
+"""A checkpoint folder's name, and the list of its files with their sizes and SHA-256 sums.
 
 A folder without a readable manifest is no checkpoint. The manifest carries a sum of itself, so
 that a flipped bit in it is not taken for damage of the file that it describes.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,25 @@ from fluxvla_core.bounds import Count
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.untrusted import parse_json, read_bytes
 
+FOLDER = "checkpoints"
+"""In a work dir, with all of its checkpoints."""
 NAME = "manifest.json"
 FORMAT = "fluxvla-checkpoint-1"
 _BLOCK = 1 << 20
 _LARGEST = 16 << 20  # bytes: 100,000 files, of which 1,000 ranks write fewer than 3,000
 _CHANGED = "it was changed, or the disk lost a part of it, after it was saved"
+_STEP = re.compile(r"step-(\d{9,})")
+
+
+def step_name(step: int) -> str:
+    """Folder name of a step's checkpoint; sorts by step."""
+    return f"step-{step:09d}"
+
+
+def step_of(path: Path) -> int | None:
+    """The step in a checkpoint folder's name; None for any other name."""
+    match = _STEP.fullmatch(path.name)
+    return int(match[1]) if match else None
 
 
 @dataclass(frozen=True)

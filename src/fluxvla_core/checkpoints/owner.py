@@ -1,4 +1,4 @@
-"""Whose a work dir is: one training at a time writes its checkpoints.
+"""The lock of a work dir: one training at a time writes its checkpoints.
 
 The lock is the system's record lock on a file (POSIX ``fcntl``). It ends with its process, however
 that ends, is not passed on to forked loader workers as one of ``flock`` would be, and holds between
@@ -104,7 +104,7 @@ def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
     """Keep other trainings out of ``work_dir``, which must exist, until the claim is closed.
 
     Args:
-        warn: is told if the file system has no locks; the claim then keeps nobody out.
+        warn: called if the file system has no locks; the claim then keeps nobody out.
 
     Raises:
         UsageError: another process has it; says which.
@@ -138,7 +138,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _path_of(descriptor: int) -> Path | None:
-    """Where an open folder is now, if the system tells (Linux); None if it was removed."""
+    """Where an open folder is now, if the system says (Linux); None if it was removed."""
     try:
         found = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
     except OSError:

@@ -20,9 +20,8 @@ from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
 from fluxvla_core.atomic import FULL
-from fluxvla_core.checkpoints.checkpoint import FOLDER, step_name
+from fluxvla_core.checkpoints.manifest import FOLDER, FileEntry, Manifest, hash_file, step_name
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, hash_file
 from fluxvla_core.errors import RunFailed
 
 _RESUME = "run the same command with --resume auto; the checkpoints before it are as they were"
@@ -104,8 +103,8 @@ class CheckpointWriter:
     def refuse(self, error: Exception) -> None:
         """Let :meth:`commit` fail with ``error``, unless something before it failed."""
         if self._error is None:
-            told = OSError(f"{type(error).__name__}: {error}")
-            self._error = error if isinstance(error, OSError) else told
+            described = OSError(f"{type(error).__name__}: {error}")
+            self._error = error if isinstance(error, OSError) else described
 
     @contextmanager
     def open(self, name: str) -> Iterator[HashedFile]:

@@ -1,12 +1,13 @@
 """The contracts of what trains: model, dataset, transform, collator, tokenizer, metric, optimizer.
 
-Nothing here imports torch: ``VLA`` is inherited beside ``torch.nn.Module``.
+Nothing here imports torch: ``VLA`` is inherited together with ``torch.nn.Module``.
 """
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute
@@ -25,6 +26,19 @@ class VLA(Contract):
     ``predict_action(...)``, to act.
     """
 
+    forward: Callable[..., Any]
+
+    def batch_keys(self) -> Mapping[str, bool] | None:
+        """Keys of a batch that ``forward`` takes, and whether each must be there; None takes all.
+
+        By default the parameters of ``forward``; those without a default must be there.
+        """
+        parameters = inspect.signature(self.forward).parameters.values()
+        if any(p.kind is p.VAR_KEYWORD for p in parameters):
+            return None
+        named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        return {p.name: p.default is p.empty for p in named}
+
     @attribute
     def action_shape(self) -> tuple[int, int] | None:
         """``(horizon, dim)`` of a chunk; None where the dataset says how long one is."""
@@ -32,14 +46,26 @@ class VLA(Contract):
 
     @attribute
     def static_graph(self) -> bool:
-        """Whether every step uses the same parameters, which DDP may then rely on."""
+        """Whether every step uses the same parameters in the same order, as DDP may rely on."""
         return False
+
+    @attribute
+    def frozen_source(self) -> str | None:
+        """Where the frozen weights come from when the model is built (a package, a file).
+
+        They are not saved in checkpoints, only their hash. None: they are saved. Any module inside
+        the model may have this attribute for its own frozen weights.
+        """
+        return None
 
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.
 
-        Each is a module whose ``forward`` is what the model calls, or a tuple of modules that are
-        used together and whose weights are gathered together.
+        Each module's ``forward`` must be what the model calls, because that is where sharded
+        weights are gathered and released. Modules that are used together, such as layer ``i`` of a
+        vision-language model and layer ``i`` of the action expert that attends to it (a mixture of
+        transformers), stand in a tuple: they are gathered in one operation before the first of
+        them runs and released after the last.
         """
         return []
 
@@ -56,6 +82,11 @@ class Dataset(Contract):
     """
 
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
+
+    seed: Any = None
+    """What its samples draw by, a whole number; None if unknown."""
+    datasets: Sequence[Any] = ()
+    """The datasets that a mixture is made of."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -91,6 +122,11 @@ class Dataset(Contract):
     @attribute
     def statistics(self) -> Mapping[str, Any]:
         """``statistic_name`` -> what states and actions are normalised by; for checkpoints."""
+        return {}
+
+    @attribute
+    def parts(self) -> Mapping[str, int]:
+        """Of a mixture: name of each dataset -> how many sample ids it has, in their order."""
         return {}
 
     @attribute

@@ -22,11 +22,11 @@ from typing import Any, ClassVar
 import torch
 
 from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.testing.training import (
     SCALARS,
     checkpoint_differences,
     differences,
-    refusal,
     run_ranks,
     tiny_config,
     train,
@@ -165,6 +165,20 @@ class TrainRunnerConformance:
             assert self.start(run) == [0] * self.ranks
             saved = Checkpoint.open(folders(tmp_path / "trained")[-1]).tensors(MODEL)
             assert saved["gain"].shape == ()
+
+
+def refusal(settings: Mapping[str, Any]) -> None:
+    """One run that is refused for its config; writes what it says to ``refused.txt``.
+
+    Raises:
+        AssertionError: it trains.
+    """
+    try:
+        train(settings)
+    except ConfigError as error:
+        (Path(settings["work_dir"]) / "refused.txt").write_text(str(error))
+        return
+    raise AssertionError("the config was not refused")
 
 
 def _loss_gap(a: Path, b: Path) -> float:

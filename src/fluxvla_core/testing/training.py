@@ -30,7 +30,6 @@ from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.sampler import sample_rng
-from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 from fluxvla_core.training import stop
@@ -303,20 +302,6 @@ def train_all(*runs: Mapping[str, Any]) -> None:
         torch.distributed.init_process_group("gloo")
     for settings in runs:
         train(settings)
-
-
-def refusal(settings: Mapping[str, Any]) -> None:
-    """One run that is refused for its config; writes what it says to ``refused.txt``.
-
-    Raises:
-        AssertionError: it trains.
-    """
-    try:
-        train(settings)
-    except ConfigError as error:
-        (Path(settings["work_dir"]) / "refused.txt").write_text(str(error))
-        return
-    raise AssertionError("the config was not refused")
 
 
 class SignallingCollator(DictCollator):

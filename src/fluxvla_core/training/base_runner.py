@@ -1,16 +1,14 @@
-"""``BaseTrainRunner``: trains on one process, and is what every strategy builds on.
+"""``BaseTrainRunner``: a training run from its config to its end; trains on one process.
 
-The loop itself is in ``trainer.py``, the settings in ``options.py``. A strategy overrides
-:meth:`BaseTrainRunner._wrap_model` and, where it must, ``unwrap_model``, ``sync_gradients``,
-``backward``, ``optimizer_step``, ``clip_grad_norm`` and how tensors are saved and loaded. Nothing
-here imports torch before it is used: a config is checked without it.
+``strategy.py`` has the methods that training strategies override, ``trainer.py`` the loop,
+``options.py`` the settings. Nothing here imports torch before it is used: a config is checked
+without it.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,30 +20,18 @@ from fluxvla_core.build import (
     build_tokenizer_from_cfg,
     build_vla_from_cfg,
 )
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.training.options import LoaderOptions, TrainOptions
+from fluxvla_core.training.strategy import Strategy
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor, nn
+    from torch import nn
 
-    from fluxvla_core.checkpoints.checkpoint import Checkpoint
-    from fluxvla_core.checkpoints.owner import Claim
-    from fluxvla_core.checkpoints.parts import Stored
-    from fluxvla_core.data.sampler import EpisodeShards
-    from fluxvla_core.training.batches import StepPlan
-    from fluxvla_core.training.distributed import World
-    from fluxvla_core.training.ema import Ema
-    from fluxvla_core.training.flops import Meter
-    from fluxvla_core.training.model import ForwardArguments
-    from fluxvla_core.training.saving import Saver
-    from fluxvla_core.training.state import Progress
     from fluxvla_core.training.trainer import Trainer
-    from fluxvla_core.training.weights import LeftOut
 
 
-class BaseTrainRunner:
+class BaseTrainRunner(Strategy):
     """The training loop with everything around it; works as it is on one process.
 
     Called as ``run_setup(n_train_examples)`` and then ``run(dataset)``. Batch size and loader
@@ -58,7 +44,7 @@ class BaseTrainRunner:
         options: the settings, by the fields of ``TrainOptions``.
 
     Raises:
-        ConfigError: a setting that cannot be meant, with its place.
+        ConfigError: an invalid setting, with its place.
     """
 
     api: ClassVar[str] = "1.0"
@@ -67,27 +53,7 @@ class BaseTrainRunner:
     needs_process_group: ClassVar[bool] = False
     """Whether the strategy needs torch's process group on a single process too."""
 
-    # Known from run_setup on.
-    vla: Any = None
-    optimizer: Any = None
-    lr_scheduler: Any = None
-    flops: Meter | None = None
-    adapter_base: str | None = None
-    left_out: LeftOut | None = None
-    # Known inside run().
-    dataset: Any = None
-    plan: StepPlan
-    progress: Progress
-    ema: Ema | None = None
-    sample_losses: Tensor | None = None
-    late_stop: int = 0
-    """The signal that asked for a stop when training was complete: nothing new is to begin."""
-    _world: World | None = None
-    _claim: Claim | None = None
-    _checkpoint: Checkpoint | None = None
-    _arguments: ForwardArguments | None = None
     _trainer: Trainer | None = None
-    _saver: Saver | None = None
 
     def __init__(
         self,
@@ -137,11 +103,53 @@ class BaseTrainRunner:
                 ran out; a work dir that was removed, or replaced by another.
             CheckpointError, ConfigError, DataError: the inputs do not fit.
         """
-        from fluxvla_core.training.trainer import train
+        from fluxvla_core.training import distributed, memory
+        from fluxvla_core.training.state import Progress
+        from fluxvla_core.training.stop import StopRequest, stopped
+        from fluxvla_core.training.trainer import Trainer
 
-        return train(self, vla_dataset)
+        self._prepare()
+        self.progress = Progress()
+        outcome = "failed"
+        try:
+            with StopRequest(self.world, self.check_work_dir) as stop:
+                self._trainer = Trainer(self, vla_dataset, stop)
+                signal = (
+                    self._run_epoch_based() if self.max_steps is None else self._run_step_based()
+                )
+                self._trainer.save()
+                self.settle_saves()
+                self.late_stop = stop.asked()
+            outcome = "interrupted" if signal else "ok"
+        except (RuntimeError, MemoryError, OSError, RunFailed) as error:
+            self.check_work_dir()
+            if isinstance(error, RunFailed):
+                raise
+            step = self.progress.step + 1
+            known = memory.explain(error, step) or distributed.explain(error, self.world, step)
+            if known is None:
+                raise
+            raise known from error
+        finally:
+            self._close(outcome)
+        if signal:
+            raise stopped(signal, f"step {self.progress.step} in {self.context.work_dir}")
+        return self.context.work_dir
 
-    # What a strategy may override.
+    def _close(self, outcome: str) -> None:
+        """End what the run has started, whatever ended it."""
+        from fluxvla_core.training import distributed
+
+        if self._trainer is not None:
+            self._trainer.close()
+        if self._saver is not None:
+            self._saver.close()
+        if self.world.first:
+            self.metric.finalize()
+        self.hooks.call("run_finished", outcome=outcome)
+        if self._claim is not None:
+            self._claim.close()
+        distributed.stop(self.world, failed=outcome == "failed")
 
     def run_setup(self, n_train_examples: int) -> None:
         """Build and wrap the model, its optimizer and its schedule.
@@ -182,34 +190,6 @@ class BaseTrainRunner:
             compile_units(vla)
         return vla
 
-    def _wrap_model(self, vla: nn.Module) -> nn.Module:
-        """Put the model where it trains; a strategy splits or replicates it here.
-
-        Raises:
-            ConfigError: there are several processes, which this class does not keep together.
-        """
-        if self.world.size > 1:
-            raise ConfigError(
-                f"{type(self).__name__} trains on one process, and there are {self.world.size}",
-                where=self.context.where(f"{self.context.section}.type"),
-                next="use DDPTrainRunner or FSDPTrainRunner, or override _wrap_model",
-            )
-        return vla.to(self.world.device)
-
-    def unwrap_model(self, vla: nn.Module) -> nn.Module:
-        """The model inside what ``_wrap_model`` returned, with the names that are saved."""
-        from torch.nn.parallel import DistributedDataParallel
-
-        return vla.module if isinstance(vla, DistributedDataParallel) else vla
-
-    def _build_optimizer(self) -> torch.optim.Optimizer:
-        """The config's ``optimizer``, with weight decay on matrices only."""
-        from fluxvla_core.training.optim import decay_groups
-
-        groups = decay_groups(self.model, self.weight_decay)
-        built: torch.optim.Optimizer = self.optimizer_settings.build(groups, self.learning_rate)
-        return built
-
     def _build_lr_scheduler(self, n_train_examples: int) -> Any:
         """The schedule over all steps of the run; has ``step`` and a JSON ``state_dict``."""
         from fluxvla_core.training.optim import ScheduledLR
@@ -224,159 +204,6 @@ class BaseTrainRunner:
             options.lr_schedule,
         )
         return ScheduledLR(self.optimizer, schedule, options.learning_rate)
-
-    def _training_step(self, batch: dict[str, Any]) -> Tensor:
-        """Forward pass of one batch on the device: its loss, a scalar with a gradient."""
-        from fluxvla_core.training.model import autocast, loss_of, sample_losses_of
-
-        if self._arguments is None:
-            raise RuntimeError("a batch's arguments are known inside run() only")
-        with autocast(self.world.device, self.compute_dtype):
-            output = self.vla(**self._arguments(batch))
-        self.sample_losses = sample_losses_of(output)
-        return loss_of(output, self.model)
-
-    def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
-        """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
-        return nullcontext()
-
-    def backward(self, loss: Tensor) -> None:
-        """Backward pass of one batch; ``loss`` is divided by the number of batches already."""
-        loss.backward()  # type: ignore[no-untyped-call]
-
-    def optimizer_step(self) -> Tensor | None:
-        """Clip, and let the optimizer step; the gradients' norm before, on the device.
-
-        Where ``clip_grad_norm`` tells none it is the norm of what the optimizer uses: gradients
-        that are not finite must not go unseen.
-        """
-        from fluxvla_core.training.optim import gradient_norm
-
-        norm = self.clip_grad_norm()
-        if norm is None:
-            norm = gradient_norm(self._optimized())
-        self.optimizer.step()
-        return norm
-
-    def warm_up(self, batch: dict[str, Any]) -> None:
-        """Called with the first batch, before the first step; must leave no trace."""
-
-    def clip_grad_norm(self) -> Tensor | None:
-        """Scale the gradients down to ``max_grad_norm``; their norm before, on the device.
-
-        None says nothing of the norm, as where there is no ``max_grad_norm``.
-        """
-        from fluxvla_core.training.optim import clip_
-
-        return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
-
-    def _optimized(self) -> list[nn.Parameter]:
-        return [p for group in self.optimizer.param_groups for p in group["params"]]
-
-    def save_checkpoint(
-        self,
-        run_dir: Path,
-        global_step: int,
-        epoch: int,
-        train_loss: float | None = None,
-        only_trainable: bool = True,
-    ) -> Path | None:
-        """Begin to save ``run_dir/checkpoints/step-…``; called on every rank.
-
-        With ``async_save`` it is there, and known to be, after :meth:`settle_saves`.
-
-        Args:
-            run_dir: the work dir.
-            global_step: optimizer steps done.
-            epoch: whole epochs done.
-            train_loss: of the last step.
-            only_trainable: leave out frozen weights whose module names their ``frozen_source``.
-
-        Raises:
-            RunFailed: it cannot be written; the earlier ones are as they were.
-        """
-        from fluxvla_core.training.saving import Saver, save_snapshot, take_snapshot
-
-        if self._saver is None:
-            self._saver = Saver(self.world, False)
-        path = save_snapshot(
-            self._saver,
-            Path(run_dir),
-            global_step,
-            epoch,
-            take_snapshot(self, train_loss, only_trainable),
-            self.options.max_keep_ckpts,
-            self.progress.best_step,
-        )
-        if not self._saver.beside:
-            self.settle_saves()
-        return path
-
-    def settle_saves(self, wait: bool = True) -> None:
-        """Learn what became of the checkpoint that is being written; called on every rank.
-
-        Args:
-            wait: for its end; otherwise nothing happens while some rank still writes.
-
-        Raises:
-            RunFailed: it could not be written; the earlier ones are as they were.
-        """
-        saved = self._saver.settle(wait) if self._saver is not None else None
-        if saved is None or not self.world.first:
-            return
-        from fluxvla_core.checkpoints.directory import name_best
-
-        for warning in saved.warnings:
-            self.context.reporter.warn(warning)
-        if saved.step == self.progress.best_step:
-            name_best(saved.path.parent.parent, saved.step)
-        self.context.reporter.artifact("checkpoint", saved.path)
-        self.hooks.call("checkpoint_saved", path=saved.path, step=saved.step)
-
-    def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
-        """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
-        from fluxvla_core.training.weights import put_model_tensors
-
-        put_model_tensors(self.model, state)
-
-    def _load_optimizer_state(self, state: dict[str, Any]) -> bool:
-        """Take an optimizer's state in the form of its ``state_dict``; whether it was taken."""
-        self.optimizer.load_state_dict(state)
-        return True
-
-    def model_tensors(self) -> Mapping[str, Tensor]:
-        """Weights and buffers by name, to be saved; parts of them where they are sharded."""
-        from fluxvla_core.training.weights import model_tensors
-
-        return model_tensors(self.model)
-
-    def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-        """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""
-        from fluxvla_core.training.optim import named_state
-
-        return named_state(self.model, self.optimizer)
-
-    def load_optimizer_tensors(
-        self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
-    ) -> bool:
-        """The inverse of :meth:`optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
-        from fluxvla_core.training.optim import torch_state
-
-        state = torch_state(self.model, self.optimizer, tensors, described, where)
-        return self._load_optimizer_state(state)
-
-    def resume(self) -> int:
-        """Resume from the chosen checkpoint; the step it was saved at, 0 for a fresh start.
-
-        Raises:
-            CheckpointError: it is of another model, optimizer, dataset or seed.
-        """
-        from fluxvla_core.training.resuming import restore
-
-        if self._checkpoint is None:
-            return 0
-        restore(self, self._checkpoint)
-        return self.progress.step
 
     def _run_epoch_based(self) -> int:
         """Steps until ``max_epochs`` are done; the signal that ended them early, or 0."""
@@ -394,54 +221,12 @@ class BaseTrainRunner:
         steps = self.max_steps or 0
         return self.trainer.run(lambda: self.progress.step >= steps, self._steps_due)
 
-    # What the run knows of itself.
-
-    @property
-    def world(self) -> World:
-        """This process among those that train; known from ``_build_vla`` on."""
-        if self._world is None:
-            raise RuntimeError("the world is known from _build_vla on")
-        return self._world
-
     @property
     def trainer(self) -> Trainer:
         """The loop of the present ``run``."""
         if self._trainer is None:
             raise RuntimeError("there is a trainer only inside run()")
         return self._trainer
-
-    @property
-    def model(self) -> nn.Module:
-        """The model without what trains it around it."""
-        return self.unwrap_model(self.vla)
-
-    @property
-    def compute_dtype(self) -> torch.dtype | None:
-        """What the forward pass computes in; None for the weights' own fp32."""
-        from fluxvla_core.training.model import compute_dtype
-
-        options = self.options
-        return compute_dtype(options.enable_mixed_precision_training, options.mixed_precision_dtype)
-
-    @property
-    def total_steps(self) -> int:
-        """Optimizer steps of the whole run: those done, which may have been of another size, and
-        those left."""
-        done, cursor = self.progress.step, self.progress.cursor
-        return done + self.plan.run_steps_left(done, cursor, self.max_steps, self.max_epochs)
-
-    def plan_steps(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
-        """How epochs of so many samples are cut into steps."""
-        from fluxvla_core.training.batches import StepPlan
-
-        return StepPlan(
-            samples,
-            self.loader_options.per_device_batch_size,
-            self.options.grad_accumulation_steps,
-            self.world.size,
-            self.options.seed,
-            shards,
-        )
 
     def _steps_due(self) -> bool:
         every = self.options.save_steps

@@ -1,4 +1,5 @@
-"""The batches of a run: which samples each optimizer step uses on this rank, and their way there.
+"""The batches of a run: which samples each optimizer step uses on this rank, and moving them to
+the device.
 
 A step uses ``per_device_batch_size * accumulation * world`` consecutive samples of the epoch's
 order, whatever they are split into: a run of eight processes, a run of one with eight-fold
@@ -57,6 +58,21 @@ class StepPlan:
     def step_samples(self) -> int:
         """Samples that all ranks together use in one step."""
         return self.batch_size * self.accumulation * self.world
+
+    @property
+    def shuffle_episodes(self) -> int | None:
+        """Episodes that are mixed at a time; None where all samples are."""
+        return self.shards.together if self.shards is not None else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``trainer.json`` says of it, as JSON values."""
+        return {
+            "seed": self.seed,
+            "n_train_examples": self.length,
+            "step_samples": self.step_samples,
+            "world_size": self.world,
+            "shuffle_episodes": self.shuffle_episodes,
+        }
 
     @property
     def steps_per_epoch(self) -> int:

@@ -1,4 +1,4 @@
-"""The processes that train together: who is here, what they agree on, how they part.
+"""The process group of a training: ranks and devices, values that ranks exchange, and its end.
 
 Tensors of the model travel over NCCL on GPUs and gloo on CPUs. Everything small that the host
 decides with (a stop, an error, a path) travels over a gloo group of its own, so that it never
@@ -222,13 +222,15 @@ def on_first(world: World, work: Callable[[], str]) -> str:
             failure = error
             fields = [error.what, error.where, error.cause, error.next]
             answer = json.dumps({"error": type(error).__name__, "fields": fields})
-    told = json.loads(share_text(world, answer))
+    reply = json.loads(share_text(world, answer))
     if failure is not None:
         raise failure
-    if "error" in told:
-        what, where, cause, advice = told["fields"]
-        raise getattr(errors, told["error"], FluxError)(what, where=where, cause=cause, next=advice)
-    return str(told["answer"])
+    if "error" in reply:
+        what, where, cause, advice = reply["fields"]
+        raise getattr(errors, reply["error"], FluxError)(
+            what, where=where, cause=cause, next=advice
+        )
+    return str(reply["answer"])
 
 
 def share_buffers(world: World, model: nn.Module) -> None:

@@ -65,14 +65,14 @@ def training_flops(skeleton: nn.Module, arguments: Mapping[str, Any]) -> int:
     drawn = rng_state()
     try:
         with FlopCounterMode(display=False) as counter:
-            torch.autograd.backward(loss_of(skeleton(**bare), skeleton))
+            torch.autograd.backward(loss_of(skeleton(**bare), type(skeleton).__name__))
     finally:
         set_rng_state(drawn)
     return int(counter.get_total_flops())
 
 
 class Meter:
-    """Tells the MFU of steps, once it has seen a batch.
+    """Computes the MFU of steps, once it has counted the operations of a batch.
 
     Args:
         skeleton: the model as :func:`on_meta` gives it.
@@ -97,7 +97,7 @@ class Meter:
             peak_tflops = known_peak(torch.cuda.get_device_name(device), dtype)
         return None if peak_tflops is None else cls(on_meta(model), peak_tflops)
 
-    def look(self, arguments: Mapping[str, Any]) -> str | None:
+    def count(self, arguments: Mapping[str, Any]) -> str | None:
         """Count with the arguments of one batch; why that cannot be done, None if it can.
 
         A model that decides by the values of its inputs cannot run without memory.

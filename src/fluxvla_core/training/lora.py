@@ -65,7 +65,7 @@ class LoraOptions:
         """Take and check the table.
 
         Raises:
-            ConfigError: unknown or missing keys, or values that cannot be meant.
+            ConfigError: unknown or missing keys, or invalid values.
         """
         known = [field.name for field in fields(cls)]
         if not isinstance(table, Mapping):
@@ -165,7 +165,7 @@ def attach(
 
     _check_found(model, options, where)
     if not trained:
-        _check_told_apart(model, options.modules_to_save, where)
+        _check_unambiguous(model, options.modules_to_save, where)
     settings = {k: v for k, v in options.for_peft().items() if k != "inference_mode"}
     tied = _tied(model)
     try:
@@ -176,7 +176,7 @@ def attach(
         raise ConfigError(
             f"lora.{key}: {str(error).splitlines()[0]}",
             where=where,
-            next=f"the model has {_some(model)}",
+            next=f"the model has {_leaf_names(model)}",
         ) from error
     _check_untied(model, tied, where)
 
@@ -192,38 +192,38 @@ def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> N
                 raise ConfigError(
                     f"lora.{key}: no module's name ends in {end!r}",
                     where=where,
-                    next=f"the model has {_some(model)}",
+                    next=f"the model has {_leaf_names(model)}",
                 )
 
 
-def _check_told_apart(model: nn.Module, saved: Sequence[str], where: str | None) -> None:
+def _check_unambiguous(model: nn.Module, saved: Sequence[str], where: str | None) -> None:
     # peft takes any module whose name ends so, also in the middle of a part, and its own ones.
     names = [name for name, _ in model.named_modules(remove_duplicate=False)]
     for end in saved:
-        others = [n for n in _hit_too(names, end) if not any(_ends(n, meant) for meant in saved)]
+        others = [n for n in _also_hit(names, end) if not any(_ends(n, meant) for meant in saved)]
         if others:
             too = ", or name those too" if set(others) <= set(names) else ""
             raise ConfigError(
                 f"lora.modules_to_save: {end!r} would also hit {_listed(others)}",
                 where=where,
                 cause="peft trains every module whose name ends in these letters",
-                next=_instead(names, end) + too,
+                next=_longer_names(names, end) + too,
             )
 
 
-def _hit_too(names: Iterable[str], end: str) -> list[str]:
+def _also_hit(names: Iterable[str], end: str) -> list[str]:
     """Modules that peft takes for ``end`` though it is no whole part of their names."""
     pefts = (f"peft's own {name}" for name in _PEFTS if name.endswith(end))
     return [*(n for n in names if n.endswith(end) and not _ends(n, end)), *pefts]
 
 
-def _instead(names: Sequence[str], end: str) -> str:
+def _longer_names(names: Sequence[str], end: str) -> str:
     """What to write for ``end``: as much of each name as no other module's name ends in."""
     telling: list[str] = []
     for name in (n for n in names if _ends(n, end)):
         parts = name.split(".")
         tails = (".".join(parts[i:]) for i in reversed(range(len(parts))))
-        tail = next((tail for tail in tails if not _hit_too(names, tail)), None)
+        tail = next((tail for tail in tails if not _also_hit(names, tail)), None)
         if tail is None:
             return f"no name tells {name!r} apart: give it another one in the model"
         telling.append(repr(tail))
@@ -285,7 +285,7 @@ def adapter_tensors(model: nn.Module, checkpoint: Checkpoint) -> dict[str, Tenso
 
 
 def merge_(model: nn.Module) -> None:
-    """Add the adapters to the layers that they stand beside, in place; none leaves no trace.
+    """Merge the adapters into their layers, in place; without any nothing changes.
 
     The model then has the names, the classes and the size that it had before :func:`attach`.
     """
@@ -312,7 +312,7 @@ def _peft_name(name: str) -> str:
     )
 
 
-def _some(model: nn.Module) -> str:
+def _leaf_names(model: nn.Module) -> str:
     leaves = [n for n, m in model.named_modules() if n and not any(True for _ in m.children())]
     return _listed(leaves)
 

@@ -1,4 +1,4 @@
-"""How much memory training took, and what to say when there was not enough."""
+"""Peak memory, and messages for errors of a GPU, a host or data workers out of memory."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
         advice = _LESS_HOST
     return RunFailed(
         f"{what} out of memory{when}",
-        cause=_telling(text),
+        cause=_telling_line(text),
         next=f"{advice}; {_GO_ON}",
     )
 
@@ -86,7 +86,7 @@ def _of_host(error: BaseException, lower: str) -> bool:
     return refused or said or isinstance(error, MemoryError)
 
 
-def _telling(text: str) -> str | None:
+def _telling_line(text: str) -> str | None:
     """The line of an error that says what there was no room for: a worker's ends with it."""
     lines = text.splitlines()
     found = [line for line in lines if any(s in line.lower() for s in (*_DEVICE, *_HOST))]

@@ -1,4 +1,4 @@
-"""The numbers of a training run: kept, averaged, and handed to trackers."""
+"""``VLAMetric``: averages the numbers of each training step and hands them to trackers."""
 
 from __future__ import annotations
 

@@ -1,22 +1,7 @@
-"""What training reads of a model: what it declares of itself, its forward arguments and its loss.
-
-A model may declare, as methods or attributes that need no base class:
-
-- ``fsdp_units() -> list[Module | tuple[Module, ...]]``: the blocks that are sharded, recomputed and
-  compiled one by one. Each module's ``forward`` must be what the model calls, because that is where
-  sharded weights are gathered and released. Modules that are used together, such as layer ``i`` of
-  a vision-language model and layer ``i`` of the action expert that attends to it (a mixture of
-  transformers), stand in a tuple: they are gathered in one operation before the first of them runs
-  and released after the last.
-- ``frozen_source`` of a module: where its frozen weights come from when it is built (a package, a
-  file); they are not saved in checkpoints.
-- ``action_shape``: ``(T, D)`` of a chunk of actions.
-- ``static_graph``: whether every step uses the same parameters in the same order.
-"""
+"""What training does with a model: its blocks, its forward arguments and its loss."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -126,7 +111,7 @@ def autocast(device: torch.device, dtype: torch.dtype | None) -> AbstractContext
 
 
 class ForwardArguments:
-    """Chooses, from a batch, the arguments of ``model.forward``.
+    """Chooses, from a batch, the arguments of ``model.forward``: see ``VLA.batch_keys``.
 
     Lists (``meta_keys``) and ``sample_ids`` that the model does not take are left out; a tensor
     that it does not take is an error, because a mask under a wrong name would train silently
@@ -138,12 +123,11 @@ class ForwardArguments:
 
     def __init__(self, model: nn.Module, where: str | None = None) -> None:
         self._where = where
-        parameters = inspect.signature(model.forward).parameters.values()
-        self._model = type(model).__name__
-        self._any = any(p.kind is p.VAR_KEYWORD for p in parameters)
-        named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-        self._taken = {p.name for p in named}
-        self._needed = {p.name for p in named if p.default is p.empty}
+        self.model_name = type(model).__name__
+        keys = VLA.adapt(model).batch_keys()
+        self._any = keys is None
+        self._taken = frozenset(keys or ())
+        self._needed = {key for key, needed in (keys or {}).items() if needed}
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         if self._any:
@@ -151,7 +135,7 @@ class ForwardArguments:
         if not self._needed <= batch.keys():
             missing = sorted(self._needed - batch.keys())
             raise ConfigError(
-                f"{self._model}.forward needs {', '.join(map(repr, missing))}, which the batch "
+                f"{self.model_name}.forward needs {', '.join(map(repr, missing))}, which the batch "
                 f"does not have; it has {', '.join(sorted(batch))}",
                 where=self._where,
                 next="let a transform of the dataset make it, and list it in the collator's keys",
@@ -166,7 +150,7 @@ class ForwardArguments:
         )
         if extra:
             raise ConfigError(
-                f"{self._model}.forward takes no {', '.join(map(repr, extra))}; "
+                f"{self.model_name}.forward takes no {', '.join(map(repr, extra))}; "
                 f"it takes {', '.join(sorted(self._taken))}",
                 where=self._where,
                 next="move what only describes from the collator's keys to meta_keys",
@@ -174,21 +158,19 @@ class ForwardArguments:
         return taken
 
 
-def loss_of(output: Any, model: nn.Module) -> Tensor:
-    """The scalar ``output["loss"]``.
+def loss_of(output: Any, model_name: str) -> Tensor:
+    """The scalar ``output["loss"]`` of a model of class ``model_name``.
 
     Raises:
         ConfigError: the model returned something else.
     """
     loss = output.get("loss") if isinstance(output, Mapping) else None
     if not (isinstance(loss, Tensor) and loss.ndim == 0):
-        raise ConfigError(
-            f"{type(model).__name__}.forward must return a mapping with a scalar tensor 'loss'"
-        )
+        raise ConfigError(f"{model_name}.forward must return a mapping with a scalar tensor 'loss'")
     return loss
 
 
 def sample_losses_of(output: Any) -> Tensor | None:
-    """``output["sample_losses"]``, ``(B,)``, if the model tells each sample's: for the records."""
+    """``output["sample_losses"]``, ``(B,)``, if the model returns it: for the records."""
     losses = output.get("sample_losses") if isinstance(output, Mapping) else None
     return losses.detach() if isinstance(losses, Tensor) else None

@@ -96,7 +96,7 @@ class TrainOptions:
     for bf16."""
 
     def check(self, context: RunContext) -> None:
-        """Refuse values that cannot be meant.
+        """Refuse invalid values.
 
         Raises:
             ConfigError: every finding, with the place of its key.
@@ -171,7 +171,7 @@ class TrainOptions:
         """The table ``lora``, checked; None without one.
 
         Raises:
-            ConfigError: it cannot be meant, or peft is not installed.
+            ConfigError: it is invalid, or peft is not installed.
         """
         if self.lora is None:
             return None
@@ -205,7 +205,7 @@ class LoaderOptions:
         """``val_dataloader`` of the config, None without one; it takes over the batch size.
 
         Raises:
-            ConfigError: it cannot be meant, or something is asked of it and it is not there.
+            ConfigError: it is invalid, or an option needs it and it is not there.
         """
         if config.get("val_dataloader") is None:
             for key in ("val_iter_interval", "early_stop_patience"):
@@ -231,7 +231,7 @@ class LoaderOptions:
         """Take and check the table.
 
         Raises:
-            ConfigError: it is missing, has unknown keys, or values that cannot be meant.
+            ConfigError: it is missing, or has unknown keys or invalid values.
         """
         table = config.get(section)
         if not isinstance(table, Mapping):

@@ -8,28 +8,27 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
     EMA,
-    FOLDER,
     MODEL,
-    OPTIMIZER_META,
     TRAINER,
     Checkpoint,
     folders,
     newest_whole,
-    step_name,
 )
 from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
+from fluxvla_core.checkpoints.manifest import FOLDER, step_name
 from fluxvla_core.checkpoints.owner import Claim, claim
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
 from fluxvla_core.training.distributed import World, agree, on_first
 from fluxvla_core.training.lora import LoraOptions, adapter_tensors
-from fluxvla_core.training.optim import SavedOptimizer, ScheduledLR
 from fluxvla_core.training.saving import plain, rng_file
 from fluxvla_core.training.state import (
     Progress,
@@ -40,10 +39,6 @@ from fluxvla_core.training.state import (
     set_rng_state,
 )
 from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_tensors
-
-if TYPE_CHECKING:
-    from fluxvla_core.training.base_runner import BaseTrainRunner
-
 
 AUTO = "auto"
 
@@ -145,12 +140,11 @@ def check_same_run(
     Raises:
         CheckpointError: another seed or number of samples, under which the order would change.
     """
-    together = plan.shards and plan.shards.together
     theirs = saved.get("data_seeds", seeds)
     for ours, before, what in (
         (plan.seed, saved.get("seed"), "seed"),
         (plan.length, saved.get("n_train_examples"), "number of samples in the dataset"),
-        (together, saved.get("shuffle_episodes"), "value of shuffle_episodes"),
+        (plan.shuffle_episodes, saved.get("shuffle_episodes"), "value of shuffle_episodes"),
         (_listed(seeds), _listed(theirs), "seed of the dataset"),
     ):
         if before != ours:
@@ -237,16 +231,6 @@ def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
         )
 
 
-def _warnings(run: BaseTrainRunner, checkpoint: Checkpoint, saved: Mapping[str, Any]) -> list[str]:
-    """What to say of settings that may change, and have."""
-    said = check_same_run(saved, run.plan, seeds_of(run.dataset), str(checkpoint.path))
-    context = run.context
-    changed = changed_settings(checkpoint.config(), context.config, context.section)
-    listed = [f"    {key}: {before} -> {now}" for key, (before, now) in changed.items()]
-    head = "other settings than those of the checkpoint's run:"
-    return (["\n".join([head, *listed])] if listed else []) + ([said] if said else [])
-
-
 def _shown(settings: Mapping[str, Any] | None) -> str:
     if settings is None:
         return "not set"
@@ -254,41 +238,54 @@ def _shown(settings: Mapping[str, Any] | None) -> str:
     return ", ".join(f"{key}={settings[key]}" for key in named)
 
 
-def restore(run: BaseTrainRunner, checkpoint: Checkpoint) -> None:
-    """Put everything but the random generators back to where ``checkpoint`` was saved.
+def check_settings(
+    checkpoint: Checkpoint,
+    context: RunContext,
+    plan: StepPlan,
+    dataset: Any,
+    lora: LoraOptions | None,
+    ema_decay: float | None,
+) -> tuple[dict[str, Any], list[str]]:
+    """Compare the present run with the one that saved ``checkpoint``.
+
+    Returns:
+        ``trainer.json``, and warnings about settings that may change, and have.
 
     Raises:
-        CheckpointError: it is of another model, optimizer, dataset, seed or adapter, or one of
-            the two keeps averages.
+        CheckpointError: another dataset, seed or adapter, or one of the two keeps averages.
     """
     where = str(checkpoint.path)
     checkpoint.json(TRAINER, SavedWeights)
     saved = checkpoint.json(TRAINER, SavedTrainer)
-    check_same_adapter(run.lora, LoraOptions.of_checkpoint(checkpoint), where)
-    check_same_averages(run.options.ema_decay, checkpoint)
-    warnings = _warnings(run, checkpoint, saved)
-    check_same_statistics(run.dataset, checkpoint)
-    for warning in warnings if run.world.first else ():
-        run.context.reporter.warn(warning)
-    tensors = checkpoint.tensors(MODEL) | adapter_tensors(run.model, checkpoint)
-    check_model_tensors(run.model, tensors, run.left_out or LeftOut(), saved["left_out"], where)
-    run._load_model_state(tensors)
-    optimizer = checkpoint.optimizer_tensors(), checkpoint.json(OPTIMIZER_META, SavedOptimizer)
-    if run.load_optimizer_tensors(*optimizer, where) is False:
-        raise CheckpointError(
-            f"{type(run).__name__} did not take the checkpoint's optimizer state", where=where
-        )
-    if run.ema is not None:
-        run.ema.load(checkpoint.tensors(EMA), where)
-    with _state_of("metric", where):
-        run.metric.load_state_dict(saved["metric"])
-    run.progress = Progress.from_dict(saved)
-    with _state_of("scheduler", where):
-        run.lr_scheduler.load_state_dict(_schedule_state(run, saved))
+    check_same_adapter(lora, LoraOptions.of_checkpoint(checkpoint), where)
+    check_same_averages(ema_decay, checkpoint)
+    steps = check_same_run(saved, plan, seeds_of(dataset), where)
+    changed = changed_settings(checkpoint.config(), context.config, context.section)
+    check_same_statistics(dataset, checkpoint)
+    listed = [f"    {key}: {before} -> {now}" for key, (before, now) in changed.items()]
+    head = "other settings than those of the checkpoint's run:"
+    return saved, (["\n".join([head, *listed])] if listed else []) + ([steps] if steps else [])
+
+
+def model_tensors(
+    checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
+) -> dict[str, Tensor]:
+    """The checkpoint's weights by name, all of which fit ``model``.
+
+    Args:
+        brings: the frozen weights that the model brings itself.
+
+    Raises:
+        CheckpointError: they are another model's, or other frozen weights go with them.
+    """
+    tensors = checkpoint.tensors(MODEL) | adapter_tensors(model, checkpoint)
+    saved = checkpoint.json(TRAINER, SavedWeights)["left_out"]
+    check_model_tensors(model, tensors, brings or LeftOut(), saved, str(checkpoint.path))
+    return tensors
 
 
 @contextmanager
-def _state_of(what: str, where: str) -> Iterator[None]:
+def state_of(what: str, where: str) -> Iterator[None]:
     """Let what a class raises for a state that it did not write be a CheckpointError."""
     try:
         yield
@@ -298,20 +295,6 @@ def _state_of(what: str, where: str) -> Iterator[None]:
             where=where,
             cause="another class wrote it, or the checkpoint was put together by hand",
         ) from error
-
-
-def _schedule_state(run: BaseTrainRunner, saved: Mapping[str, Any]) -> Any:
-    """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller now.
-
-    The rate follows the part of the run that is done. A count of the old steps would be past the
-    end of fewer, larger ones, and train the rest at a rate of 0.
-    """
-    same = saved["step_samples"] == run.plan.step_samples
-    if same or not isinstance(run.lr_scheduler, ScheduledLR):
-        return saved["scheduler"]
-    plan, progress, length = run.plan, run.progress, (run.max_steps, run.max_epochs)
-    left = plan.run_steps_left(progress.step, progress.cursor, *length)
-    return {"step": plan.total_steps(*length) - left}
 
 
 def forget_missing(
@@ -345,7 +328,7 @@ def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
     seed_all(rank_seed(seed, world.rank, checkpoint.step))
     if checkpoint.json(TRAINER, SavedTrainer)["world_size"] == world.size:
         state = checkpoint.tensors(rng_file(world.rank))
-        with _state_of("random generators", str(checkpoint.path)):
+        with state_of("random generators", str(checkpoint.path)):
             set_rng_state(state)
 
 
@@ -357,7 +340,7 @@ HARMLESS = frozenset(
         *("init_from", "resume_from", "device"),
         # How samples are fetched.
         *("per_device_num_workers", "cache_frames"),
-        # What is told and saved, and how often.
+        # What is logged and saved, and how often.
         *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
         *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
         "early_stop_patience",  # how long it goes on

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -27,12 +27,8 @@ from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, agree, on_first, texts
-from fluxvla_core.training.ema import Ema
-from fluxvla_core.training.state import rng_state, seeds_of
-from fluxvla_core.training.weights import LeftOut
-
-if TYPE_CHECKING:
-    from fluxvla_core.training.base_runner import BaseTrainRunner
+from fluxvla_core.training.optim import Ema
+from fluxvla_core.training.state import rng_state
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -70,7 +66,7 @@ def save_snapshot(
     keep: int,
     spare: int | None = None,
 ) -> Path:
-    """Begin the checkpoint of ``step``; ``saver.settle`` tells when it is there.
+    """Begin the checkpoint of ``step``; ``saver.settle`` says when it is complete.
 
     Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
     but for that of step ``spare``; old ones that cannot be removed are only warned of.
@@ -138,7 +134,7 @@ def save_snapshot(
 
 def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
     model = snapshot.model
-    if saver.beside:
+    if saver.background:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
@@ -159,44 +155,6 @@ def rng_file(rank: int) -> str:
 def part_file(rank: int) -> str:
     """Name of a rank's file with its parts of the optimizer's state."""
     return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
-
-
-def take_snapshot(run: BaseTrainRunner, train_loss: float | None, only_trainable: bool) -> Snapshot:
-    """The runner's present moment.
-
-    Args:
-        only_trainable: leave out frozen weights that the model brings itself.
-    """
-    without = run.left_out if only_trainable and run.left_out is not None else LeftOut()
-    state, (optimizer, described) = run.model_tensors(), run.optimizer_tensors()
-    adapter = lora.adapter_names(run.model)
-    elsewhere = {*without.names, *adapter}
-    documents = run_documents(run.context, run.dataset, run.model) if run.world.first else {}
-    if run.lora is not None:
-        documents[lora.CONFIG] = run.lora.for_peft(run.adapter_base)
-    trainer = {
-        **run.progress.to_dict(),
-        "train_loss": train_loss,
-        "scheduler": run.lr_scheduler.state_dict(),
-        "metric": run.metric.state_dict(),
-        "seed": run.plan.seed,
-        "data_seeds": seeds_of(run.dataset),
-        "n_train_examples": run.plan.length,
-        "step_samples": run.plan.step_samples,
-        "world_size": run.plan.world,
-        "shuffle_episodes": run.loader_options.shuffle_episodes,
-        "left_out": without.to_dict(),
-    }
-    return Snapshot(
-        {name: tensor for name, tensor in state.items() if name not in elsewhere},
-        optimizer,
-        described,
-        trainer,
-        run.ema,
-        {theirs: state[name] for name, theirs in adapter.items()},
-        documents,
-        run_folders(run.dataset, run.tokenizer),
-    )
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
@@ -249,7 +207,7 @@ def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]
 
 @dataclass
 class _Job:
-    """A checkpoint on its way: ``copied`` when nothing of the training is needed any more."""
+    """A checkpoint being written; ``copied`` is set once the training may change its tensors."""
 
     step: int
     copied: threading.Event = field(default_factory=threading.Event)
@@ -269,19 +227,19 @@ class Saved:
 
 
 class Saver:
-    """Writes checkpoints of one run, in a thread of its own or at once.
+    """Writes checkpoints of one run, in a background thread or at once.
 
     Args:
         world: the processes that save together.
-        beside: use a thread.
+        background: write in a thread, from copies of the tensors.
         optimizer: waits, in its ``step``, for the copy; one without ``register_step_pre_hook``
             is copied before :meth:`start` returns.
     """
 
-    def __init__(self, world: World, beside: bool, optimizer: Any = None) -> None:
-        self.world, self.beside = world, beside
+    def __init__(self, world: World, background: bool, optimizer: Any = None) -> None:
+        self.world, self.background = world, background
         self._threads = world
-        if beside and world.size > 1:
+        if background and world.size > 1:
             # The threads of all ranks talk while the training talks on the other groups.
             self._threads = replace(world, control=dist.new_group(backend="gloo"))
         self._job: _Job | None = None
@@ -301,7 +259,7 @@ class Saver:
         """
         job = self._job = _Job(step)
         warn = job.warnings.append
-        if not self.beside:
+        if not self.background:
             self._run(job, lambda: write(self.world, files, warn))
             return
         gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
@@ -394,7 +352,7 @@ class Saver:
 
 
 def _reached(device: torch.device) -> AbstractContextManager[object]:
-    """Inside, a GPU copies beside the work that is enqueued later than now, and after the rest."""
+    """Inside, a GPU copies on another stream, after what has been enqueued up to now."""
     if device.type != "cuda":
         return nullcontext()
     stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]

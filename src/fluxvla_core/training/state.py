@@ -1,4 +1,4 @@
-"""What a run draws by: its seed, and the state of every random generator of a process."""
+"""Seeds, the state of all random generators, and the progress of a training run."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def take_seed(dataset: Any, seed: int) -> None:
 
 
 def seeds_of(dataset: Any) -> list[int | None]:
-    """What ``dataset`` draws by, followed by the datasets that it is made of; None if untold."""
-    seed = getattr(dataset, "seed", None)
-    parts = getattr(dataset, "datasets", None)
+    """What ``dataset`` draws by, followed by the datasets that it is made of; None if unknown."""
+    described = Dataset.adapt(dataset)
+    seed, parts = described.seed, described.datasets
     below = [s for part in parts for s in seeds_of(part)] if isinstance(parts, list) else []
     return [seed if isinstance(seed, int) else None, *below]
 

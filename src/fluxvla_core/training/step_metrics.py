@@ -1,4 +1,4 @@
-"""What the last steps gave, kept on the device until somebody looks.
+"""Losses, gradient norms and times of the last steps, kept on the device until they are logged.
 
 Fetching a loss makes the host wait for the device. The numbers of every step are kept as tensors
 and fetched together every few steps, then summed over the ranks in one operation.
@@ -86,7 +86,7 @@ class StepMetrics:
     ) -> None:
         """Keep one step: a loss and the sample ids of each micro-batch, all still on the device.
 
-        ``each`` are the losses ``(B,)`` of a micro-batch's samples, where the model tells them.
+        ``each`` are the losses ``(B,)`` of a micro-batch's samples, where the model returns them.
         ``samples`` is over all ranks; ``wait`` the seconds spent waiting for data.
         """
         now = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Being asked to stop: all ranks leave at the same step, with a checkpoint behind them."""
+"""Stopping on SIGINT, SIGTERM and SIGHUP: all ranks at the same step, with a checkpoint saved."""
 
 from __future__ import annotations
 

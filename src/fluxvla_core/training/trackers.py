@@ -1,4 +1,4 @@
-"""Where numbers of a run go. A tracker may fail; the run that it watches may not."""
+"""Trackers: JSON lines, TensorBoard, Weights & Biases, Trackio. One that fails ends no run."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class TrackioTracker:
     """Trackio, which keeps runs on this machine (in ``TRACKIO_DIR``); ``trackio show`` has them.
 
     ``TRACKIO_PROJECT`` names the project. It knows a run by its name alone, which therefore ends
-    with what tells this one from another of the same name.
+    with something that no other run of the same name has.
     """
 
     def __init__(self, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]) -> None:

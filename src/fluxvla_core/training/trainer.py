@@ -1,8 +1,6 @@
 """The training loop: steps, accumulation, logging, validation, saving and stopping.
 
-:func:`train` is what ``BaseTrainRunner.run`` does, from the first step to the last checkpoint.
-:class:`Trainer` runs the steps; what a strategy does differently in a step is in the runner's
-methods, which ``base_runner`` documents.
+What a strategy does differently in a step is in the methods of ``strategy.Strategy``.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch.distributed as dist
@@ -18,61 +15,21 @@ import torch.distributed as dist
 from fluxvla_core.checkpoints.directory import name_best
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import make_loader
-from fluxvla_core.errors import RunFailed
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.training import distributed, memory
+from fluxvla_core.training import memory
 from fluxvla_core.training.batches import IDS, StepSampler, episode_shards, loader_source, to_device
-from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.model import ForwardArguments
-from fluxvla_core.training.optim import trainable
+from fluxvla_core.training.optim import Ema, trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
 from fluxvla_core.training.saving import Saver
-from fluxvla_core.training.state import Progress, take_seed
+from fluxvla_core.training.state import take_seed
 from fluxvla_core.training.step_metrics import StepMetrics, as_metrics
-from fluxvla_core.training.stop import StopRequest, stopped
-from fluxvla_core.training.validation import NotFinite, Validation
+from fluxvla_core.training.stop import StopRequest
+from fluxvla_core.training.validation import NotFinite, Validation, validation_dataset
 from fluxvla_core.training.weights import left_out
 
 if TYPE_CHECKING:
-    from fluxvla_core.training.base_runner import BaseTrainRunner
-
-
-def train(run: BaseTrainRunner, dataset: Any) -> Path:
-    """Train ``run`` on ``dataset`` to its end; see ``BaseTrainRunner.run``."""
-    run._prepare()
-    run.progress = Progress()
-    outcome = "failed"
-    try:
-        with StopRequest(run.world, run.check_work_dir) as stop:
-            run._trainer = trainer = Trainer(run, dataset, stop)
-            number = run._run_epoch_based() if run.max_steps is None else run._run_step_based()
-            trainer.save()
-            run.settle_saves()
-            run.late_stop = stop.asked()
-        outcome = "interrupted" if number else "ok"
-    except (RuntimeError, MemoryError, OSError, RunFailed) as error:
-        run.check_work_dir()
-        if isinstance(error, RunFailed):
-            raise
-        step = run.progress.step + 1
-        known = memory.explain(error, step) or distributed.explain(error, run.world, step)
-        if known is None:
-            raise
-        raise known from error
-    finally:
-        if run._trainer is not None:
-            run._trainer.close()
-        if run._saver is not None:
-            run._saver.close()
-        if run.world.first:
-            run.metric.finalize()
-        run.hooks.call("run_finished", outcome=outcome)
-        if run._claim is not None:
-            run._claim.close()
-        distributed.stop(run.world, failed=outcome == "failed")
-    if number:
-        raise stopped(number, f"step {run.progress.step} in {run.context.work_dir}")
-    return run.context.work_dir
+    from fluxvla_core.training.strategy import Strategy
 
 
 class Trainer:
@@ -86,7 +43,7 @@ class Trainer:
         stop: asked after every step.
     """
 
-    def __init__(self, run: BaseTrainRunner, dataset: Any, stop: StopRequest) -> None:
+    def __init__(self, run: Strategy, dataset: Any, stop: StopRequest) -> None:
         options, world, context = run.options, run.world, run.context
         self._run, self._stop = run, stop
         if not world.first:
@@ -109,11 +66,18 @@ class Trainer:
         forget_missing(run.progress, world, context.work_dir, run._checkpoint)
         self._validation: Validation | None = None
         if run.val_options is not None:
-            self._validation = Validation(run, stop)
+            self._validation = Validation(
+                validation_dataset(context, dataset, options.seed),
+                run.collator,
+                run.val_options,
+                world,
+                options.seed,
+                stop,
+            )
         if world.first:
             reported = run.progress.step - (run.progress.unvalidated is not None)
             run.metric.start(reported, context.config)
-        self._window = StepMetrics(world, getattr(dataset, "parts", {}))
+        self._window = StepMetrics(world, Dataset.adapt(dataset).parts)
         sampler: Any = StepSampler(run.plan, world.rank, run.progress.cursor)
         loader = make_loader(
             loader_source(dataset, run.collator, world.device),
@@ -137,18 +101,20 @@ class Trainer:
         Returns:
             The signal that asked for a stop, 0 if none did.
         """
-        run, stopped = self._run, self._catch_up()
-        if not (stopped or finished() or self._stops_early()):
+        run, every = self._run, self._run.options.log_iter_interval
+        stopped = self._catch_up()
+        over = stopped or finished() or self._stops_early()
+        if not over:
             self._look_ahead()
         self._window.restart_clock()
-        while not (stopped or finished() or self._stops_early()):
+        while not over:
             step = run.progress.step + 1
             run.hooks.call("before_step", step=step)
             self._step(step)
-            stopped = self._stop.wanted(step)
-            save = due() or finished()
-            validate = self._validates(save, finished())
-            log = step == 1 or step % run.options.log_iter_interval == 0
+            stopped, last = self._stop.wanted(step), finished()
+            save = due() or last
+            validate = self._validates(save, last)
+            log = step == 1 or step % every == 0
             if log or save or stopped or validate:
                 records, better = self._fetch(), False
                 if validate and not stopped:
@@ -163,6 +129,7 @@ class Trainer:
                 self.save()
             elif self._stop.due(step):
                 run.settle_saves(wait=False)
+            over = stopped or last or self._stops_early()
         return stopped
 
     def _step(self, step: int) -> None:
@@ -248,7 +215,7 @@ class Trainer:
         self._batches = chain([first], self._batches)
         shown = to_device(first, run.world.device)
         if run.flops is not None and run._arguments is not None:
-            trouble = run.flops.look(run._arguments(shown))
+            trouble = run.flops.count(run._arguments(shown))
             if trouble is not None and run.world.first:
                 run.context.reporter.warn(f"mfu is not reported: {trouble}")
         run.warm_up(shown)
@@ -307,7 +274,7 @@ class Trainer:
         """
         run = self._run
         assert self._validation is not None
-        loss = self._validation.loss(run)
+        loss = self._validation.loss(run.vla, run._training_step, run.ema, run.progress.step)
         if loss is None:
             return self._stop.asked(), False
         record["val_loss"] = loss

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from fluxvla_core.build import build_dataset_from_cfg
+from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.training.batches import loader_source, to_device
-from fluxvla_core.training.distributed import total
+from fluxvla_core.training.distributed import World, total
+from fluxvla_core.training.optim import Ema
+from fluxvla_core.training.options import LoaderOptions
 from fluxvla_core.training.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
 from fluxvla_core.training.stop import StopRequest
-
-if TYPE_CHECKING:
-    from fluxvla_core.training.base_runner import BaseTrainRunner
 
 
 class NotFinite(RunFailed):
@@ -29,29 +28,33 @@ class NotFinite(RunFailed):
 
 
 class Validation:
-    """The ``val_dataloader`` of a run.
+    """The loss on a run's ``val_dataloader``.
 
     Its samples are those of epoch 0 in their order: the same ones, with the same noise, every
-    time. They are normalised by the statistics of the training data. The ranks share them; as in
-    training, the last batch is filled up with the first samples. What the model itself draws is
-    the same every time too: it follows from the run's seed and the rank.
+    time. The ranks share them; as in training, the last batch is filled up with the first samples.
+    What the model itself draws is the same every time too: it follows from ``seed`` and the rank.
 
     Args:
-        run: whose weights it is of.
+        dataset: see :func:`validation_dataset`.
+        collator: the run's.
+        options: batch size and workers.
+        world: the processes that share the samples.
+        seed: the run's.
         stop: asked after every batch.
     """
 
-    def __init__(self, run: BaseTrainRunner, stop: StopRequest) -> None:
-        options = run.val_options
-        assert options is not None
-        self._stop = stop
-        table = run.context.config["val_dataloader"]["dataset"]
-        self._dataset = build_dataset_from_cfg(table, run.context)
-        share_statistics(run.dataset, self._dataset)
-        take_seed(self._dataset, run.options.seed)
-        world = run.world
+    def __init__(
+        self,
+        dataset: Any,
+        collator: Any,
+        options: LoaderOptions,
+        world: World,
+        seed: int,
+        stop: StopRequest,
+    ) -> None:
+        self._world, self._seed, self._stop = world, seed, stop
         sampler = EpochSampler(
-            len(self._dataset),
+            len(dataset),
             options.per_device_batch_size,
             rank=world.rank,
             world=world.size,
@@ -59,36 +62,48 @@ class Validation:
         )
         batches: Any = list(sampler.batches(0))
         self._loader = make_loader(
-            loader_source(self._dataset, run.collator, world.device),
-            run.collator,
+            loader_source(dataset, collator, world.device),
+            collator,
             batches,
             options.per_device_num_workers,
             pin_memory=world.device.type == "cuda",
-            seed=run.options.seed,
+            seed=seed,
         )
 
-    def loss(self, run: BaseTrainRunner) -> float | None:
+    def loss(
+        self,
+        model: nn.Module,
+        loss_of_batch: Callable[[dict[str, Any]], Tensor],
+        ema: Ema | None,
+        step: int,
+    ) -> float | None:
         """Mean loss over the samples and all ranks, of the averaged weights if they are kept.
 
         None if a stop was asked for meanwhile. Leaves weights and random generators as they were,
         also when it fails.
 
+        Args:
+            model: as it trains, which ``loss_of_batch`` calls.
+            loss_of_batch: a batch on the device -> its loss, a scalar.
+            ema: the averaged weights.
+            step: after which this is, for messages.
+
         Raises:
             NotFinite: it is not finite.
         """
         losses = []
-        with evaluating(run):
+        with evaluating(model, ema, rank_seed(self._seed, self._world.rank)):
             # Every rank has as many batches, so all ask equally often.
             for batch in self._loader:
-                losses.append(run._training_step(to_device(batch, run.world.device)))
+                losses.append(loss_of_batch(to_device(batch, self._world.device)))
                 if self._stop.asked():
                     return None
             found = torch.stack(losses).double().cpu()
-        summed = total(run.world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
+        summed = total(self._world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
         mean = float(summed[0] / summed[1])
         if not torch.isfinite(summed).all():
             raise NotFinite(
-                f"the validation loss is {mean} at step {run.progress.step}",
+                f"the validation loss is {mean} at step {step}",
                 cause="a sample of val_dataloader with wrong or huge values, or a learning rate "
                 "that is too high",
             )
@@ -96,17 +111,17 @@ class Validation:
 
 
 @contextmanager
-def evaluating(run: BaseTrainRunner) -> Iterator[None]:
+def evaluating(model: nn.Module, ema: Ema | None, seed: int) -> Iterator[None]:
     """Inside, the model evaluates: with averaged weights if kept, and the same draws every time."""
     drawn = rng_state()
-    seed_all(rank_seed(run.options.seed, run.world.rank))
-    run.vla.eval()
+    seed_all(seed)
+    model.eval()
     try:
-        with run.ema.in_place() if run.ema is not None else nullcontext(), torch.no_grad():
+        with ema.in_place() if ema is not None else nullcontext(), torch.no_grad():
             yield
-            reshard(run.vla)
+            reshard(model)
     finally:
-        run.vla.train()
+        model.train()
         set_rng_state(drawn)
 
 
@@ -118,14 +133,21 @@ def reshard(model: nn.Module) -> None:
             again()
 
 
+def validation_dataset(context: RunContext, train: Any, seed: int) -> Any:
+    """The dataset of ``val_dataloader``, normalised by the statistics of the dataset ``train``."""
+    dataset = build_dataset_from_cfg(context.config["val_dataloader"]["dataset"], context)
+    share_statistics(train, dataset)
+    take_seed(dataset, seed)
+    return dataset
+
+
 def share_statistics(train: Any, val: Any) -> None:
     """Let the ``val`` dataset normalise as ``train`` does.
 
     Raises:
         ConfigError: it is of a robot for which the training data have no statistics.
     """
-    parts = getattr(val, "datasets", None)
-    for dataset in parts if isinstance(parts, list) else [val]:
+    for dataset in Dataset.adapt(val).datasets or [val]:
         if not implements(dataset, Dataset, "use_statistics"):
             continue
         name = dataset.statistic_name

@@ -190,10 +190,10 @@ def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, 
 
 
 def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
-    """Where the weights are that a checkpoint's adapter stands beside; None if it needs no others.
+    """Where the base weights of a checkpoint's adapter are; None if it needs none.
 
     They are where they were found, or else, as folders are moved together, at the place that was
-    asked for. A sum tells if they are others by now.
+    asked for. A hash shows whether they have changed.
 
     Args:
         init_from: the place that is asked for now, which goes first when it is a new one.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.errors import ConfigError
@@ -90,4 +90,5 @@ class DDPTrainRunner(BaseTrainRunner):
         set_rng_state(drawn)
 
     def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
-        return nullcontext() if last or self.world.size == 1 else self.vla.no_sync()
+        whole = last or self.world.size == 1
+        return super().sync_gradients(last) if whole else self.vla.no_sync()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -90,7 +90,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
 
     def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         self.vla.set_gradient_accumulation_boundary(last)
-        return nullcontext()
+        return super().sync_gradients(last)
 
     def backward(self, loss: Tensor) -> None:
         self.vla.backward(loss, scale_wrt_gas=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.errors import ConfigError
@@ -119,7 +119,7 @@ class FSDPTrainRunner(BaseTrainRunner):
 
     def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         self.vla.set_requires_gradient_sync(last)
-        return nullcontext()
+        return super().sync_gradients(last)
 
     def optimizer_step(self) -> Tensor | None:
         from fluxvla_core.training import share_buffers

@@ -30,9 +30,9 @@ from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.config.check import examine
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data.dataset import ParquetDataset
+from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
-from fluxvla_core.data.validate import validate
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.recording.recorded import open_recording

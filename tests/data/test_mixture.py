@@ -12,9 +12,8 @@ import torch
 
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext
-from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset, first_dataset, shares
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.files import arrow, read_json, read_table
-from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.tables import FileId
+from fluxvla_core.data.metadata import FileId, Metadata, read_metadata
 from fluxvla_core.data.video_decode import (
     ExpectedVideo,
     ImageColumn,

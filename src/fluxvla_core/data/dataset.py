@@ -23,7 +23,7 @@ from fluxvla_core.data.columns import (
 )
 from fluxvla_core.data.frames import Frames
 from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, sample_rng
-from fluxvla_core.data.statistics import action_statistics, as_lists, column_statistics
+from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joined_statistics
 from fluxvla_core.data.transforms.images import join_planes, split_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
@@ -282,6 +282,60 @@ def pooled_statistics(datasets: Sequence[ParquetDataset]) -> dict[str, Any]:
         first.per_step_statistics,
     )
     return {"proprio": as_lists(column_statistics(states)), "action": action}
+
+
+def action_statistics(
+    datasets: Sequence[LoadedDataset],
+    size: int,
+    first_action: int,
+    relative: npt.NDArray[np.bool_] | None,
+    per_step: bool,
+) -> dict[str, Any]:
+    """Statistics of the actions that samples show, as JSON values.
+
+    Args:
+        size, first_action: of the window.
+        relative: ``(D,)``; where True, actions are counted from the state at the window's frame.
+        per_step: give ``(size, D)`` statistics, one row for each step of the window.
+
+    Plain actions are counted once a frame of the chosen episodes; relative or per-step ones once
+    for each window that they occur in.
+    """
+    if relative is None and not per_step:
+        rows = np.concatenate([r.actions[r.chosen] for r in datasets])
+        return as_lists(column_statistics(rows))
+    if per_step:
+        # The last steps of a window longer than every episode occur nowhere.
+        each: list[Stats] = []
+        for j in range(size):
+            rows = _step(datasets, first_action + j, relative, slice(None))
+            each.append(column_statistics(rows) if len(rows) else each[0])
+        stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
+    else:
+        stats = joined_statistics(
+            lambda dims: (_step(datasets, first_action + j, relative, dims) for j in range(size))
+        )
+    found = as_lists(stats)
+    if relative is not None:
+        found["relative"] = relative.astype(int).tolist()
+    return found
+
+
+def _step(
+    datasets: Sequence[LoadedDataset],
+    ahead: int,
+    relative: npt.NDArray[np.bool_] | None,
+    dims: slice,
+) -> npt.NDArray[np.float32]:
+    """Actions ``ahead`` rows after each usable one, where they are within the episode."""
+    parts = []
+    for one in datasets:
+        rows = one.rows[one.rows + ahead < one.end[one.rows]]
+        actions = one.actions[:, dims][rows + ahead]
+        if relative is not None:
+            actions = actions - one.states[:, : len(relative)][:, dims][rows] * relative[dims]
+        parts.append(actions)
+    return np.concatenate(parts)
 
 
 def window(actions: Floats, first: int, end: int, size: int) -> tuple[Floats, Floats]:

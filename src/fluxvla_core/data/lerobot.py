@@ -79,11 +79,6 @@ def camera_name(feature: str) -> str:
     return feature.removeprefix(IMAGES)
 
 
-def file_of(number: int) -> tuple[int, int]:
-    """``(chunk_index, file_index)`` of the ``number``-th file of a kind."""
-    return divmod(number, CHUNK_FILES)
-
-
 def describe_features(
     embodiment: EmbodimentSpec, fps: float, codec: str
 ) -> dict[str, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A torch ``DataLoader`` whose batches do not depend on the number of its workers."""
+"""``DictCollator``, and a torch ``DataLoader`` whose batches do not depend on its worker count."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import multiprocessing
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.contracts.training import Dataset
+from fluxvla_core.contracts.training import Collator, Dataset
 from fluxvla_core.data.sampler import (
     DEFAULT_SEED,
     EpochSampler,
@@ -22,13 +24,56 @@ from fluxvla_core.data.sampler import (
     global_generators,
     read_samples,
 )
-from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.data.transforms.images import SCALE
+from fluxvla_core.errors import ConfigError, DataError, FluxError
 from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
 # Of malloc.h, and bytes: the largest piece that comes from the heap, and what the heap may keep.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _LARGE, _KEPT = 32 << 20, 1 << 30
 _END_S = 1.0  # between the end of a connection and that of the process that had it
+
+
+class DictCollator(Collator):
+    """Collate samples: stack the keys that a model computes with, list the others.
+
+    Args:
+        keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.
+        meta_keys: kept as plain lists, one entry a sample.
+
+    What is left of normalising pictures (``image_scale``) is stacked without being listed.
+
+    Keys that are configured but that no sample has are left out: one list serves datasets with
+    and without ``embodiment_ids``.
+
+    Raises:
+        DataError: a sample has a key in neither list or one that another sample lacks, or its
+            value cannot be stacked.
+    """
+
+    def __init__(
+        self, keys: Sequence[str] | None = None, meta_keys: Sequence[str] | None = None
+    ) -> None:
+        self.keys = tuple(keys or ())
+        self.meta_keys = tuple(meta_keys or ())
+
+    def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        if not samples:
+            raise DataError("there are no samples to make a batch of")
+        batch: dict[str, Any] = {}
+        for sample in samples:
+            _check_keys(samples[0], sample)
+        for key in samples[0]:
+            if key in self.keys or key == SCALE:
+                batch[key] = _stack(key, [sample[key] for sample in samples])
+            elif key in self.meta_keys:
+                batch[key] = [sample[key] for sample in samples]
+            else:
+                raise DataError(
+                    f"sample key {key!r} is in neither keys nor meta_keys of the collator",
+                    next=f"add {key!r} to the collator's keys (to stack) or meta_keys (to list)",
+                )
+        return batch
 
 
 class Loader:
@@ -200,3 +245,34 @@ class _Keyed:
 
 def _identity(batch: Any) -> Any:
     return batch
+
+
+def _check_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    differing = sorted(one.keys() ^ other.keys())
+    if differing:
+        without = other if differing[0] in one else one
+        raise DataError(
+            f"sample key {differing[0]!r} is missing in one sample of the batch; it has "
+            f"{sorted(without)}",
+            cause="datasets of a mixture that do not give the same, embodiment_id for example",
+        )
+
+
+def _stack(key: str, values: list[Any]) -> Any:
+    import torch
+
+    first = values[0]
+    try:
+        if isinstance(first, torch.Tensor):
+            return torch.stack(values)
+        if isinstance(first, np.ndarray | np.generic):
+            return torch.from_numpy(np.stack(values))
+    except (TypeError, ValueError, RuntimeError) as error:
+        shapes = sorted({str(tuple(np.shape(value))) for value in values})
+        raise DataError(
+            f"sample key {key!r} cannot be stacked: shapes {', '.join(shapes)} ({error})"
+        ) from error
+    raise DataError(
+        f"sample key {key!r} is listed in keys, but {type(first).__name__} cannot be stacked",
+        next=f"move {key!r} to the collator's meta_keys",
+    )

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fluxvla_core import build_transform_from_cfg
-from fluxvla_core.data.statistics import as_lists, column_statistics
-from fluxvla_core.data.transforms.scaling import NORM_TYPES
+from fluxvla_core.data.statistics import NORM_TYPES, as_lists, column_statistics
 from fluxvla_core.data.transforms.state_action import (
     DenormalizePrivateAction,
     NormalizeStatesAndActions,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.training import RandomTransform, Transform
-from fluxvla_core.data.transforms.scaling import (
+from fluxvla_core.data.statistics import (
     Affine,
     check_norm_type,
     find_idle_dimensions,

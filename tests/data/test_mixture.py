@@ -174,7 +174,7 @@ def test_statistics_are_computed_once_for_all_that_share_them(shared, others, mo
     )
     dataset = mixture(table(shared), table(others[0]))
     assert dataset.statistics["private"]["proprio"]["count"] == [38]
-    assert computed == [38]
+    assert computed == [38, 38], "of states and of actions"
 
 
 def test_what_several_doubt_of_shared_statistics_is_said_once(tmp_path, recorder, take):

@@ -41,7 +41,7 @@ MEGABYTE = 1024 * 1024
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """What all episodes of a dataset share. ``embodiment`` has the recorded images' sizes."""
+    """Settings common to all episodes of a dataset; ``embodiment`` has the images' sizes."""
 
     fps: float
     embodiment: EmbodimentSpec

@@ -1,8 +1,8 @@
 """Convert LeRobot datasets of v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
 
-Rows, with the images in them, and video packets are copied as they are. Statistics are recomputed,
-exactly: version 2 has no quantiles, and estimates those of images from samples. That decodes every
-frame, so the result is known to be complete.
+Rows, with the images in them, and video packets are copied unchanged. Statistics are recomputed
+exactly: version 2 has no quantiles, and estimates those of images from samples. This decodes every
+frame, and so checks that the dataset is complete.
 """
 
 from __future__ import annotations

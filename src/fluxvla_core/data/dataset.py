@@ -78,6 +78,8 @@ class ParquetDataset(Dataset):
     """
 
     action_window_size: int
+    pipeline: Pipeline
+    statistic_name: str
 
     def __init__(
         self,
@@ -138,7 +140,7 @@ class ParquetDataset(Dataset):
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
-        """The robot, as far as anybody says; with ``use_delta`` its actions are deltas."""
+        """The robot, None if unknown; with ``use_delta`` its actions are deltas."""
         if self._embodiment is not None and self.use_delta:
             return replace(self._embodiment, action_mode="delta")
         return self._embodiment
@@ -176,9 +178,7 @@ class ParquetDataset(Dataset):
         """
         first, stats = self.loaded[0], self.statistics[self.statistic_name]
         names = first.state_names, first.action_names
-        asked = [t for t in self.pipeline.transforms if hasattr(t, "warnings")]
-        found = [warning for transform in asked for warning in transform.warnings(stats, *names)]
-        return [*naming_warnings(self.loaded), *found]
+        return [*naming_warnings(self.loaded), *self.pipeline.warnings(stats, *names)]
 
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
         """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""
@@ -190,7 +190,7 @@ class ParquetDataset(Dataset):
             self.seed = seed
 
     def deferring(self) -> ParquetDataset | None:
-        """The same samples with images left to be normalised on the device; None if that cannot be.
+        """The same samples with images to be normalised on the device; None if impossible.
 
         It shares frames and settings with this one, and is for reading only.
         """
@@ -204,9 +204,6 @@ class ParquetDataset(Dataset):
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""
         self._frames.prepare(reporter or SilentReporter())
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.get_sample(index, 0)
 
     def get_sample(self, index: int, epoch: int) -> Sample:
         """Sample ``index`` as ``epoch`` sees it."""

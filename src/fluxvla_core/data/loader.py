@@ -22,7 +22,6 @@ from fluxvla_core.data.sampler import (
     SampleKey,
     drop_kept_normal,
     global_generators,
-    read_samples,
 )
 from fluxvla_core.data.transforms.images import SCALE
 from fluxvla_core.errors import ConfigError, DataError, FluxError
@@ -128,8 +127,8 @@ def make_loader(
     """Build a loader of batches of ``dataset`` in the order of ``sampler``.
 
     Args:
-        dataset: has ``get_sample(index, epoch)``, or ``get_samples(keys)`` for grouped reads;
-            ``prepare(reporter)`` is called first where there is one.
+        dataset: a ``Dataset``, or an object with its methods; ``prepare(reporter)`` is called
+            first, then ``get_samples(keys)`` for each batch.
         num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
@@ -144,7 +143,8 @@ def make_loader(
 
     if num_workers < 0:
         raise ConfigError(f"per_device_num_workers must be at least 0, got {num_workers}")
-    Dataset.adapt(dataset).prepare(reporter or SilentReporter())
+    dataset = Dataset.adapt(dataset)
+    dataset.prepare(reporter or SilentReporter())
     keyed: Any = _Keyed(dataset, collator, seed)
     inner: DataLoader[Any] = DataLoader(
         keyed,
@@ -230,7 +230,9 @@ class _Keyed:
     therefore seeded for each batch, which then is the same whoever makes it, and restored.
     """
 
-    def __init__(self, dataset: Any, collator: Callable[[Sequence[Any]], Any], seed: int) -> None:
+    def __init__(
+        self, dataset: Dataset, collator: Callable[[Sequence[Any]], Any], seed: int
+    ) -> None:
         self.dataset = dataset
         self.collator = collator
         self.seed = seed
@@ -238,7 +240,7 @@ class _Keyed:
     def __getitems__(self, keys: list[SampleKey]) -> Any:
         try:
             with global_generators(self.seed, keys[0].epoch, keys[0].index):
-                return self.collator(read_samples(self.dataset, keys))
+                return self.collator(self.dataset.get_samples(keys))
         except FluxError as error:
             return _Failed(error)
 

@@ -16,10 +16,10 @@ from __future__ import annotations
 import hashlib
 import random
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,14 +41,6 @@ class SampleKey:
 
     epoch: int
     index: int
-
-
-def read_samples(dataset: Any, keys: Sequence[SampleKey]) -> list[Any]:
-    """The samples that ``keys`` name: by ``get_samples(keys)`` of the dataset, if it has that."""
-    if hasattr(dataset, "get_samples"):
-        samples: list[Any] = dataset.get_samples(keys)
-        return samples
-    return [dataset.get_sample(key.index, key.epoch) for key in keys]
 
 
 class Position(NamedTuple):
@@ -81,7 +73,7 @@ class EpochSampler:
         self,
         length: int,
         batch_size: int,
-        seed: int = 42,
+        seed: int = DEFAULT_SEED,
         rank: int = 0,
         world: int = 1,
         shuffle: bool = True,

@@ -103,10 +103,10 @@ def column_statistics(rows: npt.NDArray[Any], chunk: int = CHUNK) -> Stats:
 def joined_statistics(
     parts: Callable[[slice], Iterable[npt.NDArray[Any]]], chunk: int = CHUNK
 ) -> Stats:
-    """Those of several ``(n, D)`` arrays as if they were one, of which one is held at a time.
+    """Statistics of several ``(n, D)`` arrays as if they were one; see ``column_statistics``.
 
     Args:
-        parts: gives all arrays, one after the other, with the dimensions that it is asked for.
+        parts: yields all arrays, restricted to some dimensions; one is in memory at a time.
     """
     total = moments(_cut(parts(slice(None)), chunk))
     # True quantiles need all values of a dimension at once, but not those of all dimensions.

@@ -173,7 +173,7 @@ class NormalizeStatesAndActions(Transform):
         return np.pad(values, widths, constant_values=self.pad_value).astype(np.float32)
 
 
-class DenormalizePrivateAction:
+class DenormalizePrivateAction(Transform):
     """Denormalise a model's actions: the exact inverse of ``NormalizeStatesAndActions``.
 
     Called with ``{"action": (1, T, D) or (T, D)}``, and ``"states"`` ``(D,)`` in physical units
@@ -209,7 +209,7 @@ class DenormalizePrivateAction:
         self.action_key = action_key
         self._affine: Affine | None = None
 
-    def __call__(self, data: Mapping[str, Any]) -> Floats:
+    def __call__(self, data: Mapping[str, Any]) -> Floats:  # type: ignore[override]  # no sample
         action = np.asarray(data["action"], np.float64)
         if action.ndim == 3 and len(action) == 1:
             action = action[0]

@@ -8,7 +8,7 @@ import multiprocessing
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,6 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.contracts.training import Collator, Dataset
 from fluxvla_core.data.sampler import (
     DEFAULT_SEED,
-    EpochSampler,
     SampleKey,
     drop_kept_normal,
     global_generators,
@@ -76,15 +75,10 @@ class DictCollator(Collator):
 
 
 class Loader:
-    """An endless iterable of batches, from ``sampler.start`` on; ``make_loader`` builds it.
+    """An iterable of batches, as many as the sampler has; ``make_loader`` builds it."""
 
-    Prefetching runs ahead of training, so a position counts batches that were *used*:
-    ``sampler.advance(start, used)``.
-    """
-
-    def __init__(self, inner: Any, sampler: EpochSampler) -> None:
+    def __init__(self, inner: Any) -> None:
         self.inner = inner
-        self.sampler = sampler
 
     def __iter__(self) -> Iterator[Any]:
         context = getattr(self.inner, "multiprocessing_context", None) or multiprocessing
@@ -116,7 +110,7 @@ class Loader:
 def make_loader(
     dataset: Any,
     collator: Callable[[Sequence[Any]], Any],
-    sampler: EpochSampler,
+    sampler: Iterable[list[SampleKey]],
     num_workers: int = 0,
     pin_memory: bool = False,
     prefetch_factor: int = 2,
@@ -129,6 +123,7 @@ def make_loader(
     Args:
         dataset: a ``Dataset``, or an object with its methods; ``prepare(reporter)`` is called
             first, then ``get_samples(keys)`` for each batch.
+        sampler: the keys of each batch.
         num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
@@ -159,7 +154,7 @@ def make_loader(
         # would make a resumed run differ from an uninterrupted one.
         generator=torch.Generator().manual_seed(0),
     )
-    return Loader(inner, sampler)
+    return Loader(inner)
 
 
 def _init_worker(worker: int) -> None:

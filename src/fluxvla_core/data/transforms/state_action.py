@@ -80,21 +80,6 @@ class NormalizeStatesAndActions(Transform):
             out["actions"] = self._pad(scaled, self.action_dim, "action")
         return out
 
-    def inverse(
-        self, actions: npt.ArrayLike, stats: Mapping[str, Any], states: npt.ArrayLike | None = None
-    ) -> Floats:
-        """Normalised, padded actions ``(..., T, >= D)`` -> physical ``(..., T, D)``, float64.
-
-        ``states`` ``(D,)`` in physical units is needed when the statistics count actions from it.
-        """
-        scale = self._scales(stats)[1]
-        return scale.inverse(np.asarray(actions)[..., : scale.dim], states)
-
-    def inverse_states(self, states: npt.ArrayLike, stats: Mapping[str, Any]) -> Floats:
-        """Normalised, padded states ``(..., >= D)`` -> physical ``(..., D)``, float64."""
-        scale = self._scales(stats)[0]
-        return scale.inverse(np.asarray(states)[..., : scale.dim])
-
     def denormalizer(
         self, norm_stats: Mapping[str, Any], statistic_name: str = "private"
     ) -> DenormalizePrivateAction:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import (
@@ -29,7 +30,6 @@ from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-Sample = dict[str, Any]
 Floats = npt.NDArray[np.float32]
 
 

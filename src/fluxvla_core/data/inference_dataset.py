@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import InferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.transforms.images import stack_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.data.transforms.state_action import load_statistics
 from fluxvla_core.errors import ConfigError, DataError
-
-Sample = dict[str, Any]
 
 _KEYS = ("images", "img_masks", "lang_tokens", "lang_masks", "states", "embodiment_ids")
 

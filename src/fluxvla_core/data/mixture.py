@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import check_compatible, naming_warnings
@@ -19,7 +20,6 @@ from fluxvla_core.data.transforms.pipeline import deferring
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
-Sample = dict[str, Any]
 Ints = npt.NDArray[np.int64]
 
 

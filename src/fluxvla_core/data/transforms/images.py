@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Transform
 from fluxvla_core.errors import ConfigError, DataError
 
-Sample = dict[str, Any]
 Image = npt.NDArray[Any]
 Images = list[Image] | Image
 Row = npt.NDArray[np.float32] | None

@@ -12,11 +12,11 @@ import numpy as np
 
 from fluxvla_core.build import build_transform_from_cfg
 from fluxvla_core.contracts.contract import original
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.untrusted import read_json
 
-Sample = dict[str, Any]
 INDEX = "processors.json"
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import build_tokenizer_from_cfg
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
 
-Sample = dict[str, Any]
 Encoded = tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]
 
 

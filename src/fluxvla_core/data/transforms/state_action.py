@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Transform
 from fluxvla_core.data.statistics import (
     Affine,
@@ -20,7 +21,6 @@ from fluxvla_core.data.statistics import (
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.untrusted import read_json
 
-Sample = dict[str, Any]
 Floats = npt.NDArray[np.float64]
 
 

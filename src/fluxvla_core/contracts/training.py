@@ -143,7 +143,7 @@ class InferenceDataset(Contract):
     pipeline: Any = None
     """The ``Pipeline`` of its transforms, whose normalisation of actions is inverted."""
     statistic_name: str = "private"
-    """Which entry of the training's statistics that takes."""
+    """Which entry of the training's statistics is used."""
 
     @abstractmethod
     def __call__(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:

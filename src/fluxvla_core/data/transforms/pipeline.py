@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from fluxvla_core.build import build_transform_from_cfg
-from fluxvla_core.contracts.contract import original
+from fluxvla_core.contracts.contract import implements, original
 from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
@@ -88,8 +88,10 @@ class Pipeline:
         root = Path(folder)
         index: dict[str, str] = {}
         for transform in self.transforms:
-            tokenizer = transform.tokenizer and Tokenizer.adapt(transform.tokenizer)
-            if tokenizer is None or tokenizer.model_path is None:
+            if not implements(transform.tokenizer, Tokenizer, "save_pretrained"):
+                continue
+            tokenizer = Tokenizer.adapt(transform.tokenizer)
+            if tokenizer.model_path is None:
                 continue
             path = self._named.get(tokenizer.model_path, tokenizer.model_path)
             if path in index:

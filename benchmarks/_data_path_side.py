@@ -27,9 +27,8 @@ WARM_UP = 4
 
 
 def fluxvla(root: Path, kind: str, workers: int) -> Iterable[Any]:
-    from fluxvla_core.data.collator import DictCollator
     from fluxvla_core.data.dataset import ParquetDataset
-    from fluxvla_core.data.loader import make_loader
+    from fluxvla_core.data.loader import DictCollator, make_loader
     from fluxvla_core.data.sampler import EpochSampler
 
     cameras = CAMERAS if kind == "mp4" else ()

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from benchmarks._pi05_model import SIZES, BenchPi05
 from fluxvla_core import RunContext, build_runner_from_cfg
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.training import memory
 from fluxvla_core.training.batches import StepPlan, StepSampler

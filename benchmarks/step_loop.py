@@ -31,7 +31,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from benchmarks import _results
 from fluxvla_core import VLAS, RunContext, build_runner_from_cfg
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.testing.training import run_ranks
 
 MOST_RATIO, MOST_MS = 1.03, 0.15

@@ -31,8 +31,8 @@ from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.config.check import examine
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data import LeRobotWriter, ParquetDataset, Pipeline
+from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
-from fluxvla_core.data.validate import validate
 from fluxvla_core.errors import FluxError
 from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions

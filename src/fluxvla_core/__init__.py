@@ -30,6 +30,7 @@ _EXPORTS: dict[str, str] = {
     "FluxError": "fluxvla_core.errors",
     "Frame": "fluxvla_core.contracts.frame",
     "Hook": "fluxvla_core.contracts.runner",
+    "InferenceDataset": "fluxvla_core.contracts.training",
     "Joint": "fluxvla_core.spec.embodiment",
     "Metric": "fluxvla_core.contracts.training",
     "Observation": "fluxvla_core.contracts.frame",

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and folders that can be written in."""
+"""Write files atomically, and check that a folder can be written to."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from typing import Any
 from fluxvla_core.errors import UsageError
 
 FULL = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}
-"""What an OSError says where a disk, a quota or a limit on file sizes is used up."""
+"""``errno`` of an OSError where the disk, a quota or a limit on file sizes is exhausted."""
 
 
 def prepare_folder(path: Path, what: str, next: str) -> None:
-    """Make the folder and try to write in it, before any work is done for it.
+    """Create the folder and try to write to it, before any work is done for it.
 
     Args:
-        what: goes there, for the message.
-        next: the way on.
+        what: the folder's purpose, for the message.
+        next: what to do instead, for the message.
 
     Raises:
         UsageError: it cannot be made or written.
@@ -38,16 +38,16 @@ def prepare_folder(path: Path, what: str, next: str) -> None:
 
 
 _LINE = json.JSONEncoder(allow_nan=False)
-"""Kept, because making one takes a fifth of the time that a short line does."""
+"""Kept: creating one takes a fifth of the time that a short line does."""
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """``value`` as JSON. NaN and infinities, for which JSON has no word, are null."""
+    """``value`` as JSON. NaN and infinities, which JSON does not have, become null."""
     encoder = _LINE if indent is None else json.JSONEncoder(indent=indent, allow_nan=False)
     try:
         return encoder.encode(value)
     except (TypeError, ValueError):
-        # A number that JSON has no word for, or a mapping that is no dict.
+        # NaN, an infinity, or a mapping that is no dict.
         return encoder.encode(_finite(value))
 
 
@@ -62,9 +62,9 @@ def _finite(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text beside ``path``, in a folder that exists, and rename it there.
+    """Write UTF-8 text to a temporary file beside ``path``, in a folder that exists; rename it.
 
-    A reader never sees half a file; a writer that is killed leaves what was there before.
+    A reader never sees half a file; a process that is killed leaves the old one.
 
     Raises:
         OSError: it cannot be written; nothing is left beside it.

@@ -1,4 +1,4 @@
-"""Files that somebody else may have written: read within bounds, as the types they must have.
+"""Read untrusted files: regular files of bounded size, and JSON checked against a type.
 
 Every JSON file of a dataset, a checkpoint, a recording or a plugin is read through here, so that
 a pipe, a device, gigabytes, deep nesting or a value of another type is one error that names the
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 AT_MOST = 64 << 20
 """Bytes of a metadata file; the largest that are published have a few MB."""
-_SHOWN = 5  # problems of one file that are listed
+_SHOWN = 5  # problems of one file in a message
 
 
 def read_bytes(path: Path, error: type[FluxError], *, at_most: int = AT_MOST) -> bytes:
@@ -35,7 +35,7 @@ def read_bytes(path: Path, error: type[FluxError], *, at_most: int = AT_MOST) ->
             holds more than ``at_most`` bytes.
     """
     try:
-        # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
+        # Without O_NONBLOCK, opening a pipe waits for a writer.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -64,8 +64,8 @@ def read_json(path: Path, kind: type[T], error: type[FluxError], *, at_most: int
 def parse_json(content: bytes | str, kind: type[T], error: type[FluxError], where: str) -> T:
     """JSON as a ``kind``: a dataclass, a TypedDict, ``dict[str, float]``, …
 
-    Types are taken strictly: ``"3"`` and ``true`` are no numbers. Fields that ``kind`` does not
-    name are left out.
+    Types are checked strictly: ``"3"`` and ``true`` are no numbers. Fields that ``kind`` does not
+    have are ignored.
 
     Raises:
         error: it is no JSON, nested deeper than 200, or a field is missing or of another type.
@@ -76,7 +76,7 @@ def parse_json(content: bytes | str, kind: type[T], error: type[FluxError], wher
 
 
 def checked(value: object, kind: type[T], error: type[FluxError], where: str) -> T:
-    """``value``, which was parsed already, as a ``kind``; as strict as ``parse_json``.
+    """``value``, which was parsed before, as a ``kind``; as strict as ``parse_json``.
 
     Raises:
         error: a field is missing or of another type, or it is no JSON value.
@@ -94,7 +94,7 @@ def _validated(
     from pydantic import ValidationError
 
     try:
-        # typeshed has it that a class need not be hashable.
+        # To typeshed, a class may be unhashable.
         return validate(_adapter(kind))  # type: ignore[arg-type]
     except ValidationError as invalid:
         # Without the values: those of a damaged file may be of any length.

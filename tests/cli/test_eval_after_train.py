@@ -114,7 +114,7 @@ def test_under_torchrun_the_first_rank_evaluates_and_is_no_rank_then(
 
 TINY = """\
 from fluxvla_core import COLLATORS, DATASETS, RUNNERS, VLAS
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.testing import training
 
 for registry, made in (

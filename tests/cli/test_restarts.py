@@ -21,7 +21,7 @@ PLUGIN = '''\
 import os, signal, time
 from pathlib import Path
 from fluxvla_core import COLLATORS, DATASETS
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.testing import training
 
 

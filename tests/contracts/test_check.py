@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 import threading
 from abc import abstractmethod
 
@@ -310,6 +311,13 @@ def test_what_inherits_nothing_gets_the_defaults_and_keeps_all_of_its_own():
     assert implements(adapted, Environment, "step")
     with pytest.raises(AttributeError, match="Scene has no state"):
         _ = adapted.state
+
+
+def test_what_was_adapted_is_adapted_again_after_pickling():
+    adapted = pickle.loads(pickle.dumps(Environment.adapt(Scene())))  # noqa: S301
+    assert isinstance(adapted, Environment)
+    assert isinstance(original(adapted), Scene)
+    assert (adapted.step(5), adapted.state_hash()) == (5, None)
 
 
 def test_what_inherits_is_taken_as_it_is():

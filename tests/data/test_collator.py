@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fluxvla_core import build_collator_from_cfg
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.errors import DataError
 
 arrays = hnp.arrays(

@@ -16,8 +16,8 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.data import convert as convert_module
 from fluxvla_core.data.convert import convert
 from fluxvla_core.data.dataset import ParquetDataset
+from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.metadata import read_metadata
-from fluxvla_core.data.validate import validate
 from fluxvla_core.errors import DataError, RunFailed
 
 from .version2 import FPS, write_v2

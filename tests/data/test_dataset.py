@@ -10,9 +10,8 @@ import torch
 
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.data import frames
-from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.data.video_decode import VideoFile
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch

@@ -20,12 +20,11 @@ import pytest
 import torch
 
 from fluxvla_core.data.assemble import merge_datasets
-from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.convert import convert
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.inspection import validate
+from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.sampler import EpochSampler
-from fluxvla_core.data.validate import validate
 from fluxvla_core.policies.loading import load_policy
 from tools import lerobot_env, shell
 

@@ -20,8 +20,7 @@ import pytest
 import torch
 
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.data.collator import DictCollator
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.sampler import EpochSampler, Position, sample_rng
 from fluxvla_core.errors import ConfigError, DataError
 
@@ -219,7 +218,7 @@ def test_negative_workers_are_refused():
 TRAINER = """
 import multiprocessing, signal, sys, time
 import numpy as np
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 

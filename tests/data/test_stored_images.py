@@ -13,8 +13,8 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.data.convert import convert
 from fluxvla_core.data.dataset import ParquetDataset
+from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.data.validate import validate
 from fluxvla_core.data.video_decode import picture_size
 from fluxvla_core.errors import DataError
 

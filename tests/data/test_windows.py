@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.data.dataset import window
-from fluxvla_core.data.statistics import action_statistics
+from fluxvla_core.data.dataset import action_statistics, window
 
 
 @given(rows=st.integers(1, 30), data=st.data(), size=st.integers(1, 12))

@@ -10,8 +10,8 @@ import pytest
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.data.columns import read_columns
+from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.metadata import read_metadata
-from fluxvla_core.data.validate import validate
 from fluxvla_core.errors import DataError, SpecMismatch
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.to_dataset import recordings_to_dataset, row_times

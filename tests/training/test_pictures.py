@@ -10,9 +10,8 @@ from torch import nn
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.data.collator import DictCollator
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.data.transforms.images import SCALE

@@ -32,10 +32,10 @@ class Inspect:
         parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.data.describe import describe, lines
+        from fluxvla_core.data.inspection import describe, format_description
 
         facts = describe(Path(args.dataset))
-        say(json.dumps(facts, indent=1) if args.json else "\n".join(lines(facts)))
+        say(json.dumps(facts, indent=1) if args.json else "\n".join(format_description(facts)))
         return 0
 
 
@@ -51,7 +51,7 @@ class Validate:
         _log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.data.validate import validate
+        from fluxvla_core.data.inspection import validate
 
         with _reporter(args.log_format, sys.stdout) as reporter:
             warnings = validate(Path(args.dataset), reporter)
@@ -75,7 +75,11 @@ class Stats:
         _log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.data.describe import dataset_statistics, table, write_statistics
+        from fluxvla_core.data.inspection import (
+            dataset_statistics,
+            format_statistics,
+            write_statistics,
+        )
         from fluxvla_core.data.statistics import as_lists
 
         # The statistics are what comes out; how far they are is said beside them.
@@ -86,7 +90,7 @@ class Stats:
         if args.json:
             say(json.dumps({key: as_lists(entry) for key, entry in stats.items()}, indent=1))
         else:
-            say("\n".join(table(meta, stats)))
+            say("\n".join(format_statistics(meta, stats)))
         return 0
 
 

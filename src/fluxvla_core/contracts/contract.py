@@ -131,9 +131,16 @@ class _Adapter:
         names = {n for base in contract.__mro__ for n in vars(base) if base is not object}
         lacks = frozenset(n for n in names if _public(n) and not implements(made, contract, n))
         object.__setattr__(self, "_made", made)
+        object.__setattr__(self, "_contract", contract)
         object.__setattr__(self, "_lacks", lacks)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickled, for data workers, as what was adapted: its class is of this process alone."""
+        return object.__getattribute__(self, "_contract").adapt, (original(self),)
+
     def __getattribute__(self, name: str) -> Any:
+        if name == "__reduce_ex__":
+            return object.__getattribute__(self, name)
         made = object.__getattribute__(self, "_made")
         lacks = name in object.__getattribute__(self, "_lacks")
         # An object may set later what it lacked at first.

@@ -77,8 +77,7 @@ class VLA(Contract):
 class Dataset(Contract):
     """Map-style samples; everything random in one follows from (seed, epoch, index).
 
-    What prepares a robot's observations (``inference.dataset``) has ``__call__(observation)``
-    instead, and inherits nothing.
+    What prepares a robot's observations (``inference.dataset``) is an ``InferenceDataset``.
     """
 
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
@@ -120,13 +119,24 @@ class Dataset(Contract):
         raise NotImplementedError(f"{type(self).__name__} takes no statistics")
 
     @attribute
+    def pipeline(self) -> Any:
+        """The ``Pipeline`` of its transforms, whose tokenizers go into checkpoints."""
+        return None
+
+    @attribute
+    def statistic_name(self) -> str | None:
+        """The key of its entry in ``statistics``."""
+        return None
+
+    @attribute
     def statistics(self) -> Mapping[str, Any]:
         """``statistic_name`` -> what states and actions are normalised by; for checkpoints."""
         return {}
 
     @attribute
     def parts(self) -> Mapping[str, int]:
-        """Of a mixture: name of each dataset -> how many sample ids it has, in their order."""
+        """Name -> number of samples of each dataset of a mixture, in their order; losses are
+        reported by them."""
         return {}
 
     @attribute
@@ -159,11 +169,37 @@ class Dataset(Contract):
         return (("__len__", "get_sample"), ("__len__", "get_samples"), ("__call__",))
 
 
-class _Changes(Contract):
-    """What both kinds of transforms may have besides."""
+class InferenceDataset(Contract):
+    """Prepares a robot's observations: the arguments of a model's ``predict_action``."""
 
+    pipeline: Any = None
+    """The ``Pipeline`` of its transforms, whose normalisation of actions is inverted."""
+    statistic_name: str = "private"
+    """Which entry of the training's statistics is used."""
+
+    @abstractmethod
+    def __call__(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A batch of one observation."""
+
+
+class _AnyTransform(Contract):
+    """What ``Transform`` and ``RandomTransform``, whose calls differ, have in common."""
+
+    needs_rng: ClassVar[bool] = False
+    """Whether ``__call__`` takes a random number generator, too."""
     training_only: ClassVar[bool] = False
     """Whether a robot's observations do not pass it: augmentation, noise."""
+    keeps_images: ClassVar[bool] = False
+    """Whether its ``__call__`` neither reads nor changes images. Subclasses with another
+    ``__call__`` say so again."""
+    tokenizer: Any = None
+    """The tokenizer that it uses; goes into checkpoints."""
+
+    def warnings(
+        self, stats: Mapping[str, Any], states: Sequence[str], actions: Sequence[str]
+    ) -> list[str]:
+        """What is questionable in the statistics; ``states`` and ``actions`` are their names."""
+        return []
 
     def denormalizer(self, norm_stats: Mapping[str, Any], statistic_name: str) -> Any:
         """The transform that undoes what this one does to actions."""
@@ -174,18 +210,16 @@ class _Changes(Contract):
         raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
 
 
-class Transform(_Changes):
+class Transform(_AnyTransform):
     """Sample in, sample out; never changes the arrays that it was given."""
-
-    needs_rng: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, sample: Sample) -> Sample:
         """The changed sample."""
 
 
-class RandomTransform(_Changes):
-    """A transform that draws, by the generator that it is handed."""
+class RandomTransform(_AnyTransform):
+    """A transform that draws random numbers, from the generator that it is given."""
 
     needs_rng: ClassVar[bool] = True
 
@@ -207,6 +241,8 @@ class Tokenizer(Contract):
 
     padding_side: str = "right"
     pad_token_id: int | None = None
+    model_path: str | None = None
+    """Where it was loaded from, as a config says it."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

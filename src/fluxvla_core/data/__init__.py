@@ -29,11 +29,11 @@ from fluxvla_core import _lazy
 
 if TYPE_CHECKING:
     from fluxvla_core.data.assemble import merge_datasets as merge_datasets
-    from fluxvla_core.data.collator import DictCollator as DictCollator
     from fluxvla_core.data.dataset import ParquetDataset as ParquetDataset
     from fluxvla_core.data.inference_dataset import (
         PrivateInferenceDataset as PrivateInferenceDataset,
     )
+    from fluxvla_core.data.loader import DictCollator as DictCollator
     from fluxvla_core.data.mixture import DistributedRepeatingDataset as DistributedRepeatingDataset
     from fluxvla_core.data.pretrained import PretrainedTokenizer as PretrainedTokenizer
     from fluxvla_core.data.pretrained import model_folder as model_folder
@@ -49,9 +49,9 @@ __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
     {
         "fluxvla_core.data.assemble": ["merge_datasets"],
-        "fluxvla_core.data.collator": ["DictCollator"],
         "fluxvla_core.data.dataset": ["ParquetDataset"],
         "fluxvla_core.data.inference_dataset": ["PrivateInferenceDataset"],
+        "fluxvla_core.data.loader": ["DictCollator"],
         "fluxvla_core.data.mixture": ["DistributedRepeatingDataset"],
         "fluxvla_core.data.pretrained": [
             "PretrainedTokenizer",

@@ -41,7 +41,7 @@ MEGABYTE = 1024 * 1024
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """What all episodes of a dataset share. ``embodiment`` has the recorded images' sizes."""
+    """Settings common to all episodes of a dataset; ``embodiment`` has the images' sizes."""
 
     fps: float
     embodiment: EmbodimentSpec
@@ -84,16 +84,8 @@ def assemble(episodes: Sequence[Episode], out: Path, settings: DatasetSettings) 
     starts = np.cumsum([0, *map(len, episodes)])
     for column, start in zip(columns, starts, strict=False):
         column["index"] = column["frame_index"] + start
-    rows: list[dict[str, Any]] = [
-        {
-            "episode_index": i,
-            "tasks": [episode.task],
-            "length": len(episode),
-            "dataset_from_index": int(starts[i]),
-            "dataset_to_index": int(starts[i + 1]),
-            "meta/episodes/chunk_index": 0,
-            "meta/episodes/file_index": 0,
-        }
+    rows = [
+        episode_row(i, [episode.task], starts[i], starts[i + 1])
         for i, episode in enumerate(episodes)
     ]
     _write_data(columns, rows, out, features, settings)
@@ -101,17 +93,8 @@ def assemble(episodes: Sequence[Episode], out: Path, settings: DatasetSettings) 
         clips = [e.clips[key] for e in episodes]
         groups = split_by_size([clip.size for clip in clips], settings.video_file_mb * MEGABYTE)
         write_videos(key, clips, groups, rows, out, settings.fps)
-    for row, episode, column in zip(rows, episodes, columns, strict=True):
-        row.update(flat_statistics(statistics_of(episode.histograms, column)))
-    write_tables(rows, out, list(tasks))
+    write_meta(out, rows, list(tasks), columns, [e.histograms for e in episodes])
     _write_extras(episodes, out)
-    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
-    totals = {
-        k: np.sum([e.histograms[k] for e in episodes], axis=0) for k in episodes[0].histograms
-    }
-    write_json(
-        out / lerobot.STATS, {k: as_lists(s) for k, s in statistics_of(totals, whole).items()}
-    )
     write_json(out / lerobot.EMBODIMENT, settings.embodiment.to_dict())
     write_json(
         out / lerobot.INFO,
@@ -131,6 +114,28 @@ def assemble(episodes: Sequence[Episode], out: Path, settings: DatasetSettings) 
             "features": features,
         },
     )
+
+
+def episode_row(index: int, tasks: list[str], start: int, end: int) -> dict[str, Any]:
+    """An episode's row in the episode table; it has the dataset's rows ``start`` to ``end``."""
+    return {
+        "episode_index": index,
+        "tasks": tasks,
+        "length": int(end - start),
+        "dataset_from_index": int(start),
+        "dataset_to_index": int(end),
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+
+
+def make_path(out: Path, pattern: str, number: int, key: str = "") -> tuple[Path, dict[str, int]]:
+    """Path of the ``number``-th file of a kind, its folder made, and the numbers in the path."""
+    chunk, file = divmod(number, lerobot.CHUNK_FILES)
+    numbers = {"chunk_index": chunk, "file_index": file}
+    path = out / pattern.format(video_key=key, **numbers)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path, numbers
 
 
 def _columns(episode: Episode, index: int, task: int, fps: float) -> dict[str, Array]:
@@ -165,14 +170,12 @@ def _write_data(
     tables = [pa.table({k: column(a) for k, a in rows_of.items()}) for rows_of in columns]
     groups = split_by_size([t.nbytes for t in tables], settings.data_file_mb * MEGABYTE)
     for number, group in enumerate(groups):
-        chunk, file = lerobot.file_of(number)
-        path = out / lerobot.DATA.format(chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path, numbers = make_path(out, lerobot.DATA, number)
         with pq.ParquetWriter(path, tables[0].schema.with_metadata(metadata)) as writer:
             for i in group:
                 # One row group an episode lets a reader take single episodes.
                 writer.write_table(tables[i].replace_schema_metadata(metadata))
-                rows[i].update({"data/chunk_index": chunk, "data/file_index": file})
+                rows[i].update({f"data/{name}": value for name, value in numbers.items()})
 
 
 def write_videos(
@@ -185,21 +188,13 @@ def write_videos(
 ) -> None:
     """Join each group of clips into a file, and set in ``rows`` where each of them is."""
     for number, group in enumerate(groups):
-        chunk, file = lerobot.file_of(number)
-        path = out / lerobot.VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path, numbers = make_path(out, lerobot.VIDEO, number, key)
         join_clips([clips[i] for i in group], path, fps)
         done = 0
         for i in group:
             end = done + clips[i].frames
-            rows[i].update(
-                {
-                    f"videos/{key}/chunk_index": chunk,
-                    f"videos/{key}/file_index": file,
-                    f"videos/{key}/from_timestamp": done / fps,
-                    f"videos/{key}/to_timestamp": end / fps,
-                }
-            )
+            place = {**numbers, "from_timestamp": done / fps, "to_timestamp": end / fps}
+            rows[i].update({f"videos/{key}/{name}": value for name, value in place.items()})
             done = end
 
 
@@ -216,10 +211,44 @@ def split_by_size(sizes: Sequence[float], limit: float) -> list[list[int]]:
     return groups
 
 
-def statistics_of(
+def write_meta(
+    out: Path,
+    rows: Sequence[dict[str, Any]],
+    tasks: Sequence[str],
+    columns: Sequence[Mapping[str, Array]],
+    histograms: Sequence[Mapping[str, npt.NDArray[np.int64]]],
+) -> None:
+    """Write the tables of episodes and of tasks, and the statistics.
+
+    Args:
+        rows: of the episode table; each gets its episode's statistics.
+        tasks: by ``task_index``.
+        columns: of each episode, feature -> ``(n,)`` or ``(n, D)``.
+        histograms: of each episode, camera -> ``(3, 256)`` pixel counts.
+    """
+    pa = arrow()
+    pq = parquet()
+
+    for row, values, counts in zip(rows, columns, histograms, strict=True):
+        for key, entry in _statistics(counts, values).items():
+            row.update({f"stats/{key}/{name}": value for name, value in as_lists(entry).items()})
+    path, _ = make_path(out, lerobot.EPISODES, 0)
+    # Integers and lists of one episode have the types of all: the rows are alike.
+    pq.write_table(pa.Table.from_pylist(list(rows)), path)
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": list(tasks)})
+    pq.write_table(
+        table.replace_schema_metadata({"pandas": lerobot.pandas_schema()}), out / lerobot.TASKS
+    )
+    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
+    totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in histograms[0]}
+    stats = _statistics(totals, whole)
+    write_json(out / lerobot.STATS, {key: as_lists(entry) for key, entry in stats.items()})
+
+
+def _statistics(
     histograms: Mapping[str, npt.NDArray[np.int64]], columns: Mapping[str, Array]
 ) -> dict[str, Stats]:
-    """Compute statistics of each feature: cameras by pixel counts, columns ``(n, …)`` by rows."""
+    """Statistics of each feature: cameras by pixel counts, columns ``(n, …)`` by rows."""
     frames = len(columns["index"])
     stats = {key: histogram_statistics(h, frames) for key, h in histograms.items()}
     for key, values in columns.items():
@@ -228,30 +257,6 @@ def statistics_of(
             for name in ("min", "max"):
                 stats[key][name] = stats[key][name].astype(np.int64)
     return stats
-
-
-def flat_statistics(stats: Mapping[str, Stats]) -> dict[str, Any]:
-    """One episode's statistics as entries of its row in the episode table."""
-    return {
-        f"stats/{key}/{name}": value
-        for key, entry in stats.items()
-        for name, value in as_lists(entry).items()
-    }
-
-
-def write_tables(rows: Sequence[dict[str, Any]], out: Path, tasks: Sequence[str]) -> None:
-    """Write the tables of episodes and of tasks, the latter by ``task_index``."""
-    pa = arrow()
-    pq = parquet()
-
-    path = out / lerobot.EPISODES.format(chunk_index=0, file_index=0)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Integers and lists of one episode have the types of all: the rows are alike.
-    pq.write_table(pa.Table.from_pylist(list(rows)), path)
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": list(tasks)})
-    pq.write_table(
-        table.replace_schema_metadata({"pandas": lerobot.pandas_schema()}), out / lerobot.TASKS
-    )
 
 
 def _write_extras(episodes: Sequence[Episode], out: Path) -> None:
@@ -310,13 +315,7 @@ def _settings_of(meta: Metadata) -> DatasetSettings:
     codec = next((name for name, c in CODECS.items() if streams <= {c.stream}), None)
     if codec is None:
         raise DataError(f"{meta.root}: video codecs {sorted(streams)} cannot be merged")
-    return DatasetSettings(
-        meta.fps,
-        meta.embodiment,
-        codec,
-        robot,
-        *kept,
-    )
+    return DatasetSettings(meta.fps, meta.embodiment, codec, robot, *kept)
 
 
 def _check_same_settings(first: DatasetSettings, one: Metadata, other: Metadata) -> None:

@@ -1,6 +1,6 @@
-"""Load a dataset into memory: its columns as arrays, its camera frames as places in files.
+"""Load a dataset's columns into memory, and find its camera frames in their files.
 
-Also here: whether datasets that are used together are of one robot.
+Also checks whether datasets that are used together are of one robot.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.files import arrow, read_json, read_table
-from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.tables import FileId
+from fluxvla_core.data.metadata import FileId, Metadata, read_metadata
 from fluxvla_core.data.video_decode import (
     ExpectedVideo,
     ImageColumn,
@@ -32,7 +31,7 @@ Floats = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Track:
-    """Where one camera's frames are: frame ``row`` is in ``files[file[row]]`` at ``time[row]`` s.
+    """Index of one camera's frames: frame ``row`` is in ``files[file[row]]`` at ``time[row]`` s.
 
     For image columns of parquet files, ``time`` is the row in the file.
     """

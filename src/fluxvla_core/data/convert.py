@@ -1,8 +1,8 @@
 """Convert LeRobot datasets of v2.0 and v2.1 to v3.0: ``fluxvla data convert``.
 
-Rows, with the images in them, and video packets are copied as they are. Statistics are recomputed,
-exactly: version 2 has no quantiles, and estimates those of images from samples. That decodes every
-frame, so the result is known to be complete.
+Rows, with the images in them, and video packets are copied unchanged. Statistics are recomputed
+exactly: version 2 has no quantiles, and estimates those of images from samples. This decodes every
+frame, and so checks that the dataset is complete.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data import lerobot
 from fluxvla_core.data.assemble import (
     MEGABYTE,
-    flat_statistics,
+    episode_row,
+    make_path,
     split_by_size,
-    statistics_of,
-    write_tables,
+    write_meta,
     write_videos,
 )
 from fluxvla_core.data.columns import has_width, read_columns
 from fluxvla_core.data.files import arrow, built_aside, parquet, read_table, write_json
 from fluxvla_core.data.metadata import Metadata, read_metadata
-from fluxvla_core.data.statistics import LEVELS, as_lists, image_histogram
-from fluxvla_core.data.video_decode import ImageColumn, Source, open_source
+from fluxvla_core.data.statistics import LEVELS, image_histogram
+from fluxvla_core.data.video_decode import ImageColumn, Source, read_frames
 from fluxvla_core.data.video_encode import Clip, whole_clip
 from fluxvla_core.errors import DataError
 
@@ -64,17 +64,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, reporter: Reporte
     rows: list[dict[str, Any]] = []
     for i, (start, end) in enumerate(zip(episodes.first_row, episodes.end_row, strict=True)):
         texts = dict.fromkeys(meta.tasks[t] for t in tasks[start:end])
-        rows.append(
-            {
-                "episode_index": i,
-                "tasks": list(texts),
-                "length": int(end - start),
-                "dataset_from_index": int(start),
-                "dataset_to_index": int(end),
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-            }
-        )
+        rows.append(episode_row(i, list(texts), start, end))
     columns = _copy_rows(meta, rows, out)
     histograms: list[dict[str, Counts]] = [{} for _ in rows]
     frames = int(episodes.lengths.sum())
@@ -97,13 +87,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, reporter: Reporte
         if clips:
             groups = _groups(clips, parameters)
             write_videos(key, clips, groups, rows, out, meta.fps)
-    for row, counts, values in zip(rows, histograms, columns, strict=True):
-        row.update(flat_statistics(statistics_of(counts, values)))
-    write_tables(rows, out, meta.tasks)
-    whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
-    totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in meta.cameras}
-    stats = statistics_of(totals, whole)
-    write_json(out / lerobot.STATS, {key: as_lists(entry) for key, entry in stats.items()})
+    write_meta(out, rows, meta.tasks, columns, histograms)
     if (meta.root / lerobot.EMBODIMENT).is_file():
         shutil.copyfile(meta.root / lerobot.EMBODIMENT, out / lerobot.EMBODIMENT)
     gone = ("total_chunks", "total_videos")
@@ -132,9 +116,7 @@ def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> lis
     columns: list[Columns] = []
     schema: Any = None
     for number, group in enumerate(split_by_size(sizes, lerobot.DATA_FILE_MB * MEGABYTE)):
-        chunk, file = lerobot.file_of(number)
-        path = out / lerobot.DATA.format(chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path, numbers = make_path(out, lerobot.DATA, number)
         writer: Any = None
         for i in group:
             table = _rows(paths[i], names, rows[i]["dataset_from_index"])
@@ -147,7 +129,7 @@ def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> lis
                 ) from error
             writer = writer or pq.ParquetWriter(path, schema)
             writer.write_table(table)
-            rows[i].update({"data/chunk_index": chunk, "data/file_index": file})
+            rows[i].update({f"data/{name}": value for name, value in numbers.items()})
             columns.append(_numbers(table))
         writer.close()
     # What has gaps in one episode has no statistics in any.
@@ -186,14 +168,10 @@ def _numbers(table: Any) -> Columns:
 
 
 def _count_pixels(source: Source, frames: int, period: float) -> Counts:
-    pictures = open_source(source)
-    try:
-        counts = np.zeros((3, LEVELS), np.int64)
-        for i in range(frames):
-            counts += image_histogram(pictures.read(i * period))
-        return counts
-    finally:
-        pictures.close()
+    counts = np.zeros((3, LEVELS), np.int64)
+    for image in read_frames(source, (i * period for i in range(frames))):
+        counts += image_histogram(image)
+    return counts
 
 
 def _groups(clips: Sequence[Clip], parameters: Sequence[bytes]) -> list[list[int]]:

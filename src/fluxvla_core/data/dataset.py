@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import (
@@ -23,13 +24,12 @@ from fluxvla_core.data.columns import (
 )
 from fluxvla_core.data.frames import Frames
 from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, sample_rng
-from fluxvla_core.data.statistics import action_statistics, as_lists, column_statistics
+from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joined_statistics
 from fluxvla_core.data.transforms.images import join_planes, split_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-Sample = dict[str, Any]
 Floats = npt.NDArray[np.float32]
 
 
@@ -78,6 +78,8 @@ class ParquetDataset(Dataset):
     """
 
     action_window_size: int
+    pipeline: Pipeline
+    statistic_name: str
 
     def __init__(
         self,
@@ -138,7 +140,7 @@ class ParquetDataset(Dataset):
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
-        """The robot, as far as anybody says; with ``use_delta`` its actions are deltas."""
+        """The robot, None if unknown; with ``use_delta`` its actions are deltas."""
         if self._embodiment is not None and self.use_delta:
             return replace(self._embodiment, action_mode="delta")
         return self._embodiment
@@ -176,9 +178,7 @@ class ParquetDataset(Dataset):
         """
         first, stats = self.loaded[0], self.statistics[self.statistic_name]
         names = first.state_names, first.action_names
-        asked = [t for t in self.pipeline.transforms if hasattr(t, "warnings")]
-        found = [warning for transform in asked for warning in transform.warnings(stats, *names)]
-        return [*naming_warnings(self.loaded), *found]
+        return [*naming_warnings(self.loaded), *self.pipeline.warnings(stats, *names)]
 
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
         """Normalise by these instead of the dataset's own: ``{"proprio": …, "action": …}``."""
@@ -190,7 +190,7 @@ class ParquetDataset(Dataset):
             self.seed = seed
 
     def deferring(self) -> ParquetDataset | None:
-        """The same samples with images left to be normalised on the device; None if that cannot be.
+        """The same samples with images to be normalised on the device; None if impossible.
 
         It shares frames and settings with this one, and is for reading only.
         """
@@ -204,9 +204,6 @@ class ParquetDataset(Dataset):
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""
         self._frames.prepare(reporter or SilentReporter())
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.get_sample(index, 0)
 
     def get_sample(self, index: int, epoch: int) -> Sample:
         """Sample ``index`` as ``epoch`` sees it."""
@@ -282,6 +279,60 @@ def pooled_statistics(datasets: Sequence[ParquetDataset]) -> dict[str, Any]:
         first.per_step_statistics,
     )
     return {"proprio": as_lists(column_statistics(states)), "action": action}
+
+
+def action_statistics(
+    datasets: Sequence[LoadedDataset],
+    size: int,
+    first_action: int,
+    relative: npt.NDArray[np.bool_] | None,
+    per_step: bool,
+) -> dict[str, Any]:
+    """Statistics of the actions that samples show, as JSON values.
+
+    Args:
+        size, first_action: of the window.
+        relative: ``(D,)``; where True, actions are counted from the state at the window's frame.
+        per_step: give ``(size, D)`` statistics, one row for each step of the window.
+
+    Plain actions are counted once a frame of the chosen episodes; relative or per-step ones once
+    for each window that they occur in.
+    """
+    if relative is None and not per_step:
+        rows = np.concatenate([r.actions[r.chosen] for r in datasets])
+        return as_lists(column_statistics(rows))
+    if per_step:
+        # The last steps of a window longer than every episode occur nowhere.
+        each: list[Stats] = []
+        for j in range(size):
+            rows = _step(datasets, first_action + j, relative, slice(None))
+            each.append(column_statistics(rows) if len(rows) else each[0])
+        stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
+    else:
+        stats = joined_statistics(
+            lambda dims: (_step(datasets, first_action + j, relative, dims) for j in range(size))
+        )
+    found = as_lists(stats)
+    if relative is not None:
+        found["relative"] = relative.astype(int).tolist()
+    return found
+
+
+def _step(
+    datasets: Sequence[LoadedDataset],
+    ahead: int,
+    relative: npt.NDArray[np.bool_] | None,
+    dims: slice,
+) -> npt.NDArray[np.float32]:
+    """Actions ``ahead`` rows after each usable one, where they are within the episode."""
+    parts = []
+    for one in datasets:
+        rows = one.rows[one.rows + ahead < one.end[one.rows]]
+        actions = one.actions[:, dims][rows + ahead]
+        if relative is not None:
+            actions = actions - one.states[:, : len(relative)][:, dims][rows] * relative[dims]
+        parts.append(actions)
+    return np.concatenate(parts)
 
 
 def window(actions: Floats, first: int, end: int, size: int) -> tuple[Floats, Floats]:

@@ -1,7 +1,7 @@
-"""Files of a dataset: packages imported on demand, reading with checks, writing in one step.
+"""Read and write files of a dataset: parquet, JSON, staging folders; optional packages.
 
 A dataset is written into a staging folder beside it, ``.<name>.writing``, and renamed when it is
-whole. Whatever is wrong with a file is reported with its path.
+complete. Errors name the file.
 """
 
 from __future__ import annotations

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
+from fluxvla_core.contracts.training import InferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.transforms.images import stack_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.data.transforms.state_action import load_statistics
 from fluxvla_core.errors import ConfigError, DataError
 
-Sample = dict[str, Any]
-
 _KEYS = ("images", "img_masks", "lang_tokens", "lang_masks", "states", "embodiment_ids")
 
 
-class PrivateInferenceDataset:
-    """Callable: an observation becomes what the model's ``predict_action`` takes.
+class PrivateInferenceDataset(InferenceDataset):
+    """Prepares an observation: the arguments of the model's ``predict_action``.
 
-    The same transforms as in training, without those that only training wants, give ``images``
+    The same transforms as in training, without ``training_only`` ones, give ``images``
     ``(1, 3N, H, W)``, ``img_masks`` ``(1, N)`` all True, ``lang_tokens`` and ``lang_masks``
     ``(1, L)``, ``states`` ``(1, D)`` float32 and, if set, ``embodiment_ids`` ``(1,)`` int64:
     torch tensors on the CPU.

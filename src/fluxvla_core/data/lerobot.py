@@ -63,7 +63,7 @@ INDEX_FEATURES: Mapping[str, str] = {
 }
 
 MOST_PIXELS = 64_000_000
-"""The most pixels of an image, 192 MB in memory; 8K video has 33 million."""
+"""The most pixels of an image that is decoded, 192 MB; 8K video has 33 million."""
 _NUMBERS = frozenset({"chunk_index", "file_index", "episode_chunk", "episode_index"})
 _KEY = "video_key"
 _WIDTH = re.compile(r"(?:0?\d{1,2})?d?")  # of LeRobot's: 03d, 06d
@@ -77,11 +77,6 @@ def image_feature(camera: str) -> str:
 def camera_name(feature: str) -> str:
     """``observation.images.top`` -> ``top``."""
     return feature.removeprefix(IMAGES)
-
-
-def file_of(number: int) -> tuple[int, int]:
-    """``(chunk_index, file_index)`` of the ``number``-th file of a kind."""
-    return divmod(number, CHUNK_FILES)
 
 
 def describe_features(

@@ -1,4 +1,4 @@
-"""A torch ``DataLoader`` whose batches do not depend on the number of its workers."""
+"""``DictCollator``, and a torch ``DataLoader`` whose batches do not depend on its worker count."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import multiprocessing
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.contracts.training import Dataset
+from fluxvla_core.contracts.training import Collator, Dataset
 from fluxvla_core.data.sampler import (
     DEFAULT_SEED,
-    EpochSampler,
     SampleKey,
     drop_kept_normal,
     global_generators,
-    read_samples,
 )
-from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.data.transforms.images import SCALE
+from fluxvla_core.errors import ConfigError, DataError, FluxError
 from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
 # Of malloc.h, and bytes: the largest piece that comes from the heap, and what the heap may keep.
@@ -31,16 +32,53 @@ _LARGE, _KEPT = 32 << 20, 1 << 30
 _END_S = 1.0  # between the end of a connection and that of the process that had it
 
 
-class Loader:
-    """An endless iterable of batches, from ``sampler.start`` on; ``make_loader`` builds it.
+class DictCollator(Collator):
+    """Collate samples: stack the keys that a model computes with, list the others.
 
-    Prefetching runs ahead of training, so a position counts batches that were *used*:
-    ``sampler.advance(start, used)``.
+    Args:
+        keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.
+        meta_keys: kept as plain lists, one entry a sample.
+
+    What is left of normalising pictures (``image_scale``) is stacked without being listed.
+
+    Keys that are configured but that no sample has are left out: one list serves datasets with
+    and without ``embodiment_ids``.
+
+    Raises:
+        DataError: a sample has a key in neither list or one that another sample lacks, or its
+            value cannot be stacked.
     """
 
-    def __init__(self, inner: Any, sampler: EpochSampler) -> None:
+    def __init__(
+        self, keys: Sequence[str] | None = None, meta_keys: Sequence[str] | None = None
+    ) -> None:
+        self.keys = tuple(keys or ())
+        self.meta_keys = tuple(meta_keys or ())
+
+    def __call__(self, samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        if not samples:
+            raise DataError("there are no samples to make a batch of")
+        batch: dict[str, Any] = {}
+        for sample in samples:
+            _check_keys(samples[0], sample)
+        for key in samples[0]:
+            if key in self.keys or key == SCALE:
+                batch[key] = _stack(key, [sample[key] for sample in samples])
+            elif key in self.meta_keys:
+                batch[key] = [sample[key] for sample in samples]
+            else:
+                raise DataError(
+                    f"sample key {key!r} is in neither keys nor meta_keys of the collator",
+                    next=f"add {key!r} to the collator's keys (to stack) or meta_keys (to list)",
+                )
+        return batch
+
+
+class Loader:
+    """An iterable of batches, as many as the sampler has; ``make_loader`` builds it."""
+
+    def __init__(self, inner: Any) -> None:
         self.inner = inner
-        self.sampler = sampler
 
     def __iter__(self) -> Iterator[Any]:
         context = getattr(self.inner, "multiprocessing_context", None) or multiprocessing
@@ -72,7 +110,7 @@ class Loader:
 def make_loader(
     dataset: Any,
     collator: Callable[[Sequence[Any]], Any],
-    sampler: EpochSampler,
+    sampler: Iterable[list[SampleKey]],
     num_workers: int = 0,
     pin_memory: bool = False,
     prefetch_factor: int = 2,
@@ -83,8 +121,9 @@ def make_loader(
     """Build a loader of batches of ``dataset`` in the order of ``sampler``.
 
     Args:
-        dataset: has ``get_sample(index, epoch)``, or ``get_samples(keys)`` for grouped reads;
-            ``prepare(reporter)`` is called first where there is one.
+        dataset: a ``Dataset``, or an object with its methods; ``prepare(reporter)`` is called
+            first, then ``get_samples(keys)`` for each batch.
+        sampler: the keys of each batch.
         num_workers: 0 loads in this process. Workers inherit decoded frames by forking.
         pin_memory: for a GPU.
         multiprocessing_context: ``fork``, ``forkserver`` or ``spawn``; torch's default if None.
@@ -99,7 +138,8 @@ def make_loader(
 
     if num_workers < 0:
         raise ConfigError(f"per_device_num_workers must be at least 0, got {num_workers}")
-    Dataset.adapt(dataset).prepare(reporter or SilentReporter())
+    dataset = Dataset.adapt(dataset)
+    dataset.prepare(reporter or SilentReporter())
     keyed: Any = _Keyed(dataset, collator, seed)
     inner: DataLoader[Any] = DataLoader(
         keyed,
@@ -114,7 +154,7 @@ def make_loader(
         # would make a resumed run differ from an uninterrupted one.
         generator=torch.Generator().manual_seed(0),
     )
-    return Loader(inner, sampler)
+    return Loader(inner)
 
 
 def _init_worker(worker: int) -> None:
@@ -185,7 +225,9 @@ class _Keyed:
     therefore seeded for each batch, which then is the same whoever makes it, and restored.
     """
 
-    def __init__(self, dataset: Any, collator: Callable[[Sequence[Any]], Any], seed: int) -> None:
+    def __init__(
+        self, dataset: Dataset, collator: Callable[[Sequence[Any]], Any], seed: int
+    ) -> None:
         self.dataset = dataset
         self.collator = collator
         self.seed = seed
@@ -193,10 +235,41 @@ class _Keyed:
     def __getitems__(self, keys: list[SampleKey]) -> Any:
         try:
             with global_generators(self.seed, keys[0].epoch, keys[0].index):
-                return self.collator(read_samples(self.dataset, keys))
+                return self.collator(self.dataset.get_samples(keys))
         except FluxError as error:
             return _Failed(error)
 
 
 def _identity(batch: Any) -> Any:
     return batch
+
+
+def _check_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    differing = sorted(one.keys() ^ other.keys())
+    if differing:
+        without = other if differing[0] in one else one
+        raise DataError(
+            f"sample key {differing[0]!r} is missing in one sample of the batch; it has "
+            f"{sorted(without)}",
+            cause="datasets of a mixture that do not give the same, embodiment_id for example",
+        )
+
+
+def _stack(key: str, values: list[Any]) -> Any:
+    import torch
+
+    first = values[0]
+    try:
+        if isinstance(first, torch.Tensor):
+            return torch.stack(values)
+        if isinstance(first, np.ndarray | np.generic):
+            return torch.from_numpy(np.stack(values))
+    except (TypeError, ValueError, RuntimeError) as error:
+        shapes = sorted({str(tuple(np.shape(value))) for value in values})
+        raise DataError(
+            f"sample key {key!r} cannot be stacked: shapes {', '.join(shapes)} ({error})"
+        ) from error
+    raise DataError(
+        f"sample key {key!r} is listed in keys, but {type(first).__name__} cannot be stacked",
+        next=f"move {key!r} to the collator's meta_keys",
+    )

@@ -1,4 +1,14 @@
-"""Read and check a dataset's ``meta/``: features, tasks, episodes and the robot; no frames."""
+"""Read and check a dataset's ``meta/``, in versions 2.0, 2.1 and 3.0; no rows and no frames.
+
+Version 3.0 keeps the tables of episodes and tasks as parquet, version 2 as JSON lines:
+
+    meta/episodes.jsonl     {"episode_index": 1, "tasks": ["…"], "length": 266}
+    meta/tasks.jsonl        {"task_index": 1, "task": "…"}
+    data/chunk-000/episode_000001.parquet
+    videos/chunk-000/<feature>/episode_000001.mp4
+
+Source: LeRobot 0.3 (codebase version v2.1); 2.0 keeps its statistics elsewhere, which are not read.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +19,65 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from fluxvla_core.bounds import Count
 from fluxvla_core.data import lerobot
-from fluxvla_core.data.files import read_json, staging_of
+from fluxvla_core.data.files import (
+    arrow,
+    read_json,
+    read_json_lines,
+    read_table,
+    seconds,
+    staging_of,
+    whole_numbers,
+)
 from fluxvla_core.data.lerobot import check_info, fill
-from fluxvla_core.data.tables import Episodes, FileId, read_episodes, read_tasks, tasks_file
 from fluxvla_core.errors import DataError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
+Ints = npt.NDArray[np.int64]
+FileId = tuple[int, int]
+
+_TASKS_V2 = "meta/tasks.jsonl"
+_EPISODES_V2 = "meta/episodes.jsonl"
 _MOST_TASKS = 1_000_000
 """The largest dataset that is published, DROID, has some 50,000 instructions."""
 VERSIONS = ("v2.0", "v2.1", lerobot.VERSION)
 
 
 @dataclass(frozen=True)
+class VideoPlaces:
+    """Where each episode's video is: ``(chunk, file)`` and its start in seconds."""
+
+    files: Sequence[FileId]
+    starts: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The episode table, one entry an episode; rows count over the whole dataset."""
+
+    first_row: Ints
+    end_row: Ints
+    files: Sequence[FileId]
+    videos: Mapping[str, VideoPlaces]
+
+    def __len__(self) -> int:
+        return len(self.first_row)
+
+    @property
+    def lengths(self) -> Ints:
+        return self.end_row - self.first_row
+
+
+@dataclass(frozen=True)
 class Metadata:
-    """A dataset's ``meta/``. ``tasks[i]`` is the instruction with ``task_index`` i."""
+    """A dataset's ``meta/``.
+
+    ``tasks[i]`` is the instruction with ``task_index`` i; ``embodiment`` the robot that FluxVLA
+    recorded it with, None for datasets of other programs.
+    """
 
     root: Path
     info: Mapping[str, Any]
@@ -40,7 +93,7 @@ class Metadata:
     @property
     def tasks_file(self) -> str:
         """The file of the instructions, below ``root``."""
-        return tasks_file(self.version)
+        return _tasks_file(self.version)
 
     @property
     def fps(self) -> float:
@@ -140,20 +193,11 @@ def read_metadata(root: Path) -> Metadata:
 
     Raises:
         DataError: no such folder, not a dataset, of another version, empty, or damaged.
+        SpecMismatch: the file of its robot is not an embodiment.
     """
     info = _read_info(root)
-    episodes = read_episodes(root, info)
-    numbered = read_tasks(root, info["codebase_version"])
-    if max(numbered, default=0) >= _MOST_TASKS:
-        raise DataError(
-            f"{root}: task_index {max(numbered)}, {_MOST_TASKS} instructions are the most that "
-            "are read",
-            cause="the table of tasks was damaged, or made by hand",
-        )
-    for index, text in numbered.items():
-        if not isinstance(text, str):
-            raise DataError(f"{root}: task_index {index} has no instruction, but {text!r}")
-    tasks = tuple(numbered.get(i, "") for i in range(max(numbered, default=-1) + 1))
+    episodes = _read_episodes(root, info)
+    tasks = _read_tasks(root, info["codebase_version"])
     frames = int(episodes.lengths.sum())
     for what, stated, found in (
         ("episodes", info["total_episodes"], len(episodes)),
@@ -170,17 +214,9 @@ def read_metadata(root: Path) -> Metadata:
             f"{root}: episode {empty[0]} has {episodes.lengths[empty[0]]} frames",
             cause="it was never recorded, or the episode table was edited",
         )
-    return Metadata(root, info, tasks, episodes, read_embodiment(root))
-
-
-def read_embodiment(root: Path) -> EmbodimentSpec | None:
-    """The robot that FluxVLA recorded the dataset with; None for datasets of other programs.
-
-    Raises:
-        DataError: the file is not JSON. SpecMismatch: it is not an embodiment.
-    """
     path = root / lerobot.EMBODIMENT
-    return EmbodimentSpec.from_dict(read_json(path)) if path.is_file() else None
+    embodiment = EmbodimentSpec.from_dict(read_json(path)) if path.is_file() else None
+    return Metadata(root, info, tasks, episodes, embodiment)
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -243,3 +279,122 @@ def _numbers(file: FileId) -> dict[str, int]:
         "episode_chunk": chunk,
         "episode_index": number,
     }
+
+
+def _tasks_file(version: str) -> str:
+    return lerobot.TASKS if version == lerobot.VERSION else _TASKS_V2
+
+
+def _read_tasks(root: Path, version: str) -> tuple[str, ...]:
+    """Instructions by ``task_index``, empty where there is none; rows may come in any order.
+
+    Raises:
+        DataError: the table is missing, damaged, or is not a table of tasks.
+    """
+    path = root / _tasks_file(version)
+    if version == lerobot.VERSION:
+        numbered = _tasks_v3(path)
+    else:
+        numbered = {row.task_index: row.task for row in read_json_lines(path, _TaskLine)}
+    last = max(numbered, default=-1)
+    if last >= _MOST_TASKS:
+        raise DataError(
+            f"{root}: task_index {last}, {_MOST_TASKS} instructions are the most that are read",
+            cause="the table of tasks was damaged, or made by hand",
+        )
+    for index, text in numbered.items():
+        if not isinstance(text, str):
+            raise DataError(f"{root}: task_index {index} has no instruction, but {text!r}")
+    return tuple(numbered.get(i, "") for i in range(last + 1))
+
+
+def _tasks_v3(path: Path) -> dict[int, Any]:
+    table = read_table(path)
+    text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
+    if text is None or "task_index" not in table.column_names:
+        raise DataError(f"{path}: columns {table.column_names} hold no tasks")
+    index = whole_numbers(table, "task_index", str(path)).tolist()
+    return dict(zip(index, table[text].to_pylist(), strict=True))
+
+
+def _read_episodes(root: Path, info: Mapping[str, Any]) -> Episodes:
+    """The episode table of the dataset whose ``meta/info.json`` is ``info``.
+
+    Raises:
+        DataError: it is missing, damaged, or skips or repeats an episode.
+    """
+    videos = [k for k, f in info["features"].items() if f["dtype"] == "video"]
+    if info["codebase_version"] == lerobot.VERSION:
+        return _episodes_v3(root, videos)
+    return _episodes_v2(root, videos, info.get("chunks_size", lerobot.CHUNK_EPISODES))
+
+
+@dataclass(frozen=True)
+class _TaskLine:
+    task_index: Count
+    task: Any = None
+
+
+@dataclass(frozen=True)
+class _EpisodeLine:
+    episode_index: Count
+    length: Count
+
+
+def _episodes_v2(root: Path, videos: Sequence[str], chunk: int) -> Episodes:
+    """One data file and one video a camera for each episode; ``chunk`` episodes a folder."""
+    lines = read_json_lines(root / _EPISODES_V2, _EpisodeLine)
+    rows = [(line.episode_index, line.length) for line in lines]
+    table = np.array(sorted(rows), np.int64).reshape(-1, 2)
+    _check_numbering(root, table[:, 0])
+    end = np.cumsum(table[:, 1])
+    files = [(i // chunk, i) for i in range(len(rows))]
+    starts = np.zeros(len(rows))
+    return Episodes(end - table[:, 1], end, files, {k: VideoPlaces(files, starts) for k in videos})
+
+
+def _episodes_v3(root: Path, videos: Sequence[str]) -> Episodes:
+    pa = arrow()
+
+    paths = sorted(root.glob("meta/episodes/*/*.parquet"))
+    if not paths:
+        raise DataError(f"{root}: meta/episodes holds no episode table")
+    columns = [
+        *("episode_index", "dataset_from_index", "dataset_to_index"),
+        *("data/chunk_index", "data/file_index"),
+        *(
+            f"videos/{k}/{n}"
+            for k in videos
+            for n in ("chunk_index", "file_index", "from_timestamp")
+        ),
+    ]
+    parts = [read_table(path, columns) for path in paths]
+    try:
+        table = pa.concat_tables(parts, promote_options="permissive").sort_by("episode_index")
+    except pa.ArrowException as error:
+        raise DataError(
+            f"{root}: the files of meta/episodes are not of the same columns ({error})"
+        ) from error
+    where = f"{root}: meta/episodes"
+
+    def whole(name: str) -> Ints:
+        return whole_numbers(table, name, where)
+
+    def files(prefix: str) -> list[FileId]:
+        chunk, file = (whole(f"{prefix}/{n}_index").tolist() for n in ("chunk", "file"))
+        return list(zip(chunk, file, strict=True))
+
+    _check_numbering(root, whole("episode_index"))
+    starts = {k: seconds(table, f"videos/{k}/from_timestamp", where) for k in videos}
+    return Episodes(
+        whole("dataset_from_index"),
+        whole("dataset_to_index"),
+        files("data"),
+        {k: VideoPlaces(files(f"videos/{k}"), starts[k]) for k in videos},
+    )
+
+
+def _check_numbering(root: Path, numbers: Ints) -> None:
+    """Refuse an episode table (sorted) that skips or repeats an episode."""
+    if not np.array_equal(numbers, np.arange(len(numbers))):
+        raise DataError(f"{root}: the episode table does not number its episodes 0, 1, 2, …")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import check_compatible, naming_warnings
 from fluxvla_core.data.dataset import ParquetDataset, pooled_statistics
-from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, mixture_rng, read_samples
+from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, mixture_rng
 from fluxvla_core.data.transforms.pipeline import deferring
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
-Sample = dict[str, Any]
 Ints = npt.NDArray[np.int64]
 
 
@@ -44,7 +44,7 @@ class DistributedRepeatingDataset(Dataset):
         samples_per_epoch: by default as many as all datasets have.
         seed: of which samples an epoch takes, where it does not take all; None takes the
             training's (``runner.seed``), as do the datasets that set none.
-        context: handed on to datasets that want it.
+        context: for the constructors of the datasets.
 
     Raises:
         ConfigError: no datasets, weights that are not positive or not one a dataset, a share of
@@ -61,7 +61,7 @@ class DistributedRepeatingDataset(Dataset):
         seed: int | None = None,
         context: RunContext | None = None,
     ) -> None:
-        self.datasets = _build(datasets, context)
+        self.datasets: list[Dataset] = _build(datasets, context)
         self.seed = DEFAULT_SEED if seed is None else seed
         self._own_seed = seed is not None
         self.lengths = np.array([len(d) for d in self.datasets], np.int64)
@@ -83,23 +83,22 @@ class DistributedRepeatingDataset(Dataset):
     @property
     def embodiment(self) -> EmbodimentSpec | None:
         """The first dataset's robot."""
-        found: EmbodimentSpec | None = self.datasets[0].embodiment
-        return found
+        return self.datasets[0].embodiment
 
     @property
-    def fps(self) -> float:
+    def fps(self) -> float | None:
         """The first dataset's."""
-        return float(self.datasets[0].fps)
+        return self.datasets[0].fps
 
     @property
     def action_window_size(self) -> int | None:
         """The first dataset's."""
-        return Dataset.adapt(self.datasets[0]).action_window_size
+        return self.datasets[0].action_window_size
 
     @property
     def pipeline(self) -> Any:
         """The first dataset's."""
-        return getattr(self.datasets[0], "pipeline", None)
+        return self.datasets[0].pipeline
 
     @property
     def parts(self) -> dict[str, int]:
@@ -115,7 +114,7 @@ class DistributedRepeatingDataset(Dataset):
     @property
     def tasks(self) -> tuple[str, ...]:
         """The instructions of all datasets."""
-        return tuple(dict.fromkeys(t for d in self.datasets for t in Dataset.adapt(d).tasks))
+        return tuple(dict.fromkeys(t for d in self.datasets for t in d.tasks))
 
     def warnings(self) -> list[str]:
         """Warnings before training begins; those that several datasets give are listed once.
@@ -123,10 +122,9 @@ class DistributedRepeatingDataset(Dataset):
         Raises:
             ConfigError: see ``ParquetDataset.warnings``.
         """
-        asked = [d for d in self.datasets if hasattr(d, "warnings")]
-        found = [warning for dataset in asked for warning in dataset.warnings()]
+        found = [warning for dataset in self.datasets for warning in dataset.warnings()]
         for group in self._groups().values():
-            loaded = [one for dataset in group for one in getattr(dataset, "loaded", ())]
+            loaded = [one for d in group if isinstance(d, ParquetDataset) for one in d.loaded]
             found += naming_warnings(loaded) if loaded else []
         return list(dict.fromkeys(found))
 
@@ -135,24 +133,21 @@ class DistributedRepeatingDataset(Dataset):
         if not self._own_seed:
             self.seed, self._drawn = seed, {}
         for dataset in self.datasets:
-            Dataset.adapt(dataset).use_seed(seed)
+            dataset.use_seed(seed)
 
     def deferring(self) -> DistributedRepeatingDataset | None:
-        """The same samples with images left to be normalised on the device, if all datasets can."""
+        """The same samples with images to be normalised on the device; None if impossible."""
         parts = [deferring(dataset) for dataset in self.datasets]
         if any(part is None for part in parts):
             return None
         other = copy(self)
-        other.datasets = parts
+        other.datasets = [Dataset.adapt(part) for part in parts]
         return other
 
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Let every dataset decode what it keeps in memory."""
         for dataset in self.datasets:
-            Dataset.adapt(dataset).prepare(reporter)
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.get_sample(index, 0)
+            dataset.prepare(reporter)
 
     def get_sample(self, index: int, epoch: int) -> Sample:
         """Sample ``index`` as ``epoch`` sees it."""
@@ -164,9 +159,8 @@ class DistributedRepeatingDataset(Dataset):
         found: list[Any] = [None] * len(keys)
         for part, dataset in enumerate(self.datasets):
             mine = [i for i, (which, _) in enumerate(places) if which == part]
-            for i, sample in zip(
-                mine, read_samples(dataset, [places[i][1] for i in mine]), strict=True
-            ):
+            samples = dataset.get_samples([places[i][1] for i in mine])
+            for i, sample in zip(mine, samples, strict=True):
                 if "sample_ids" in sample:
                     sample["sample_ids"] = sample["sample_ids"] + self._first_id[part]
                 found[i] = sample
@@ -207,8 +201,12 @@ class DistributedRepeatingDataset(Dataset):
         groups: dict[str, list[Any]] = {}
         for dataset in self.datasets:
             # Asking for its statistics would compute them, only to replace them below.
-            own = isinstance(dataset, ParquetDataset)
-            for name in [dataset.statistic_name] if own else dataset.statistics:
+            names: Iterable[str] = (
+                [dataset.statistic_name]
+                if isinstance(dataset, ParquetDataset)
+                else dataset.statistics
+            )
+            for name in names:
                 groups.setdefault(name, []).append(dataset)
         return groups
 
@@ -267,24 +265,23 @@ def first_dataset(table: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _build(datasets: Any, context: RunContext | None) -> list[Any]:
+def _build(datasets: Any, context: RunContext | None) -> list[Dataset]:
     named = isinstance(datasets, Mapping) and "type" not in datasets
     groups: Mapping[str | None, Any] = datasets if named else {None: datasets}
-    built = []
+    built: list[Any] = []
     for name, group in groups.items():
         defaults = {} if name is None else {"statistic_name": name}
         tables = group if isinstance(group, list | tuple) else [group]
         built += [build_dataset_from_cfg(table, context, **defaults) for table in tables]
     if not built:
         raise ConfigError("DistributedRepeatingDataset: datasets names no dataset")
-    return built
+    return [Dataset.adapt(dataset) for dataset in built]
 
 
-def _name_of(dataset: Any) -> str:
-    loaded = getattr(dataset, "loaded", None)
-    if loaded:
-        return str(loaded[0].meta.root.name)
-    return str(getattr(dataset, "statistic_name", type(dataset).__name__))
+def _name_of(dataset: Dataset) -> str:
+    if isinstance(dataset, ParquetDataset):
+        return dataset.loaded[0].meta.root.name
+    return str(dataset.statistic_name or type(dataset).__name__)
 
 
 def _check_group(name: str, group: Sequence[Any]) -> None:

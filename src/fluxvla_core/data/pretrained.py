@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from fluxvla_core.contracts.training import Tokenizer
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.untrusted import read_json
 
@@ -20,7 +21,7 @@ _READ = ("config.json", "processor_config.json", "preprocessor_config.json")
 _SIDES = ("right", "left")
 
 
-class PretrainedTokenizer:
+class PretrainedTokenizer(Tokenizer):
     """The tokenizer of a pretrained model, by the ``tokenizers`` library alone.
 
     Args:
@@ -141,7 +142,7 @@ def model_folder(model_path: str | Path) -> Path:
 
 def _load(folder: Path, config: dict[str, Any]) -> Any:
     try:
-        from tokenizers import BertWordPieceTokenizer, Tokenizer
+        import tokenizers
     except ImportError as error:
         raise ConfigError(
             "PretrainedTokenizer needs the package tokenizers, which is not installed",
@@ -152,10 +153,10 @@ def _load(folder: Path, config: dict[str, Any]) -> Any:
     # The library raises plain Exception for files that it cannot read.
     try:
         if file.is_file():
-            return Tokenizer.from_file(str(file))
+            return tokenizers.Tokenizer.from_file(str(file))
         if vocab.is_file():
             lower = bool(config.get("do_lower_case", True))
-            return BertWordPieceTokenizer(str(vocab), lowercase=lower)
+            return tokenizers.BertWordPieceTokenizer(str(vocab), lowercase=lower)
     except Exception as error:
         raise ConfigError(f"no tokenizer can be read from {folder}: {error}") from error
     present = sorted(p.name for p in folder.iterdir())[:8]

@@ -16,10 +16,10 @@ from __future__ import annotations
 import hashlib
 import random
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,14 +43,6 @@ class SampleKey:
     index: int
 
 
-def read_samples(dataset: Any, keys: Sequence[SampleKey]) -> list[Any]:
-    """The samples that ``keys`` name: by ``get_samples(keys)`` of the dataset, if it has that."""
-    if hasattr(dataset, "get_samples"):
-        samples: list[Any] = dataset.get_samples(keys)
-        return samples
-    return [dataset.get_sample(key.index, key.epoch) for key in keys]
-
-
 class Position(NamedTuple):
     """Where this rank continues: ``batch`` batches of ``epoch`` have been used already."""
 
@@ -61,31 +53,31 @@ class Position(NamedTuple):
 class EpochSampler:
     """Yields batches of :class:`SampleKey` for one rank, epoch after epoch, without end.
 
+    An epoch's incomplete last global batch is filled up with the first samples of the same epoch's
+    order, so that every sample is seen, every rank has equally many full batches, and no rank waits
+    for another.
+
     Args:
         length: number of samples in the dataset.
         batch_size: samples per rank and batch.
         seed: with the epoch, all that the order depends on.
         rank, world: this process and how many there are.
         shuffle: False keeps the dataset's own order in every epoch.
-        drop_last: drop an epoch's incomplete last global batch. By default it is filled up with
-            the first samples of the same epoch's order, so that every sample is seen, every rank
-            has equally many full batches, and no rank waits for another.
         start: the first position that is yielded; the beginning of epoch 0 by default.
         shards: mix a few episodes at a time instead of all samples.
 
     Raises:
-        ConfigError: the dataset is empty, or too small for one batch under ``drop_last``.
+        ConfigError: the dataset or a batch is empty.
     """
 
     def __init__(
         self,
         length: int,
         batch_size: int,
-        seed: int = 42,
+        seed: int = DEFAULT_SEED,
         rank: int = 0,
         world: int = 1,
         shuffle: bool = True,
-        drop_last: bool = False,
         start: Position | None = None,
         shards: EpisodeShards | None = None,
     ) -> None:
@@ -101,15 +93,8 @@ class EpochSampler:
         self.rank = rank
         self.world = world
         self.shuffle = shuffle
-        self.drop_last = drop_last
         self.start = start or Position(0, 0)
         self.shards = shards
-        if self.batches_per_epoch == 0:
-            raise ConfigError(
-                f"{length} samples do not fill one global batch of {self.global_batch}",
-                next="lower --set train_dataloader.per_device_batch_size=…, use fewer processes, "
-                "or set drop_last=False",
-            )
 
     @property
     def global_batch(self) -> int:
@@ -118,8 +103,7 @@ class EpochSampler:
 
     @property
     def batches_per_epoch(self) -> int:
-        full, rest = divmod(self.length, self.global_batch)
-        return full if self.drop_last or rest == 0 else full + 1
+        return -(-self.length // self.global_batch)
 
     def order(self, epoch: int) -> npt.NDArray[np.int64]:
         """Indices of the whole epoch over all ranks: ``(batches_per_epoch * global_batch,)``."""
@@ -134,15 +118,6 @@ class EpochSampler:
         cut = self.order(epoch).reshape(self.batches_per_epoch, self.world, self.batch_size)
         for indices in cut[start:, self.rank].tolist():
             yield [SampleKey(epoch, index) for index in indices]
-
-    def advance(self, position: Position, batches: int) -> Position:
-        """The position ``batches`` batches after ``position``."""
-        done = position.epoch * self.batches_per_epoch + position.batch + batches
-        return Position(*divmod(done, self.batches_per_epoch))
-
-    def seek(self, position: Position) -> None:
-        """Start the next iteration at ``position``."""
-        self.start = self.advance(position, 0)
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, batch = self.start

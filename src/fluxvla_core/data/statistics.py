@@ -1,15 +1,20 @@
-"""Exact statistics for normalisation: of columns, action windows and images, in bounded memory.
+"""Statistics of states, actions and images, and normalisation by them.
 
-Mean and variance are kept as (count, mean, sum of squared deviations) in float64 and joined by
-Chan's formula, so many small chunks give what one big one gives. Quantiles of columns are true
-quantiles, taken of one dimension at a time; pixels have 256 values, so their histogram loses
-nothing.
+Statistics are exact, in bounded memory. Mean and variance are kept as (count, mean, sum of squared
+deviations) in float64 and joined by Chan's formula, so many small chunks give what one big one
+gives. Quantiles of columns are true quantiles, taken of one dimension at a time; pixels have 256
+values, so their histogram loses nothing.
 Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing sample
 variances", Stanford STAN-CS-79-773, 1979.
+
+Normalisation is one formula for both directions: a value ``x`` becomes ``(x - offset) / scale``.
+``relative`` in a statistics entry marks dimensions that are counted from the present state; they
+are shifted by it before and after.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,11 +22,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.data.columns import LoadedDataset
+from fluxvla_core.errors import ConfigError
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LEVELS = 256
 CHUNK = 65536
+_RANGES = {"quantile": ("q01", "q99"), "min_max": ("min", "max")}
+NORM_TYPES = ("mean_std", *_RANGES, "none")
+EPS = 1e-6
+LARGEST_RANGE = 200.0
+"""A dimension's range after scaling is ordinarily smaller: 2 by ``min_max``, some 20 by a
+``quantile`` or standard deviation if it moves now and then."""
+SMALLEST_SCALE = 1e-4
+"""If a state is divided by less, an error of 0.01 in a reading becomes more than 100."""
+
 Floats = npt.NDArray[np.float64]
 Stats = dict[str, npt.NDArray[Any]]
 
@@ -89,10 +103,10 @@ def column_statistics(rows: npt.NDArray[Any], chunk: int = CHUNK) -> Stats:
 def joined_statistics(
     parts: Callable[[slice], Iterable[npt.NDArray[Any]]], chunk: int = CHUNK
 ) -> Stats:
-    """Those of several ``(n, D)`` arrays as if they were one, of which one is held at a time.
+    """Statistics of several ``(n, D)`` arrays as if they were one; see ``column_statistics``.
 
     Args:
-        parts: gives all arrays, one after the other, with the dimensions that it is asked for.
+        parts: yields all arrays, restricted to some dimensions; one is in memory at a time.
     """
     total = moments(_cut(parts(slice(None)), chunk))
     # True quantiles need all values of a dimension at once, but not those of all dimensions.
@@ -108,43 +122,6 @@ def joined_statistics(
         "count": np.array([total.count], dtype=np.int64),
         **dict(zip(QUANTILES, np.stack(levels, axis=1), strict=True)),
     }
-
-
-def action_statistics(
-    datasets: Sequence[LoadedDataset],
-    size: int,
-    first_action: int,
-    relative: npt.NDArray[np.bool_] | None,
-    per_step: bool,
-) -> dict[str, Any]:
-    """Statistics of the actions that samples show, as JSON values.
-
-    Args:
-        size, first_action: of the window.
-        relative: ``(D,)``; where True, actions are counted from the state at the window's frame.
-        per_step: give ``(size, D)`` statistics, one row for each step of the window.
-
-    Plain actions are counted once a frame of the chosen episodes; relative or per-step ones once
-    for each window that they occur in.
-    """
-    if relative is None and not per_step:
-        rows = np.concatenate([r.actions[r.chosen] for r in datasets])
-        return as_lists(column_statistics(rows))
-    if per_step:
-        # The last steps of a window longer than every episode occur nowhere.
-        each: list[Stats] = []
-        for j in range(size):
-            rows = _step(datasets, first_action + j, relative, slice(None))
-            each.append(column_statistics(rows) if len(rows) else each[0])
-        stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
-    else:
-        stats = joined_statistics(
-            lambda dims: (_step(datasets, first_action + j, relative, dims) for j in range(size))
-        )
-    found = as_lists(stats)
-    if relative is not None:
-        found["relative"] = relative.astype(int).tolist()
-    return found
 
 
 def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
@@ -198,23 +175,6 @@ def _column(parts: Iterable[npt.NDArray[Any]]) -> Floats:
     return np.concatenate([part[:, 0].astype(np.float64) for part in parts])
 
 
-def _step(
-    datasets: Sequence[LoadedDataset],
-    ahead: int,
-    relative: npt.NDArray[np.bool_] | None,
-    dims: slice,
-) -> npt.NDArray[np.float32]:
-    """Actions ``ahead`` rows after each usable one, where they are within the episode."""
-    parts = []
-    for one in datasets:
-        rows = one.rows[one.rows + ahead < one.end[one.rows]]
-        actions = one.actions[:, dims][rows + ahead]
-        if relative is not None:
-            actions = actions - one.states[:, : len(relative)][:, dims][rows] * relative[dims]
-        parts.append(actions)
-    return np.concatenate(parts)
-
-
 def _histogram_quantile(histogram: npt.NDArray[np.int64], level: float) -> float:
     """The quantile of the counted values, by linear interpolation as ``np.quantile`` does it."""
     cumulative = np.cumsum(histogram)
@@ -222,3 +182,190 @@ def _histogram_quantile(histogram: npt.NDArray[np.int64], level: float) -> float
     low = int(np.floor(place))
     below, above = np.searchsorted(cumulative, [low, low + (place > low)], side="right")
     return float(below + (above - below) * (place - low))
+
+
+@dataclass(frozen=True)
+class Affine:
+    """Offset and scale, each ``(D,)`` or ``(T, D)``; ``relative`` is ``(D,)`` of 0 and 1."""
+
+    offset: Floats
+    scale: Floats
+    relative: Floats | None = None
+
+    @property
+    def dim(self) -> int:
+        return int(self.offset.shape[-1])
+
+    def forward(self, values: npt.ArrayLike, state: npt.ArrayLike | None = None) -> Floats:
+        """Physical ``(..., D)`` -> normalised ``(..., D)``, in float64."""
+        return (np.asarray(values, np.float64) - self._base(state) - self.offset) / self.scale
+
+    def inverse(self, values: npt.ArrayLike, state: npt.ArrayLike | None = None) -> Floats:
+        """Normalised ``(..., D)`` -> physical ``(..., D)``, in float64."""
+        return np.asarray(values, np.float64) * self.scale + self.offset + self._base(state)
+
+    def _base(self, state: npt.ArrayLike | None) -> Floats | float:
+        if self.relative is None:
+            return 0.0
+        if state is None:
+            raise ConfigError(
+                "these actions are counted from the present state, and no state was given",
+                next="pass the state in physical units as data['states']",
+            )
+        base: Floats = np.asarray(state, np.float64).reshape(-1)[: self.dim] * self.relative
+        return base
+
+
+def check_norm_type(norm_type: str, who: str) -> None:
+    """Check a ``norm_type``.
+
+    Raises:
+        ConfigError: it is unknown; lists the known ones and suggests the nearest.
+    """
+    if norm_type in NORM_TYPES:
+        return
+    near = difflib.get_close_matches(str(norm_type), NORM_TYPES, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ConfigError(
+        f"{who}: norm_type {norm_type!r} is none of {', '.join(NORM_TYPES)}{hint}",
+        cause="state_key and action_key select the statistics, norm_type the formula",
+    )
+
+
+def make_affine(
+    stats: Mapping[str, Any],
+    norm_type: str,
+    who: str,
+    std_floor: float = 0.0,
+    norm_mask: Sequence[bool] | None = None,
+) -> Affine:
+    """Compute offset and scale from one statistics entry.
+
+    Args:
+        stats: ``mean``, ``std``, ``min``, ``max``, ``q01``, ``q99``: ``(D,)`` or ``(T, D)``;
+            optionally ``relative`` ``(D,)``.
+        norm_type: ``mean_std``: (x - mean) / (std + 1e-6); ``quantile`` and ``min_max``:
+            2 (x - low) / (high - low + 1e-6) - 1; ``none``: x.
+        std_floor: no dimension is divided by less than this, in the data's units: a joint that
+            hardly moved in the demonstrations otherwise turns noise into huge values.
+        norm_mask: ``(D,)``; False leaves a dimension as it is.
+
+    Raises:
+        ConfigError: a statistic is missing, or the mask has another length.
+    """
+    mean = _entry(stats, "mean", who)
+    used = ("std",) if norm_type == "mean_std" else _RANGES.get(norm_type, ())
+    for name in used:
+        shape = _entry(stats, name, who).shape
+        if shape != mean.shape:
+            raise ConfigError(
+                f"{who}: {name!r} of the statistics has shape {shape}, 'mean' {mean.shape}"
+            )
+    if norm_type == "none":
+        offset, scale = np.zeros_like(mean), np.ones_like(mean)
+    elif norm_type == "mean_std":
+        offset, scale = mean, np.maximum(_entry(stats, "std", who), std_floor) + EPS
+    else:
+        low, high = (_entry(stats, name, who) for name in _RANGES[norm_type])
+        scale = np.maximum((high - low + EPS) / 2, std_floor)
+        offset = _center(low, high, scale)
+    if norm_mask is not None:
+        mask = np.asarray(norm_mask, bool)
+        if mask.shape != offset.shape[-1:]:
+            raise ConfigError(
+                f"{who}: action_norm_mask has {mask.size} entries, "
+                f"the statistics have {offset.shape[-1]}"
+            )
+        offset, scale = np.where(mask, offset, 0.0), np.where(mask, scale, 1.0)
+    if stats.get("relative") is None:
+        return Affine(offset, scale)
+    relative = _numbers(stats["relative"], "relative", who)
+    if relative.shape != offset.shape[-1:]:
+        raise ConfigError(
+            f"{who}: 'relative' of the statistics has shape {relative.shape}, "
+            f"there are {offset.shape[-1]} dimensions"
+        )
+    return Affine(offset, scale, relative)
+
+
+@dataclass(frozen=True)
+class IdleDimension:
+    """A dimension that hardly moves: ``spread`` is its max - min, ``scale`` what it is divided by.
+
+    ``blown_up``: its small moves in the data become huge, not only a robot's readings.
+    ``rare``: it moves in under 2 % of the frames, so that its q01 and q99 are equal.
+    """
+
+    name: str
+    spread: float
+    scale: float
+    blown_up: bool
+    rare: bool
+
+    def __str__(self) -> str:
+        return f"{self.name} (range {self.spread:.2g}, divided by {self.scale:.2g})"
+
+
+def find_idle_dimensions(
+    what: str,
+    stats: Mapping[str, Any],
+    scale: Floats,
+    names: Sequence[str],
+    mask: Sequence[bool] | None = None,
+) -> Iterator[IdleDimension]:
+    """Dimensions that hardly move, by one statistics entry; of several steps the worst one counts.
+
+    Args:
+        what: put before the names.
+        scale: what is divided by, as wide as the statistics.
+        names: of the dimensions; their numbers are used where there are none.
+        mask: ``(D,)``; False where nothing is divided.
+    """
+    if not {"min", "max", "q01", "q99"} <= set(stats):
+        return
+    low, high, q01, q99 = (np.atleast_2d(stats[k]) for k in ("min", "max", "q01", "q99"))
+    spread, scale = high - low, np.atleast_2d(scale)
+    rare = (q01 == q99) & (spread > 0)
+    for d in range(spread.shape[1]):
+        reach = spread[:, d] / scale[:, d]
+        blown_up = bool(reach.max() > LARGEST_RANGE)
+        step = int(reach.argmax() if blown_up else scale[:, d].argmin())
+        used = mask is None or mask[d]
+        if used and (blown_up or scale[step, d] < SMALLEST_SCALE):
+            name = f"{what} {names[d] if names else d}"
+            yield IdleDimension(
+                name, spread[step, d], scale[step, d], blown_up, bool(rare[step, d])
+            )
+
+
+def _center(low: Floats, high: Floats, scale: Floats) -> Floats:
+    """``low`` maps to -1 unless the floor widened the range; then its middle maps to 0."""
+    widened = scale > (high - low + EPS) / 2
+    return np.where(widened, (low + high) / 2, low + scale)
+
+
+def _entry(stats: Mapping[str, Any], name: str, who: str) -> Floats:
+    if name not in stats:
+        raise ConfigError(
+            f"{who}: the statistics have no {name!r}; they have {', '.join(sorted(stats))}"
+        )
+    return _numbers(stats[name], name, who)
+
+
+def _numbers(value: Any, name: str, who: str) -> Floats:
+    """``(D,)`` or ``(T, D)`` finite numbers, as the statistics of a file may not be.
+
+    Raises:
+        ConfigError: it is anything else.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    plain = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+    if not plain or array.ndim not in (1, 2) or not array.size or not np.isfinite(array).all():
+        raise ConfigError(
+            f"{who}: {name!r} of the statistics is no list of finite numbers, one a dimension, "
+            "nor of such lists, one a step"
+        )
+    return array.astype(np.float64)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -254,6 +255,20 @@ class ImageColumnReader:
 def open_source(source: Source) -> VideoFile | ImageColumnReader:
     """Open ``source`` for reading frames. Raises DataError if it cannot be read."""
     return ImageColumnReader(source) if isinstance(source, ImageColumn) else VideoFile(source)
+
+
+def read_frames(source: Source, times: Iterable[float]) -> Iterator[Image]:
+    """Decode the frames of ``source`` at ``times``; fastest in ascending order.
+
+    Raises:
+        DataError: it cannot be read, or has no such frame.
+    """
+    file = open_source(source)
+    try:
+        for time in times:
+            yield file.read(time)
+    finally:
+        file.close()
 
 
 class FrameReader:

@@ -17,7 +17,7 @@ from fluxvla_core.build import (
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whole
 from fluxvla_core.config.snapshot import work_dirs_below
 from fluxvla_core.contracts.contract import implements
-from fluxvla_core.contracts.training import Transform
+from fluxvla_core.contracts.training import InferenceDataset, Transform
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
@@ -163,11 +163,10 @@ def _denormalize(given: Any, prepare: Any, checkpoint: Checkpoint) -> Any:
     if given is not None:
         defaults = {"norm_stats": statistics}
         return build_transform_from_cfg(given, **_taken(given, TRANSFORMS, defaults))
-    transforms = getattr(getattr(prepare, "pipeline", None), "transforms", ())
-    for transform in transforms:
+    described = InferenceDataset.adapt(prepare)
+    for transform in described.pipeline.transforms if described.pipeline is not None else ():
         if implements(transform, Transform, "denormalizer"):
-            name = getattr(prepare, "statistic_name", "private")
-            return transform.denormalizer(statistics, name)
+            return transform.denormalizer(statistics, described.statistic_name)
     raise ConfigError(
         "no transform tells how actions were normalised",
         where=str(checkpoint.path),

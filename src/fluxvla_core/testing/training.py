@@ -28,7 +28,7 @@ from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from fluxvla_core.contracts.training import Dataset
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import EpisodeShards, EpochSampler, SampleKey
 from fluxvla_core.data.transforms.images import normalized
 from fluxvla_core.data.transforms.pipeline import deferring

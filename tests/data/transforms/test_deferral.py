@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fluxvla_core.data.collator import DictCollator
+from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.transforms.images import (
     SCALE,
     NormalizeImages,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -42,6 +43,38 @@ def test_a_random_transform_without_a_generator_is_refused():
         ConfigError, match="StateNoise draws random numbers, which only training has"
     ):
         Pipeline([{"type": "StateNoise", "std": 1.0}])({"states": np.zeros(2)})
+
+
+class Doubled:
+    """Inherits nothing."""
+
+    def __call__(self, sample):
+        return {**sample, "states": sample["states"] * 2}
+
+
+class Jittered:
+    """Inherits nothing, and draws."""
+
+    needs_rng = training_only = True
+
+    def __call__(self, sample, rng):
+        return {**sample, "states": sample["states"] + rng.random(2)}
+
+    def warnings(self, stats, states, actions):
+        return [f"{stats} of {', '.join(states + actions)}"]
+
+
+@pytest.mark.parametrize("spawned", [False, True])
+def test_transforms_that_inherit_nothing_have_the_defaults_also_in_a_spawned_worker(spawned):
+    pipeline = Pipeline([Doubled(), Jittered()])
+    if spawned:
+        pipeline = pickle.loads(pickle.dumps(pipeline))  # noqa: S301
+    sample = {"states": np.ones(2)}
+    drawn = sample_rng(0, 0, 0).random(2)
+    np.testing.assert_array_equal(pipeline(sample, sample_rng(0, 0, 0))["states"], 2 + drawn)
+    np.testing.assert_array_equal(pipeline.inference()(sample)["states"], [2, 2])
+    assert pipeline.warnings("range", ["a"], ["b"]) == ["range of a, b"]
+    assert pipeline.deferring() is None
 
 
 def test_a_misspelt_transform_is_refused():

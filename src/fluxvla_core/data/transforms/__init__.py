@@ -1,1 +1,1 @@
-"""Transforms: what changes a sample between dataset and model, and actions on their way back."""
+"""Transforms of samples between dataset and model, and of actions between model and robot."""

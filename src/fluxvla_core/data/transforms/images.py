@@ -4,10 +4,10 @@
 of N cameras of equal size. Images stay uint8 until they are normalised, and are never resized
 twice.
 
-Normalisation can be left to the device that computes the model: images then travel as uint8, with
-what is left to do as ``image_scale``, ``(4, 3N)`` float32: for each plane what to divide by,
-multiply by, subtract and divide by, in this order. Doing nothing is exact (by 1, or 0), so one
-formula serves every normaliser, bit for bit, and each sample of a batch has its own numbers.
+Normalisation can be deferred to the device that computes the model: images are then transferred as
+uint8 with ``image_scale``, ``(4, 3N)`` float32: for each plane what to divide by, multiply by,
+subtract and divide by, in this order. By 1, or 0, these change nothing, bit for bit, so one formula
+serves every normaliser, and each sample of a batch has its own numbers.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Transform
 from fluxvla_core.errors import ConfigError, DataError
 
-Sample = dict[str, Any]
 Image = npt.NDArray[Any]
 Images = list[Image] | Image
 Row = npt.NDArray[np.float32] | None
 Steps = tuple[Row, Row, Row, Row]
 """Divide by, multiply by, subtract, divide by: each ``(3N,)``, or None for nothing."""
 SCALE = "image_scale"
-"""The sample's key of what is left to do."""
+"""The sample's key of a deferred normalisation."""
 INTERPOLATIONS = ("linear", "area")
 _OTHER_ORDER = "height, width and channels are in another order, or there is an alpha channel"
 _Operation = Callable[[Any, Any], Any]

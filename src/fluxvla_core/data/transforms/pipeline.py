@@ -1,4 +1,4 @@
-"""``Pipeline``: a list of transforms, the same for training and for inference."""
+"""``Pipeline``: a list of transforms, used in training and in inference."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from fluxvla_core.build import build_transform_from_cfg
+from fluxvla_core.contracts.contract import implements, original
+from fluxvla_core.contracts.frame import Sample
+from fluxvla_core.contracts.training import RandomTransform, Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.untrusted import read_json
 
-Sample = dict[str, Any]
 INDEX = "processors.json"
 
 
@@ -38,30 +40,33 @@ class Pipeline:
     ) -> None:
         saved = _saved(Path(processors)) if processors is not None else {}
         self._named = {copy: path for path, copy in saved.items()}
-        self.transforms = [build_transform_from_cfg(_redirect(t, saved)) for t in transforms]
+        built = [build_transform_from_cfg(_redirect(t, saved)) for t in transforms]
+        self.transforms: list[Transform | RandomTransform] = [
+            t if isinstance(t, RandomTransform) else Transform.adapt(t) for t in built
+        ]
 
     def __call__(self, sample: Sample, rng: np.random.Generator | None = None) -> Sample:
         for transform in self.transforms:
-            if not getattr(transform, "needs_rng", False):
-                sample = transform(sample)
+            if not transform.needs_rng:
+                sample = cast(Transform, transform)(sample)
                 continue
             if rng is None:
                 raise ConfigError(
                     f"{type(transform).__name__} draws random numbers, which only training has",
                     next="give it training_only = True, or take it out of this section",
                 )
-            sample = transform(sample, rng)
+            sample = cast(RandomTransform, transform)(sample, rng)
         return sample
 
     def inference(self) -> Pipeline:
         """The same transforms without the ``training_only`` ones."""
-        return self._of([t for t in self.transforms if not getattr(t, "training_only", False)])
+        return self._of([t for t in self.transforms if not t.training_only])
 
     def deferring(self) -> Pipeline | None:
-        """The same transforms, with normalising images left to the device; None if that cannot be.
+        """The same transforms, with normalising images deferred to the device; None if impossible.
 
-        It must be the last transform that touches images. Those after it declare that they do not
-        by ``keeps_images = True``; if one does not declare it, nothing can be left.
+        It must be the last transform that uses images. Those after it declare that they do not
+        by ``keeps_images = True``; if one does not declare it, nothing can be deferred.
         """
         for place, transform in reversed(list(enumerate(self.transforms))):
             if declared(transform, "keeps_images", "__call__"):
@@ -72,16 +77,23 @@ class Pipeline:
             return self._of([*before, transform.defer, *after])
         return None
 
+    def warnings(
+        self, stats: Mapping[str, Any], states: Sequence[str], actions: Sequence[str]
+    ) -> list[str]:
+        """What the transforms warn of before training; see ``Transform.warnings``."""
+        return [text for t in self.transforms for text in t.warnings(stats, states, actions)]
+
     def save_pretrained(self, folder: str | Path) -> None:
         """Save every tokenizer into ``folder``, under the path that its table named it by."""
         root = Path(folder)
         index: dict[str, str] = {}
         for transform in self.transforms:
-            tokenizer = getattr(transform, "tokenizer", None)
-            path = getattr(tokenizer, "model_path", None)
-            if tokenizer is None or path is None:
+            if not implements(transform.tokenizer, Tokenizer, "save_pretrained"):
                 continue
-            path = self._named.get(path, path)
+            tokenizer = Tokenizer.adapt(transform.tokenizer)
+            if tokenizer.model_path is None:
+                continue
+            path = self._named.get(tokenizer.model_path, tokenizer.model_path)
             if path in index:
                 continue
             name = "tokenizer" if not index else f"tokenizer-{len(index) + 1}"
@@ -97,9 +109,9 @@ class Pipeline:
 
 
 def deferring(dataset: Any) -> Any:
-    """``dataset.deferring()``, or None if its samples are made by another class than that one's."""
+    """``dataset.deferring()``; None if a class that has none makes its samples."""
     defer = declared(dataset, "deferring", "get_samples")
-    return None if defer is None else defer(dataset)
+    return None if defer is None else defer(original(dataset))
 
 
 def declared(thing: object, name: str, method: str) -> Any:
@@ -108,7 +120,7 @@ def declared(thing: object, name: str, method: str) -> Any:
     A subclass that overrides ``method`` does not inherit what was declared of the old one, and a
     wrapper that delegates attributes declares nothing.
     """
-    owner = next((cls for cls in type(thing).__mro__ if method in vars(cls)), object)
+    owner = next((cls for cls in type(original(thing)).__mro__ if method in vars(cls)), object)
     return vars(owner).get(name)
 
 

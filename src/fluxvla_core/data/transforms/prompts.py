@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.build import build_tokenizer_from_cfg
-from fluxvla_core.contracts.training import Transform
+from fluxvla_core.contracts.frame import Sample
+from fluxvla_core.contracts.training import Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
 
-Sample = dict[str, Any]
 Encoded = tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]
 
 
@@ -40,9 +40,9 @@ class ProcessPrompts(Transform):
         self._who = type(self).__name__
         if max_len < 1:
             raise ConfigError(f"{self._who}: max_len must be at least 1, got {max_len}")
-        self.tokenizer = build_tokenizer_from_cfg(tokenizer)
+        self.tokenizer = Tokenizer.adapt(build_tokenizer_from_cfg(tokenizer))
         self.max_len = max_len
-        self.padding_side = getattr(self.tokenizer, "padding_side", "right")
+        self.padding_side = self.tokenizer.padding_side
         # A dataset has a handful of instructions and millions of frames.
         self._known: dict[str, Encoded] = {}
 
@@ -70,7 +70,7 @@ class ProcessPrompts(Transform):
                 next=f"set max_len to {len(ids)} or more where the model was trained, "
                 "or use shorter words",
             )
-        pad = int(getattr(self.tokenizer, "pad_token_id", 0) or 0)
+        pad = int(self.tokenizer.pad_token_id or 0)
         left = self.padding_side == "left"
         place = slice(self.max_len - len(ids), None) if left else slice(len(ids))
         tokens = np.full(self.max_len, pad, dtype=np.int64)

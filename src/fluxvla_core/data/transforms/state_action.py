@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Transform
-from fluxvla_core.data.transforms.scaling import (
+from fluxvla_core.data.statistics import (
     Affine,
     check_norm_type,
     find_idle_dimensions,
@@ -20,7 +21,6 @@ from fluxvla_core.data.transforms.scaling import (
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.untrusted import read_json
 
-Sample = dict[str, Any]
 Floats = npt.NDArray[np.float64]
 
 
@@ -79,21 +79,6 @@ class NormalizeStatesAndActions(Transform):
             scaled = action_scale.forward(actions, states)
             out["actions"] = self._pad(scaled, self.action_dim, "action")
         return out
-
-    def inverse(
-        self, actions: npt.ArrayLike, stats: Mapping[str, Any], states: npt.ArrayLike | None = None
-    ) -> Floats:
-        """Normalised, padded actions ``(..., T, >= D)`` -> physical ``(..., T, D)``, float64.
-
-        ``states`` ``(D,)`` in physical units is needed when the statistics count actions from it.
-        """
-        scale = self._scales(stats)[1]
-        return scale.inverse(np.asarray(actions)[..., : scale.dim], states)
-
-    def inverse_states(self, states: npt.ArrayLike, stats: Mapping[str, Any]) -> Floats:
-        """Normalised, padded states ``(..., >= D)`` -> physical ``(..., D)``, float64."""
-        scale = self._scales(stats)[0]
-        return scale.inverse(np.asarray(states)[..., : scale.dim])
 
     def denormalizer(
         self, norm_stats: Mapping[str, Any], statistic_name: str = "private"
@@ -173,7 +158,7 @@ class NormalizeStatesAndActions(Transform):
         return np.pad(values, widths, constant_values=self.pad_value).astype(np.float32)
 
 
-class DenormalizePrivateAction:
+class DenormalizePrivateAction(Transform):
     """Denormalise a model's actions: the exact inverse of ``NormalizeStatesAndActions``.
 
     Called with ``{"action": (1, T, D) or (T, D)}``, and ``"states"`` ``(D,)`` in physical units
@@ -209,7 +194,7 @@ class DenormalizePrivateAction:
         self.action_key = action_key
         self._affine: Affine | None = None
 
-    def __call__(self, data: Mapping[str, Any]) -> Floats:
+    def __call__(self, data: Mapping[str, Any]) -> Floats:  # type: ignore[override]  # no sample
         action = np.asarray(data["action"], np.float64)
         if action.ndim == 3 and len(action) == 1:
             action = action[0]

@@ -303,7 +303,7 @@ def test_a_work_dir_means_its_newest_whole_checkpoint(tmp_path):
             CheckpointError,
             "train_dataloader.dataset has no img_keys, transforms",
         ),
-        ({"dataset": {"transforms": []}}, ConfigError, "no transform tells how actions were"),
+        ({"dataset": {"transforms": []}}, ConfigError, "no transform knows how actions were"),
     ],
 )
 def test_what_a_checkpoint_does_not_say_is_named(tmp_path, changes, error, message):

@@ -138,7 +138,7 @@ SHM = (
         (
             GONE.format(123, "Killed"),
             "a data worker (pid 123) was killed at step 7",
-            "ran out of memory: dmesg tells",
+            "ran out of memory (see dmesg)",
             "lower --set train_dataloader.per_device_num_workers=… or",
         ),
         (

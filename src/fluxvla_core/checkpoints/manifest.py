@@ -24,7 +24,7 @@ FOLDER = "checkpoints"
 NAME = "manifest.json"
 FORMAT = "fluxvla-checkpoint-1"
 _BLOCK = 1 << 20
-_LARGEST = 16 << 20  # bytes: 100,000 files, of which 1,000 ranks write fewer than 3,000
+_LARGEST = 16 << 20  # bytes: 100,000 files; 1,000 ranks write fewer than 3,000
 _CHANGED = "it was changed, or the disk lost a part of it, after it was saved"
 _STEP = re.compile(r"step-(\d{9,})")
 

@@ -79,7 +79,7 @@ class Actor(Contract):
         return None
 
     def enter(self, environment: Environment) -> None:
-        """Told once an episode has begun where it acts; called before ``reset``.
+        """Called when an episode has begun in ``environment``, before ``reset``.
 
         Scripted experts see there what others must look for.
         """

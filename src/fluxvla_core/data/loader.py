@@ -222,7 +222,7 @@ class _Keyed:
     """The dataset as torch's fetcher sees it, which asks for a whole batch of keys.
 
     Workers start with equal global generators on every rank and after every restart. They are
-    therefore seeded for each batch, which then is the same whoever makes it, and restored.
+    therefore seeded for each batch, which then is the same in every worker, and restored.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class DistributedRepeatingDataset(Dataset):
         weights: relative frequencies, one for each dataset in their order; by default their
             lengths, so that each sample is seen once an epoch.
         samples_per_epoch: by default as many as all datasets have.
-        seed: of which samples an epoch takes, where it does not take all; None takes the
+        seed: of the choice of samples, where an epoch does not take all; None takes the
             training's (``runner.seed``), as do the datasets that set none.
         context: for the constructors of the datasets.
 

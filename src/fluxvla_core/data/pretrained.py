@@ -28,7 +28,7 @@ class PretrainedTokenizer(Tokenizer):
         model_path: a folder, or ``package:<import name>/<folder>``, that holds
             ``tokenizer.json``, or BERT's ``vocab.txt``.
         model_max_length: longest sequence that :meth:`encode` returns.
-        padding_side: ``right`` or ``left``; used by whoever pads.
+        padding_side: ``right`` or ``left``; used by transforms that pad.
 
     Raises:
         ConfigError: no such folder, no tokenizer in it, or an unreadable one.

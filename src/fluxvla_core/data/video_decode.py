@@ -6,7 +6,7 @@ has to begin and whether decoding on from the last frame is shorter.
 
 An image column (LeRobot's ``dtype: image``) holds ``{"bytes": PNG or JPEG, "path": its name}`` in
 every row, as the Image feature of Hugging Face's ``datasets`` stores it. Rows are read by row
-group, of which the last one is kept.
+group; the last one is kept.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ class EnvironmentOperator(Operator):
         """Hold: the last command stays."""
 
     def close(self) -> None:
-        """Nothing: whoever made the environment closes it."""
+        """Nothing: the environment is closed where it was made."""
 
     def _over(self) -> bool:
         ended = self._last_step is not None and bool(self._last_step.ended)

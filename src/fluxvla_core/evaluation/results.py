@@ -195,7 +195,7 @@ def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path)
 
 # -- videos: failures show more than successes, so they come first
 
-# Tasks of which every group is shown.
+# Tasks whose groups are all shown.
 _COMPARED = 2
 # What results.json says of a video.
 _VIDEO_KEYS = ("group", "task", "seed", "success", "instruction")

@@ -168,7 +168,7 @@ def _denormalize(given: Any, prepare: Any, checkpoint: Checkpoint) -> Any:
         if implements(transform, Transform, "denormalizer"):
             return transform.denormalizer(statistics, described.statistic_name)
     raise ConfigError(
-        "no transform tells how actions were normalised",
+        "no transform knows how actions were normalised",
         where=str(checkpoint.path),
         next="give the section denormalize_action = dict(type='DenormalizePrivateAction', ...)",
     )

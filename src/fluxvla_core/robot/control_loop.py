@@ -176,7 +176,7 @@ class ControlLoop:
         """The first answer: nothing moves, and the policy may have to warm up.
 
         On a robot it is asked again: by the time of a long answer, what it saw is old. If the
-        second one takes long as well, a third tells whether that is its way. The episode begins
+        second one takes long as well, a third shows whether it always does. The episode begins
         with the last.
         """
         until = time.monotonic() + self.safety.first_chunk_s

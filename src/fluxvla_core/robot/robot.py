@@ -27,7 +27,7 @@ from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
 from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
-# How long a safe stop may take before a person is told to use the emergency stop.
+# How long a safe stop may take before the message says to use the emergency stop.
 STOP_S = 5.0
 _LEAST_SPEED = 0.01
 
@@ -145,7 +145,7 @@ class Robot:
 
     @property
     def speed(self) -> Callable[[], float] | None:
-        """Tells the share of its speed that a person lets it have (``speed_scaling``), or None."""
+        """The share of its speed that a person allows (``speed_scaling``), or None."""
         operator = self._operator
         if not self._has("speed_scaling"):
             return None
@@ -154,7 +154,7 @@ class Robot:
         return lambda: min(max(as_number(operator.speed_scaling, name), _LEAST_SPEED), 1.0)
 
     def commanded(self, before: npt.NDArray[np.float64] | None) -> npt.NDArray[np.float64] | None:
-        """``(D,)`` what the arm was told last, None if nothing, or nothing that still counts.
+        """``(D,)`` the arm's last command, None if nothing, or nothing that still counts.
 
         Args:
             before: the last command of this run, for operators that do not tell (``last_action``).
@@ -267,7 +267,7 @@ class Robot:
     def _reported(self, method: str, function: Callable[[], object]) -> str | None:
         try:
             function()
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - told; the rest of the stop goes on
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - reported; the rest of the stop goes on
             return f"{self.name}.{method} raised {type(error).__name__}: {error}"
         return None
 

@@ -1,9 +1,8 @@
 """The episodes of one run, one after the other, and what happens in between.
 
-Between two episodes the arm holds: its last command is sent again at every tick, so that drivers
-which stop an arm that they hear nothing for keep it where it is, and what goes wrong while nobody
-moves it stops it as in an episode. After a stop nothing is sent and no task is taken, until whoever
-gives the tasks says ``rearm``.
+Between two episodes the arm holds: its last command is sent again at every tick, because some
+drivers stop an arm when commands cease. The safety rules hold as in an episode. After a stop
+nothing is sent and no task is taken until the task source says ``rearm``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tasks of a run, and where they come from: command line, file, terminal, ROS 2 topic.
 
-There is never a default task, and an unknown one is refused. A source is asked for the next line
-again and again, so that whoever waits for it can keep a robot where it is in the meantime. What
-was said while the robot was busy is not taken for an answer.
+There is never a default task, and an unknown one is refused. A source is polled for the
+next line, so that the caller can hold the robot in between. What came in while the
+robot was busy is not taken as an answer.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class EndOfTasks(Exception):
 
 
 class TaskSource(ABC):
-    """Lines that name tasks. ``waits``: whoever gives them is there while the run goes on."""
+    """Lines that name tasks. ``waits``: more may come while the run goes on."""
 
     waits: ClassVar[bool] = False
 
@@ -166,7 +166,7 @@ class TaskSource(ABC):
         return
 
     def announce(self, text: str) -> None:
-        """Something that whoever gives the tasks should know."""
+        """Something that the person or program that gives the tasks should know."""
         return
 
     def report(self, text: str) -> None:

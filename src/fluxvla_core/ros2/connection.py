@@ -187,7 +187,7 @@ class Connection:
             # close() is noticed, and the process does not hang on a thread that it must join.
             while not self._closing.is_set() and main.is_alive() and self._context.ok():
                 self._executor.spin_once()
-        except BaseException as error:  # noqa: BLE001 - kept, and raised to whoever asks next
+        except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error
         finally:
             self._closing.set()
@@ -212,7 +212,7 @@ def keep_large_blocks() -> bool:
 
     A picture is larger than what malloc keeps: each message, and each copy of one, would be asked
     of the kernel and given back to it, page by page, which takes longer than copying the picture
-    and stops the process's other threads meanwhile. glibc keeps larger blocks if told to
+    and stops the process's other threads meanwhile. glibc keeps larger blocks if configured to
     (mallopt(3)); other C libraries are left as they are. Memory stays bounded by what was in use at
     one time.
     """

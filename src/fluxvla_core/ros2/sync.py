@@ -71,7 +71,7 @@ def match(
         max_skew: seconds that the chosen messages may be apart.
         by: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived (for senders
             whose clocks differ). Where any stream has no stamps, ``receipt`` is used.
-        wall: what to add to receipts for this machine's wall clock, which tells whose clock is off.
+        wall: what to add to receipts for this machine's wall clock, to find which clock is off.
 
     Raises:
         Stale: they are further apart; names the first and the last stream, and whether the

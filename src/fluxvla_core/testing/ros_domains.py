@@ -22,7 +22,7 @@ def claimed_domain(folder: Path | None = None) -> Iterator[int]:
     """A domain that nobody else on this machine has, for as long as the context lasts.
 
     Test processes keep out of each other's way by a lock on a file per domain, which ends with the
-    process however that ends; of participants that know nothing of locks, the port tells.
+    process however that ends; participants without locks are recognised by their port.
 
     Args:
         folder: where the files are; the same for all who must not meet.

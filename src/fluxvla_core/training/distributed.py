@@ -102,7 +102,7 @@ def start(device: str = "auto", group_of_one: bool = False) -> World:
 def _stay_inside() -> None:
     """Let gloo and NCCL listen on the loopback alone: all processes are on this machine.
 
-    Both take whoever connects for a rank. NCCL still moves tensors over NVLink, PCIe or shared
+    Both accept any connection as a rank. NCCL still moves tensors over NVLink, PCIe or shared
     memory. Who names an interface gets that one.
     """
     loopback = next((name for _, name in socket.if_nameindex() if name in ("lo", "lo0")), None)

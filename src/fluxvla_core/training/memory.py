@@ -106,7 +106,7 @@ def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFai
         )
     elif ending == "killed":
         what = f"a data worker{pid} was killed{when}"
-        cause = "this machine, or its container, ran out of memory: dmesg tells"
+        cause = "this machine, or its container, ran out of memory (see dmesg)"
         advice = _LESS_HOST
     else:
         what = (

@@ -3,7 +3,7 @@
 A class of ``fluxvla.optimizers`` holds an optimizer's own settings and has
 ``build(groups, learning_rate) -> torch.optim.Optimizer``. ``groups`` are ``decay_groups`` of the
 model: weight decay is already where it belongs. What is built has ``learning_rate``, or groups with
-rates of their own, all of which the schedule scales alike. Constructors import no torch, so that a
+rates of their own; the schedule scales them all alike. Constructors import no torch, so that a
 config is checked without it.
 """
 

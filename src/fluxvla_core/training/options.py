@@ -20,7 +20,7 @@ SAVE_STEPS = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """The settings of a train runner, of which its constructor and ``plugins show`` are made."""
+    """The settings of a train runner; its constructor and ``plugins show`` are made from them."""
 
     learning_rate: float
     """peak rate of AdamW."""

@@ -270,7 +270,7 @@ def check_settings(
 def model_tensors(
     checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
 ) -> dict[str, Tensor]:
-    """The checkpoint's weights by name, all of which fit ``model``.
+    """The checkpoint's weights by name; all fit ``model``.
 
     Args:
         brings: the frozen weights that the model brings itself.

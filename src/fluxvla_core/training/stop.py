@@ -110,7 +110,7 @@ def stopped(number: int, place: str) -> BaseException:
     """What a run that was asked to stop, and saved, ends with.
 
     SIGINT ends as an interrupted command does (exit code 130), the others as one that could not
-    finish (1): whoever restarts failed jobs then restarts this one.
+    finish (1): a scheduler that restarts failed jobs then restarts this one.
     """
     if number == signal.SIGINT:
         return KeyboardInterrupt(place)

@@ -120,7 +120,7 @@ class Trainer:
                 if validate and not stopped:
                     stopped, better = self._try_validation(records, save)
                 if validate and stopped:
-                    # Whoever asks for a stop may kill soon. The resumed run makes up for the
+                    # A stop request is often followed by a kill. The resumed run makes up for the
                     # validation, and reports this step then.
                     run.progress.unvalidated = records.pop()
                 self._report(records)
@@ -209,7 +209,7 @@ class Trainer:
             close()
 
     def _look_ahead(self) -> None:
-        """Show the first batch to whoever has to see one before the first step."""
+        """Pass the first batch to what needs one before the first step."""
         run = self._run
         first = next(self._batches)
         self._batches = chain([first], self._batches)

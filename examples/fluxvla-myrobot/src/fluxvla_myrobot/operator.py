@@ -131,7 +131,7 @@ class MyRobotOperator:
         self.movegrip(checked[6])
 
     def stop(self):
-        """Nothing is sent: the arm stays where it was last told to go."""
+        """Nothing is sent: the arm stays at its last command."""
 
     def close(self):
         """Give the connection back and forget what was read; any number of times."""

@@ -1,6 +1,6 @@
 """An evaluation runner, as the page 'Adding Custom Engines' outlines it: no base class needed.
 
-The simulation is as small as one can be: an arm that is where it was told to be, and a task that is
+The simulation is as small as one can be: an arm that is always at its command, and a task that is
 done when its first joint has turned to the right side.
 """
 

@@ -1,6 +1,6 @@
 """DeepSpeed's engine around a model and its optimizer, and their state by parameter name.
 
-ZeRO trains flat fp32 copies of which every process holds a part. The names, shapes and values of
+ZeRO trains flat fp32 copies, partitioned over the processes. The names, shapes and values of
 the parameters that they are made of are put together again for checkpoints, which are therefore
 those of any other strategy.
 """

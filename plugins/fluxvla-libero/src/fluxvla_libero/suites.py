@@ -145,7 +145,7 @@ def can_be_done_in(task: SuiteTask, scene: SuiteTask) -> bool:
 
 @lru_cache(maxsize=256)
 def goal(task: SuiteTask) -> tuple[tuple[str, ...], ...]:
-    """The conditions of ``task``, all of which must hold: a predicate and what it is about."""
+    """The conditions of ``task``, which must all hold: a predicate and its arguments."""
     return tuple(tuple(state) for state in _parsed(task)["goal_state"])
 
 

@@ -63,7 +63,7 @@ class CompactVLA(VLA, nn.Module):
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar}``.
 
-        A head that tells ``errors`` gives ``sample_losses`` ``(B,)`` too, for the records.
+        A head that returns ``errors`` gives ``sample_losses`` ``(B,)`` too, for the records.
 
         Args:
             images: ``(B, 3N, H, W)`` normalised.

@@ -1,6 +1,6 @@
 """Pictures from MuJoCo without a window, from any thread, in any size.
 
-A robot's scene is drawn by whoever looks: the thread that observes, the one that records, the
+A robot's scene is drawn by several threads: the one that observes, the one that records, the
 cameras' thread of a ROS 2 node. What qualities there are and what they cost is in
 ``fluxvla_mujoco.drawing``.
 """
@@ -35,7 +35,7 @@ def import_mujoco() -> Any:
 def _gl_context_class(mujoco: Any) -> Any:
     if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "egl").lower() != "egl":
         return mujoco.GLContext
-    # Whoever imported mujoco first chose its default; this class works whatever that was.
+    # The first import of mujoco chose its default backend; this class works with any.
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     from mujoco.egl import GLContext
 

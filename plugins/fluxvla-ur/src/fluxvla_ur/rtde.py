@@ -68,7 +68,7 @@ class _Reading:
 class URRTDEOperator(Operator):
     """A UR arm on the network, without ROS.
 
-    The controller is told to stop by itself when this program falls silent (``watchdog_hz``).
+    The controller is configured to stop by itself when this program falls silent (``watchdog_hz``).
     Protective and emergency stops end the commands, and the speed slider slows them down.
 
     Args:

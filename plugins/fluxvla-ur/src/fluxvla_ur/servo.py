@@ -22,7 +22,7 @@ STREAMED = "forward_position_controller"
 """The controller that works like this; trajectory controllers interpolate by themselves."""
 STEP = 20.0 * 0.002
 """How far one position may be from another, in rad."""
-# Of which the first that suffices is taken; the robot itself runs at the last.
+# The first that suffices is taken; the robot itself runs at the last.
 _RATES_HZ = (125.0, 250.0, 500.0)
 
 

@@ -214,7 +214,7 @@ def check_beginning(
 def _check_jumps(
     points: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
 ) -> None:
-    """Refuse jumps between points ``(N, dim)``, the second of which is keyframe ``first``."""
+    """Refuse jumps between points ``(N, dim)``; the second one is keyframe ``first``."""
     moves = np.diff(points, axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
     seconds = np.abs(moves) / np.array([j.velocity for j in embodiment.joints]) - 1.0 / rate_hz

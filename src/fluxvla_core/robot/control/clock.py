@@ -71,9 +71,9 @@ class Rate:
     Deadlines that were missed are skipped, never made up for: two commands sent at once would ask
     the arm for a jump. Two ticks are at least half a period apart, however late the first one was.
 
-    What a command is made of takes a while, and not always the same. So ``sleep`` may return
-    ``lead_s`` early, and whoever has the command ready calls ``wait()`` for the deadline itself; in
-    real time no other thread of the interpreter comes between.
+    Making a command takes a varying time. So ``sleep`` may return ``lead_s`` early; the caller
+    makes the command, then calls ``wait()`` for the deadline itself. In real time no other thread
+    of the interpreter runs during that wait.
 
     In a lockstep simulation both return at once.
 
@@ -85,8 +85,8 @@ class Rate:
     ``on_tick`` is called at each tick, after the wait; what it raises leaves ``sleep``. The runner
     supervises there, so that a custom loop around ``rate.sleep()`` is supervised too.
 
-    ``ticks`` were had and ``skipped`` were not; ``late_s`` tells how late the last one was, or,
-    once ``wait`` was called, what was sent at the last deadline.
+    ``ticks`` counts those that happened, ``skipped`` those missed; ``late_s`` is how late the last
+    one was, or, once ``wait`` was called, how late what was sent at the last deadline.
     """
 
     def __init__(

@@ -59,7 +59,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 
-# Limits are kept a millionth inside, so that whoever recomputes speeds from the positions that
+# Limits are kept a millionth inside, so that a robot that recomputes speeds from the positions that
 # were sent finds them within the limits in spite of rounding.
 MARGIN = 1e-6
 # How far beyond a limit a joint may be measured at the start (encoder offset, backlash): a share

@@ -93,7 +93,7 @@ class JsonLines(Log):
 
 
 def _json(value: Any) -> str:
-    """A chunk row by row: one call for all of it would keep the interpreter from whoever sends."""
+    """A chunk row by row: one call for all would keep the interpreter from the sending thread."""
     if isinstance(value, np.ndarray) and value.ndim > 1:
         return "[" + ", ".join(map(_json, value)) + "]"
     return json.dumps(value, default=ros.plain)
@@ -105,7 +105,7 @@ class Recording:
 
     Args:
         names: ``state`` and ``action`` -> joint names.
-        cameras: of which every picture is recorded, if ``source`` gives them.
+        cameras: those whose pictures are all recorded, if ``source`` gives them.
         source: see ``Source``; None: pictures are recorded when somebody looks. Videos show what
             it gives, too.
     """
@@ -232,7 +232,7 @@ class EpisodeTrace:
         return JsonLines(self.folder)
 
     def _run(self) -> None:
-        # Whoever sends commands waits for the interpreter while this thread has it.
+        # The sending thread waits for the interpreter while this thread has it.
         priority.just_below_real_time()
         while True:
             try:

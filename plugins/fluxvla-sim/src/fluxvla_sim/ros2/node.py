@@ -9,7 +9,7 @@ second and whenever an episode begins or a task is done). A robot may have more,
 sets on it.
 
 A machine that cannot draw and think in real time is given a ``real_time_factor``: the whole robot
-then lives that much slower, its rates with it, and whoever drives it follows the same slowed clock
+then lives that much slower, its rates with it, and the control loop follows the same slowed clock
 (:mod:`fluxvla_sim.ros2.operators`). What was promised and not kept is counted: ``late`` periods.
 """
 

@@ -190,7 +190,7 @@ class InSimulation(RosOperator):
         return self._newest_facts()[0]
 
     def episode_facts(self) -> dict[str, Any]:
-        """JSON values about how the last episode was simulated, for whoever reports its outcome.
+        """JSON values about how the last episode was simulated, for reports of its outcome.
 
         ``real_time_factor`` is what was stated, ``real_time_kept`` the share of it that the
         simulator reached from the episode's begin until it was judged. Below 0.95 a warning is

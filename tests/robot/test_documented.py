@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks._robot_fault_list import FAULTS
+from fluxvla_core.operators import SafetySettings
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "time_to_hold.json"
@@ -20,10 +21,25 @@ def page():
     return (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
 
 
+def table(page, first):
+    """The cells of the table whose first column is called ``first``, row by row."""
+    _, _, below = page.partition(f"| {first} |")
+    lines = below.partition("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
 @pytest.fixture(scope="module")
 def rows(page):
-    lines = [line for line in page.splitlines() if line.startswith("| ")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
+    return table(page, "fault")
+
+
+def test_the_thresholds_are_listed_with_their_defaults(page):
+    listed = {}
+    for keys, values, _ in table(page, "key"):
+        numbers = [float(number) for number in re.findall(r"[\d.]+", values)]
+        names = re.findall(r"`(\w+)`", keys)
+        listed |= zip(names, numbers * len(names) if len(numbers) == 1 else numbers, strict=True)
+    assert listed == vars(SafetySettings())
 
 
 def test_every_test_that_the_page_names_exists(page):

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.robot.control.commands import Sent
 from fluxvla_core.robot.control.safety import Trip
+from fluxvla_core.robot.control.sender import Sent
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]

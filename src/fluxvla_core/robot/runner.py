@@ -31,13 +31,13 @@ from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control import priority
-from fluxvla_core.robot.control.commands import check_pose
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.episode import EpisodeSettings, Equipment
+from fluxvla_core.robot.control.sender import check_pose
+from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
 from fluxvla_core.robot.observation import scaled_views
 from fluxvla_core.robot.policy_calls import PolicyThread
@@ -291,7 +291,7 @@ class BaseInferenceRunner(Runner):
                 hooks.call("run_started")
                 source.open()
                 self.robot.connect()
-                with nullcontext() if self.robot.lockstep else priority.real_time():
+                with nullcontext() if self.robot.lockstep else realtime.real_time():
                     result = session.run(self._run_episode)
                 ended = "ok"
             except Interrupted as signal:
@@ -357,10 +357,10 @@ class BaseInferenceRunner(Runner):
             max_steps=self.max_publish_step,
             ready_s=self.ready_timeout,
         )
-        equipment = Equipment(
+        parts = EpisodeParts(
             robot=self.robot,
             policy=self.policy,
-            look=self._look,
+            observe=self._observe,
             filters=self.action_filters,
             joiner=joiner,
             execute=self._execute_actions,
@@ -370,10 +370,10 @@ class BaseInferenceRunner(Runner):
             reporter=reporter,
             observers=(self.recorder, *self._observers),
         )
-        session.play(equipment, settings, task)
+        session.play(parts, settings, task)
         return self.recorder.summary
 
-    def _look(self) -> tuple[dict[str, Any], Frame | None]:
+    def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
         window = self.update_observation_window()
         return window, self._frame

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from fluxvla_core.contracts.robot import Clock, Operator
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 
 
 class MonotonicClock(Clock):
@@ -142,10 +142,10 @@ class Rate:
         self.skipped += missed
         deadline += missed * self.period
         if self._keeps:
-            priority.share_interpreter()
+            realtime.share_interpreter()
         self.clock.sleep_until(deadline)
         if self._keeps:
-            priority.keep_interpreter()
+            realtime.keep_interpreter()
         self._woke = self.clock.now()
         late = max(0.0, self._woke - deadline)
         if not self._waits:
@@ -165,7 +165,7 @@ class Rate:
         self.late_s = 0.0
         if self._due is not None:
             if self._keeps:
-                priority.wait_until(self._due)
+                realtime.wait_until(self._due)
             else:
                 self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)

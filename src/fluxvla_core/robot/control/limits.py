@@ -366,7 +366,7 @@ class CommandLimiter:
 class PassThrough:
     """No limits, for actions that are no joint targets: commands are the targets.
 
-    What such an environment does with a value beyond its limits is its own affair; it is noted.
+    What such an environment does with a value beyond its limits is up to it; it is recorded.
 
     Args:
         embodiment: whose limits the values are held against.

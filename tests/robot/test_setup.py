@@ -121,8 +121,8 @@ def test_a_camera_with_more_pixels_than_in_training_is_said(bench):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["front", "back"], "camera_names 'back' is none of front"),
-        (["side"], "camera_names 'side' is none of front"),
+        (["front", "back"], "camera_names 'back' is unknown; choose one of front"),
+        (["side"], "camera_names 'side' is unknown; choose one of front"),
     ],
 )
 def test_camera_names_must_be_the_robots(bench, names, message):

@@ -43,7 +43,7 @@ class PendingQuery:
     """A query that the policy has not answered yet.
 
     Args:
-        future: of the answer.
+        future: the future of the answer.
         last: ``(D,)`` the last command when it was asked.
         due: in lockstep, the time before which the answer does not count as there.
     """

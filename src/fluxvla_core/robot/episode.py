@@ -1,4 +1,4 @@
-"""One episode on a robot: to the start pose, the control loop, to rest.
+"""An episode on a robot: to the start pose, the control loop, to rest.
 
 Whatever happens in it, it ends in a safe stop: the arm brakes within its limits where it still
 obeys, and the operator's own ``stop`` is called where something went wrong.
@@ -84,12 +84,12 @@ class EpisodeParts:
         robot, policy: connected, loaded, and fitting each other.
         observe: makes an observation of the robot's newest frame.
         filters: the config's ``action_filters``.
-        joiner: how chunks become one motion.
+        joiner: joins the chunks to one motion.
         execute: sends commands: ``(N, D)`` and the rate.
         latch: an episode does not begin while it is tripped.
         interrupts: signals that ask the run to end.
-        thread: where the policy thinks.
-        reporter: where progress goes.
+        thread: the thread in which the policy computes.
+        reporter: shows progress and warnings.
         observers: receive every event.
     """
 

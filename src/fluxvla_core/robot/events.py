@@ -1,4 +1,4 @@
-"""What happens in an episode, as typed events, and who observes them.
+"""Typed events of an episode, and the observers that receive them.
 
 The episode engine emits events and knows nothing of files or plugins: an observer writes the
 record, another calls the plugins' hooks. Observers are called in order, in the thread that emits;
@@ -158,7 +158,7 @@ class HookObserver(EpisodeObserver):
     """Calls the plugins' hooks.
 
     Args:
-        hooks: of the run.
+        hooks: the hooks of the run.
     """
 
     def __init__(self, hooks: HookCaller) -> None:

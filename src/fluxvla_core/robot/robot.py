@@ -267,7 +267,7 @@ class Robot:
     def _reported(self, method: str, function: Callable[[], object]) -> str | None:
         try:
             function()
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - reported; the rest of the stop goes on
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - reported; the rest of the stop follows
             return f"{self.name}.{method} raised {type(error).__name__}: {error}"
         return None
 

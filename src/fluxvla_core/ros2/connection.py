@@ -1,4 +1,4 @@
-"""One ROS 2 node in one context, spun by one thread, with the shutdown order that works.
+"""Connection to ROS 2: a node in a context, spun by one thread, shut down in the order that works.
 
 A ``MultiThreadedExecutor`` loses messages and burns a core in the rclpy releases that are in use;
 one thread that only stores messages keeps up with 240 VGA pictures a second. The context is our

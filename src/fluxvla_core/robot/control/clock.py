@@ -79,7 +79,7 @@ class Rate:
 
     Args:
         hz: ticks a second.
-        clock: whose time counts; the monotonic clock by default.
+        clock: source of the time; the monotonic clock by default.
         lead_s: how long before each deadline ``sleep`` returns, less than a period.
 
     ``on_tick`` is called at each tick, after the wait; what it raises leaves ``sleep``. The runner
@@ -116,7 +116,7 @@ class Rate:
         self._waits = False
 
     def reset(self) -> None:
-        """Begin anew: the next deadline is one period from the next ``sleep``'s call."""
+        """Reset: the next deadline is one period from the next ``sleep``'s call."""
         self._deadline = self._due = self._woke = None
 
     def sleep(self) -> float:

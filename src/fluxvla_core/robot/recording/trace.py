@@ -96,7 +96,7 @@ def _json(value: Any) -> str:
     """A chunk row by row: one call for all would keep the interpreter from the sending thread."""
     if isinstance(value, np.ndarray) and value.ndim > 1:
         return "[" + ", ".join(map(_json, value)) + "]"
-    return json.dumps(value, default=ros.plain)
+    return json.dumps(value, default=ros.numpy_as_json)
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class EpisodeTrace:
     def _guard(self, call: Any, *arguments: Any) -> None:
         try:
             call(*arguments)
-        except Exception as error:  # noqa: BLE001 - raised by close; the robot goes on
+        except Exception as error:  # noqa: BLE001 - raised by close; the run continues
             self._error = self._error or error
 
     def _put(self, item: Any) -> None:

@@ -163,7 +163,7 @@ def test_a_start_pose_that_cannot_be(bench, pose, message):
         ),
         (
             {"chunk_joining": "rtc"},
-            "chunk_joining is 'rtc', and Waver cannot go on from a chunk",
+            "chunk_joining is 'rtc', and Waver cannot continue a chunk",
         ),
         ({"simulated_latency": -1}, "simulated_latency must be 0 or more, got -1"),
         ({"simulated_latency": float("nan")}, "simulated_latency must be 0 or more, got nan"),

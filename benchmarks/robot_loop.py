@@ -51,7 +51,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
 from fluxvla_core.build import RunContext
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.ros2.startup import large_frames_profile
@@ -279,7 +279,7 @@ def upstream(seconds: float, prompt: float) -> dict[str, Any]:
 def bare(seconds: float, prompt: float) -> dict[str, Any]:
     """A loop that does nothing; ``late_share`` and jitter as the others have them."""
     woke, late = [], []
-    with priority.real_time():
+    with realtime.real_time():
         due = time.monotonic()
         for _ in range(round(seconds * RATE_HZ)):
             due += 1 / RATE_HZ

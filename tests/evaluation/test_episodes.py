@@ -82,7 +82,7 @@ def test_finished_episodes_are_never_run_again(tmp_path):
     more = run(tmp_path, keys_of(5), reporter=listener)
     assert more[:3] == first
     assert len(runs(tmp_path)) == 5
-    assert listener.lines == ["3 of 5 episodes are there already; going on with the others"]
+    assert listener.lines == ["3 of 5 episodes are there already; running the others"]
     assert listener.steps[-1] == ("episodes", 5, 5, 3)
     assert run(tmp_path, keys_of(5)) == more
     assert len(runs(tmp_path)) == 5

@@ -172,7 +172,7 @@ def test_an_interrupted_evaluation_goes_on(evaluate, section, tmp_path, listener
     assert 0 < done < 4
     found = evaluate(tasks=["1"])
     assert found["groups"]["policy"]["tasks"]["1"]["episodes"] == 4
-    assert f"{done} of 4 episodes are there already; going on" in listener.lines
+    assert f"{done} of 4 episodes are there already; running the others" in listener.lines
     assert [r["seed"] for r in episodes(tmp_path)] == [10, 11, 12, 13]
 
 
@@ -240,7 +240,7 @@ class TestRealRobot:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"section": "other"}, "section: 'other' is none of the config's"),
+        ({"section": "other"}, "section: 'other' is not in the config"),
         ({"tasks": ["9"]}, "tasks: '9' is no task of inference; there are 1, 2"),
         ({"episodes": 0}, "episodes: must be at least 1, got 0"),
     ],

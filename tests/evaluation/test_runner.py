@@ -191,7 +191,7 @@ def test_finished_episodes_are_never_run_again(tmp_path, walking, listener):
     evaluate(tmp_path, environment, tasks=["right"], episodes=6, reporter=listener)
     new = {p.name.split(".")[0] for p in marks.iterdir() if p.name not in before}
     assert new == {"right-4", "right-5"}
-    assert "4 of 6 episodes are there already; going on with the others" in listener.lines
+    assert "4 of 6 episodes are there already; running the others" in listener.lines
 
 
 def test_parts_of_a_job_are_run_apart_and_merged(tmp_path, walking, monkeypatch, listener):
@@ -341,7 +341,7 @@ def test_chance_does_what_chance_does(tmp_path, walking):
         ({"video_fps": 0.0}, "video_fps must be positive, got 0"),
         ({"tasks": ["up"]}, "there is no task 'up'; there are right, left"),
         ({"tasks": ["left", "left"]}, r"tasks must name each task once, got \['left', 'left'\]"),
-        ({"video_cameras": ["ear"]}, "video_cameras 'ear' is none of eye"),
+        ({"video_cameras": ["ear"]}, "video_cameras 'ear' is unknown; choose one of eye"),
     ],
 )
 def test_impossible_values_are_refused(tmp_path, walking, options, text):

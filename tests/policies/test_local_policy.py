@@ -242,7 +242,9 @@ def test_bf16_computes_and_still_gives_float64(tmp_path):
     policy.reset(0)
 
     assert policy.predict_action(observation()).dtype == np.float64
-    with pytest.raises(ConfigError, match="mixed_precision_dtype 'fp16' is none of float32, bf16"):
+    with pytest.raises(
+        ConfigError, match="mixed_precision_dtype 'fp16' is unknown; choose one of float32, bf16"
+    ):
         load(save(tmp_path), mixed_precision_dtype="fp16")
 
 

@@ -139,7 +139,7 @@ def test_asked_all_the_same_it_is_an_error(model):
         return rows * rows.mean()
 
     local = policy(model(), mixing if model is Obedient else None, source="step-100")
-    with pytest.raises(ConfigError, match="the policy of step-100 cannot go on from a chunk"):
+    with pytest.raises(ConfigError, match="the policy of step-100 cannot continue a chunk"):
         local.continue_action(observation(), rest())
 
 

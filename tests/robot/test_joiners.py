@@ -69,9 +69,13 @@ def test_parameters_reach_the_joiner():
         ),
         (
             {"method": "rtc", "schedule": "expo"},
-            "schedule 'expo' is none of exp, linear, ones, zeros; did you mean 'exp'?",
+            "schedule 'expo' is unknown; choose one of exp, linear, ones, zeros; "
+            "did you mean 'exp'?",
         ),
-        ({"method": "rtc", "schedule": "?"}, "schedule '?' is none of exp, linear, ones, zeros"),
+        (
+            {"method": "rtc", "schedule": "?"},
+            "schedule '?' is unknown; choose one of exp, linear, ones, zeros",
+        ),
         ({"method": "rtc", "max_guidance_weight": 0}, "max_guidance_weight must be positive"),
         ({"method": "rtc", "window": 0}, "rtc: window must be at least 1, got 0"),
     ],

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.commands import ramp
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import SafetySettings
+from fluxvla_core.robot.control.sender import ramp
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

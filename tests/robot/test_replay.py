@@ -317,7 +317,7 @@ def test_lines_of_json_are_enough_for_a_policy(bench, make_arm):
     np.testing.assert_array_equal(bench.arm.sent, sent)
     with pytest.raises(DataError, match="has no pictures: its robot cannot be replayed") as caught:
         bench.run(operator=ReplayOperator(path))
-    assert "record anew with --record DIR" in str(caught.value)
+    assert "record again with --record DIR" in str(caught.value)
 
 
 @pytest.mark.realtime

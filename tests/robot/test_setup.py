@@ -121,8 +121,8 @@ def test_a_camera_with_more_pixels_than_in_training_is_said(bench):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["front", "back"], "camera_names 'back' is none of front"),
-        (["side"], "camera_names 'side' is none of front"),
+        (["front", "back"], "camera_names 'back' is unknown; choose one of front"),
+        (["side"], "camera_names 'side' is unknown; choose one of front"),
     ],
 )
 def test_camera_names_must_be_the_robots(bench, names, message):
@@ -163,7 +163,7 @@ def test_a_start_pose_that_cannot_be(bench, pose, message):
         ),
         (
             {"chunk_joining": "rtc"},
-            "chunk_joining is 'rtc', and Waver cannot go on from a chunk",
+            "chunk_joining is 'rtc', and Waver cannot continue a chunk",
         ),
         ({"simulated_latency": -1}, "simulated_latency must be 0 or more, got -1"),
         ({"simulated_latency": float("nan")}, "simulated_latency must be 0 or more, got nan"),

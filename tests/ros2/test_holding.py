@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluxvla_core.ros2.commands import Motion, braking_commands, hold_target
+from fluxvla_core.ros2.stop_motion import Motion, braking_commands, hold_target
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
@@ -111,7 +111,7 @@ def test_commands_that_came_one_by_one_are_no_motion():
 def test_a_motion_is_gone_on_from_at_the_speed_that_it_has(monkeypatch, late_s):
     """However late a single command was, those of a beat are a beat apart."""
     now = [100.0]
-    monkeypatch.setattr("fluxvla_core.ros2.commands.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("fluxvla_core.ros2.stop_motion.time.monotonic", lambda: now[0])
     motion, sent = Motion(), [np.full(3, 0.5), np.full(3, 0.51)]
     motion.sent(sent[0])
     now[0] += 0.02 + late_s

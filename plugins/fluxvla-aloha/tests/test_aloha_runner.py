@@ -82,7 +82,7 @@ def test_it_is_found_by_its_name():
 
 
 def test_the_one_in_real_time_asks_for_a_policy_that_goes_on_from_a_chunk(tmp_path):
-    with pytest.raises(ConfigError, match="chunk_joining is 'rtc', and Closing cannot go on"):
+    with pytest.raises(ConfigError, match="chunk_joining is 'rtc', and Closing cannot continue"):
         run(tmp_path, Still(), Closing(0.5), type="AlohaRTCInferenceRunner")
     policy = Closing(0.5)
     policy.continue_action = lambda observation, rest: policy.predict_action(observation)

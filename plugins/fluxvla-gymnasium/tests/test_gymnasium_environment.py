@@ -208,7 +208,7 @@ def test_what_does_not_fit_is_refused_before_the_first_step(arguments, error, me
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"render": "nice"}, "render 'nice' is none of"),
+        ({"render": "nice"}, "render 'nice' is unknown; choose one of"),
         ({"id": "gym_aloha:gym_aloha/X-v0"}, "set module = 'gym_aloha' and id = 'gym_aloha/X-v0'"),
         ({"module": "os.path"}, "'os.path' is no name of an installed package"),
         ({"success": "reward"}, "success 'reward' is none of info, terminated, truncated"),

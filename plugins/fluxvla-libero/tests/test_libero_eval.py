@@ -108,7 +108,7 @@ def test_each_trial_begins_in_its_fixed_state_and_ten_steps_later(environment):
     assert settled - environment.scene.data.time == pytest.approx(0.5)
     with pytest.raises(ConfigError, match="50 fixed states for each task; there is no episode 50"):
         environment.reset(50, SALAD)
-    with pytest.raises(ConfigError, match="'juggle' is none of this environment's tasks"):
+    with pytest.raises(ConfigError, match="'juggle' is not a task of this environment"):
         environment.reset(0, "juggle")
     anywhere = LiberoEnvironment(begin="random")
     anywhere._scene = environment.scene

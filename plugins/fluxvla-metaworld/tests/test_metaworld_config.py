@@ -53,7 +53,7 @@ def test_sets_of_tasks_have_names():
         ({"tasks": ["push-v3", "push-v3"]}, "tasks must name each task once"),
         ({"cameras": ("front",)}, "no camera 'front'; they have corner, corner2"),
         ({"height": 8}, "pictures of 8x224 are too small"),
-        ({"render": "nice"}, "render 'nice' is none of cheap, coarse, reference"),
+        ({"render": "nice"}, "render 'nice' is unknown; choose one of cheap, coarse, reference"),
         ({"max_steps": 501}, "max_steps must be 1 to 500, got 501"),
     ],
 )

@@ -141,7 +141,7 @@ def test_impossible_actions_are_refused(environment, action):
 
 def test_a_task_of_another_set_is_refused(environment):
     few = MetaWorldEnvironment(tasks=["push-v3"])
-    with pytest.raises(ConfigError, match="'reach-v3' is none of this environment's tasks"):
+    with pytest.raises(ConfigError, match="'reach-v3' is not a task of this environment"):
         few.reset(0, "reach-v3")
     with pytest.raises(RunFailed, match="the episode is over"):
         few.step(np.zeros(4))

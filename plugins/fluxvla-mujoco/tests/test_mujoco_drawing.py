@@ -89,7 +89,9 @@ def test_only_the_reference_keeps_the_models_quality():
 
 
 def test_an_unknown_quality_is_answered_with_those_there_are():
-    with pytest.raises(ConfigError, match="render 'nice' is none of cheap, coarse, reference"):
+    with pytest.raises(
+        ConfigError, match="render 'nice' is unknown; choose one of cheap, coarse, reference"
+    ):
         check_render("nice")
 
 

@@ -215,6 +215,19 @@ def test_what_went_wrong_in_episodes_stands_beside_their_rates(
     assert page.shows("2 more problems are in")
 
 
+def test_the_mean_return_is_shown_where_there_is_one(complete: Path, tmp_path: Path) -> None:
+    assert not page_of(complete, tmp_path).shows("mean return")
+    work_dir = tmp_path / "with_returns"
+    shutil.copytree(complete, work_dir)
+    path = work_dir / "eval" / "results.json"
+    results = json.loads(path.read_text())
+    next(iter(results["groups"].values()))["all"]["mean_return"] = -12.5
+    path.write_text(json.dumps(results))
+    page = page_of(work_dir, tmp_path)
+    assert page.shows("mean return")
+    assert page.shows("-12.5")
+
+
 def test_damaged_files_are_listed(tmp_path: Path) -> None:
     (little(tmp_path / "work") / "environment.json").write_text("{")
     assert page_of(tmp_path / "work", tmp_path).shows("environment.json: invalid JSON")

@@ -44,7 +44,9 @@ def test_what_an_environment_says_before_anything_is_built(cls):
     assert spec.details == {"render": "reference"}
     assert spec.embodiment.camera_names == cls.robot.cameras
     assert {task.max_steps for task in spec.tasks} == {300}
-    with pytest.raises(ConfigError, match="render 'best' is none of cheap, coarse, reference"):
+    with pytest.raises(
+        ConfigError, match="render 'best' is unknown; choose one of cheap, coarse, reference"
+    ):
         cls(render="best")
 
 
@@ -246,8 +248,8 @@ def test_without_a_checkpoint_the_message_says_what_to_do(tmp_path):
         ({"tasks": ("juggle",)}, "there is no task 'juggle'"),
         ({"tasks": ("lift_hold", "lift_hold")}, "tasks must name each task once"),
         ({"max_steps": 200}, "max_steps must be at least 300, got 200"),
-        ({"render": "best"}, "render 'best' is none of cheap"),
-        ({"video_cameras": ("head",)}, "'head' is none of top"),
+        ({"render": "best"}, "render 'best' is unknown; choose one of cheap"),
+        ({"video_cameras": ("head",)}, "'head' is unknown; choose one of top"),
         ({"environment": {"type": "x"}}, "AlohaSimEvalRunner is for AlohaSimEnvironment alone"),
     ],
 )

@@ -199,7 +199,7 @@ def test_the_cameras_are_those_of_the_scene():
         ({"task": "juggle"}, "no task 'juggle'; there are transfer_cube, lift_hold"),
         ({"camera_names": ("head",)}, "simulated ALOHA has no camera 'head'; it has top"),
         ({"height": 0}, "positive size, got 0x640"),
-        ({"render": "best"}, "render 'best' is none of cheap, coarse, reference"),
+        ({"render": "best"}, "render 'best' is unknown; choose one of cheap, coarse, reference"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_loaded(arguments, message):

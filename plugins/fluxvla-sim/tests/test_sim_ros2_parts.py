@@ -298,11 +298,11 @@ class TestCommandLine:
 
     @pytest.mark.parametrize("text", ["top", "top=", "=0.1", "top=soon", "top=-1", "top=inf"])
     def test_a_latency_that_is_none_is_refused(self, text):
-        with pytest.raises(UsageError, match=f"'{text}' is no latency; write STREAM=SECONDS"):
+        with pytest.raises(UsageError, match=f"'{text}' is not a latency; write STREAM=SECONDS"):
             stream_latency(text)
 
     def test_a_time_that_is_none_is_refused(self):
-        with pytest.raises(UsageError, match="'soon' is no number of seconds"):
+        with pytest.raises(UsageError, match="'soon' is not a number of seconds"):
             timed_fault("top=drop@soon")
 
     @pytest.mark.parametrize(

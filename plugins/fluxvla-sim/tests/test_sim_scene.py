@@ -196,7 +196,7 @@ def test_cheap_pictures_leave_out_shadows_and_multisampling():
     assert (quality.shadowsize, quality.offsamples) == (0, 0)
     quality = reference.vis.quality
     assert (quality.shadowsize, quality.offsamples) == (4096, 4), "as the model file asks"
-    with pytest.raises(ConfigError, match="render 'best' is none of"):
+    with pytest.raises(ConfigError, match="render 'best' is unknown; choose one of"):
         load_model(AlohaScene.file, "best")
 
 

@@ -50,9 +50,9 @@ class Collection:
         episodes: how many demonstrations; tasks take turns, or follow each other where going from
             one to another takes long.
         tasks: names; all of the environment's by default.
-        seed: of the first episode.
+        seed: seed of the first episode.
         cameras: names; all of the environment's by default.
-        height, width: of all pictures; each camera's own by default.
+        height, width: size of all pictures; each camera's own by default.
         failures: also keep episodes in which the task was not done.
 
     Raises:
@@ -302,10 +302,10 @@ def collect_episodes(
         out: the dataset's folder; it must not exist yet.
         fps: frames a second.
         factory: makes, in a worker process, a function from an episode's number to the episode.
-        settings: what the dataset follows from, as JSON values; going on with other ones is
+        settings: what the dataset follows from, as JSON values; continuing with other ones is
             refused.
         workers: processes that act, beside this one, which writes.
-        resume: go on with a collection into ``out`` that was interrupted.
+        resume: continue a collection into ``out`` that was interrupted.
 
     Returns:
         JSON values: ``episodes``; ``collected``, ``frames`` and ``retried`` of this call;
@@ -325,7 +325,7 @@ def collect_episodes(
     elif note.parent.exists():
         raise UsageError(
             f"a collection into {out} was interrupted, or is under way",
-            next=f"add --resume to go on with it, or delete {note.parent}",
+            next=f"add --resume to continue it, or delete {note.parent}",
         )
     began, retried, frames = time.monotonic(), 0, 0
     with LeRobotWriter(out, fps, embodiment, recover=resume, go_on=_GO_ON) as writer:
@@ -389,5 +389,5 @@ def _check_same(note: Path, settings: Mapping[str, Any]) -> None:
     if other:
         raise UsageError(
             f"the interrupted collection had other settings: {'; '.join(other)}",
-            next=f"use the same settings, or delete {note.parent} and begin anew",
+            next=f"use the same settings, or delete {note.parent} and start again",
         )

@@ -20,7 +20,7 @@ class Evaluated:
     """One side of a comparison: the finished episodes of a group.
 
     Args:
-        folder: where it is.
+        folder: the folder of its results.
         group: which of its groups.
         about: what was evaluated, from the episode log's first line.
         records: finished episodes.

@@ -51,7 +51,7 @@ class EpisodeKey:
     Args:
         group: which policy, with which instruction: ``policy``, ``swapped``, ``untrained``, …
         task: the task whose scene and success are meant.
-        seed: of everything random in the episode.
+        seed: seed of everything random in the episode.
     """
 
     group: str
@@ -101,7 +101,7 @@ def run_in_pool(
     done, began = len(keys) - len(missing), time.monotonic()
     succeeded = sum(bool(record["success"]) for record in log.records(keys))
     if done and missing:
-        reporter.info(f"{done} of {len(keys)} episodes are there already; going on with the others")
+        reporter.info(f"{done} of {len(keys)} episodes are there already; running the others")
     with closing(pool.run(missing)) as outcomes:
         for outcome in outcomes:
             key = missing[outcome.index]

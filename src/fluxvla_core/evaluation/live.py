@@ -51,8 +51,8 @@ class LiveSettings:
 
     Args:
         options: arguments of ``BaseInferenceRunner``, of those in ``LIVE_OPTIONS``.
-        folder: where each episode's recording goes.
-        video_fps: of the recorded videos; None records none.
+        folder: parent of the episodes' recordings.
+        video_fps: frames a second of the videos; None records none.
     """
 
     options: Mapping[str, Any]

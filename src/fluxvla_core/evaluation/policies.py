@@ -36,7 +36,7 @@ class PolicySource:
             or None for that of the run.
         dataset, denormalize_action: override those of the checkpoint, see ``load_policy``.
         norm_stats_key: which of its statistics; those it was trained with by default.
-        device: of torch.
+        device: a torch device.
         precision: ``float32`` or ``bf16``.
         batch_size: rows of every forward pass; results follow from it.
     """

@@ -244,7 +244,7 @@ class ServedPolicy(Policy):
         return self._ask(Question(observation, self._seed, self._calls))
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """As ``predict_action``, for a chunk that goes on from ``rest`` (``ContinuesChunks``)."""
+        """As ``predict_action``, for a chunk that continues ``rest``: see ``Actor``."""
         return self._ask(Question(observation, self._seed, self._calls, rest))
 
     def _ask(self, question: Question) -> Array:

@@ -3,7 +3,7 @@
 A worker is built once per process by a factory and then called with one job after another. A
 process that dies, hangs or raises is replaced: what made one job fail may be broken for good in it,
 as a lost renderer is. The job that it had is tried once more in another process; if that fails too
-it is an error of that job, and the others go on. What cannot get better by trying again (a
+it is an error of that job, and the others continue. What cannot get better by trying again (a
 ``FluxError`` that means bad input) ends the run at once.
 """
 

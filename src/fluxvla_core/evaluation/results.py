@@ -155,7 +155,7 @@ def check_all_done(records: Sequence[Mapping[str, Any]], log: Path) -> None:
             f"{len(errors)} of {len(records)} episodes gave no result, so the rates are of the "
             f"others alone; the last one: {reason(errors[-1]['error'])}",
             where=str(log),
-            next="mend what it says and run the same command again: only these are tried again",
+            next="fix the cause and run the same command again: only these are tried again",
         )
 
 

@@ -49,13 +49,13 @@ class RobotEvalRunner(Runner):
     Args:
         cfg: the whole config (injected).
         context: what the run knows (injected): work dir, reporter.
-        section: of the inference runner.
+        section: the config's section with the inference runner.
         tasks: ids of the section's ``task_descriptions``, or name -> id, where results are to be
             compared with others that have names of their own; all of them by default.
         episodes: for each task.
-        seed: of each task's first episode, for the policy and, where the section's operator takes
-            one, for the scene; the others count up from it.
-        go_on: after a safety stop, go on with the next episode. Only for robots that can hurt
+        seed: seed of each task's first episode, for the policy and, where the section's operator
+            takes one, for the scene; the others count up from it.
+        go_on: after a safety stop, continue with the next episode. Only for robots that can hurt
             nobody: with any other a person must look first, and start the same command again.
         record_videos: how many episodes the results show: failures first, then successes.
         answer: reads a person's line; stdin by default.
@@ -92,18 +92,20 @@ class RobotEvalRunner(Runner):
         self._answer = answer
         table = self.context.config.get(section)
         if not isinstance(table, Mapping):
-            raise self._wrong("section", f"{section!r} is none of the config's")
+            raise self.config_error("section", f"{section!r} is not in the config")
         self._table = dict(table)
         known = {str(key): text for key, text in table.get("task_descriptions", {}).items()}
         self.tasks = _named(tasks, known)
         for task in self.tasks.values():
             if task not in known:
                 there = ", ".join(known) or "none"
-                raise self._wrong("tasks", f"{task!r} is no task of {section}; there are {there}")
+                raise self.config_error(
+                    "tasks", f"{task!r} is no task of {section}; there are {there}"
+                )
         if not self.tasks:
-            raise self._wrong("tasks", f"{section} has no task_descriptions to evaluate")
+            raise self.config_error("tasks", f"{section} has no task_descriptions to evaluate")
         if episodes < 1:
-            raise self._wrong("episodes", f"must be at least 1, got {episodes}")
+            raise self.config_error("episodes", f"must be at least 1, got {episodes}")
         self._policy: Any = None
         self._checkpoint: dict[str, Any] | None = None
 
@@ -137,7 +139,7 @@ class RobotEvalRunner(Runner):
         began = time.monotonic()
         if 0 < len(missing) < len(keys):
             left = len(keys) - len(missing)
-            reporter.info(f"{left} of {len(keys)} episodes are there already; going on")
+            reporter.info(f"{left} of {len(keys)} episodes are there already; running the others")
         for key in missing:
             record = self._episode(key, log)
             if record["status"] == ERROR:
@@ -256,7 +258,8 @@ class RobotEvalRunner(Runner):
         self.context.reporter.settle()
         return input(question).strip()
 
-    def _wrong(self, name: str, what: str) -> ConfigError:
+    def config_error(self, name: str, what: str) -> ConfigError:
+        """An error about a key of this section."""
         where = self.context.where(f"{self.context.section}.{name}")
         return ConfigError(f"{name}: {what}", where=where)
 

@@ -1,4 +1,4 @@
-"""One episode in an environment: observe, predict, execute some of the chunk, observe again.
+"""Rollout of an episode: observe, predict, execute some of the chunk, observe again.
 
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
 commands are formed by the same path as on a robot: keyframes are joined linearly from the last
@@ -21,8 +21,8 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
-from fluxvla_core.robot.control.commands import CommandFormer
 from fluxvla_core.robot.control.limits import CommandLimiter, PassThrough
+from fluxvla_core.robot.control.sender import CommandFormer
 from fluxvla_core.robot.control.tracking import action_columns
 from fluxvla_core.spec.embodiment import Camera
 
@@ -55,7 +55,7 @@ class ChunkCommands:
     an environment that takes no joint targets.
 
     Args:
-        spec: of the environment.
+        spec: the environment's description.
         action_rate_hz: keyframes a second; the environment's rate by default.
     """
 
@@ -103,7 +103,7 @@ def run_episode(
     policy.
 
     Args:
-        seed: of environment and, with ``settings.policy_seed``, policy.
+        seed: seed of the environment and, with ``settings.policy_seed``, policy.
         instruction_of: the task whose instruction the policy gets instead of that of ``task``, one
             of the environment's ``other_tasks``.
         on_step: called with the environment and the number of steps, before the first step and

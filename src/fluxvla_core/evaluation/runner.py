@@ -76,7 +76,7 @@ class EvalRunner(Runner):
     """Evaluates a policy in an environment: ``run_setup()``, then ``run()``.
 
     Writes ``<work_dir>/eval/``: ``results.json``, ``episodes.jsonl``, ``videos/*.mp4``. Started
-    again in the same work dir it goes on where it was. Started as several processes (torchrun, a
+    again in the same work dir it continues where it was. Started as several processes (torchrun, a
     SLURM array, ``srun``) each runs its part of the episodes, and the last one writes the results.
 
     Args:
@@ -87,7 +87,7 @@ class EvalRunner(Runner):
             the table of a registered policy.
         ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
         episodes: for each task.
-        seed: of each task's first episode; the others count up from it.
+        seed: seed of each task's first episode; the others count up from it.
         policy_seed: the policy's seed is this more than the episode's.
         tasks: names of the tasks; all by default.
         replan_every: how many actions of a chunk are executed before the policy is queried again;
@@ -95,7 +95,7 @@ class EvalRunner(Runner):
         max_steps: control steps after which an episode ends, instead of the environment's.
         instruction_swap: also give the policy another task's instruction, and test whether the
             right one does better.
-        swap_seed: of the first of these episodes; by default they repeat those of the policy.
+        swap_seed: seed of the first of these episodes; by default they repeat those of the policy.
         baseline: also evaluate the same model with fresh random weights, on the same seeds.
         live: on the wall clock, through the control loop and the safety of a robot, into
             ``<work_dir>/eval_live/``: True, or a table with those keys of an inference runner
@@ -113,8 +113,8 @@ class EvalRunner(Runner):
         video_fps: frames a second.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
         norm_stats_key: which of the checkpoint's statistics.
-        height, width: of the policy's pictures; as in its training data by default.
-        device, mixed_precision_dtype: of the policy.
+        height, width: size of the policy's pictures; as in its training data by default.
+        device, mixed_precision_dtype: torch device and precision of the policy.
         episode_timeout_s: an episode that takes longer is tried again in a new process.
         reuse: also count existing episodes that other code ran (other versions, changed plugins),
             which is an error otherwise.
@@ -168,7 +168,7 @@ class EvalRunner(Runner):
         # Under torchrun, nproc is the number of its processes, not of each one's workers.
         nproc = None if "WORLD_SIZE" in os.environ else self.context.nproc
         try:
-            self._live: dict[str, Any] | None = plain(live_options(live))
+            self._live: dict[str, Any] | None = as_json(live_options(live))
         except ConfigError as error:
             raise self.config_error("live", error.what) from error
         usual = 2 if self._live is None else 1
@@ -209,9 +209,9 @@ class EvalRunner(Runner):
                 where=self.context.where(self.context.section),
                 next="set environment = dict(type='...') in this section",
             )
-        self._environment = plain(environment)
+        self._environment = as_json(environment)
         self._video = (video_cameras, video_height, video_width, video_fps)
-        self._policy = policy if isinstance(policy, str) else plain(policy)
+        self._policy = policy if isinstance(policy, str) else as_json(policy)
         self._source = PolicySource(
             policy=CHECKPOINT,
             dataset=dataset,
@@ -365,7 +365,7 @@ class EvalRunner(Runner):
             values["live"] = self._live
         if self.instruction_swap:
             values["wrong_instructions_of"] = settings.tasks
-        about: dict[str, Any] = plain(
+        about: dict[str, Any] = as_json(
             {
                 "policy": policy,
                 "environment": self._environment,
@@ -429,10 +429,10 @@ class EvalRunner(Runner):
         return self._spec, self._settings
 
 
-def plain(table: Any) -> Any:
+def as_json(table: Any) -> Any:
     """A config's table as plain JSON values, which can be sent to other processes."""
-    return json.loads(json.dumps(table, default=_plain))
+    return json.loads(json.dumps(table, default=_as_json_value))
 
 
-def _plain(value: Any) -> Any:
+def _as_json_value(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else str(value)

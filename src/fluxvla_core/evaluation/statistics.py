@@ -278,7 +278,7 @@ def smallest_difference(pairs: int, level: float = 0.05, power: float = 0.8) -> 
     ``k`` or more among ``pairs``, each with the difference as its probability.
 
     Args:
-        level: of the test.
+        level: significance level of the test.
         power: how often such a difference would have been shown.
 
     Returns:

@@ -50,7 +50,9 @@ class Video:
         known = {camera.name: camera for camera in spec.embodiment.cameras}
         for name in names or ():
             if name not in known:
-                raise ConfigError(f"{name!r} is none of {', '.join(known) or 'none'}")
+                raise ConfigError(
+                    f"{name!r} is unknown; choose one of {', '.join(known) or 'none'}"
+                )
         chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
         sized = (
             replace(camera, height=height or camera.height, width=width or camera.width)

@@ -37,7 +37,7 @@ def load_policy(
 
     Args:
         ckpt_path: a checkpoint's folder, or a work dir, whose newest one is taken.
-        device: of torch; a plain ``cuda`` is ``own_device``'s.
+        device: a torch device; a plain ``cuda`` is ``own_device``'s.
         dataset: table or object that prepares observations instead of the training dataset's
             transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
             ``norm_stats`` and ``processors``, is the checkpoint's.
@@ -98,7 +98,8 @@ def own_device(environment: Mapping[str, str], count: int) -> str:
     """The torch device of this process: ranks on one machine share its GPUs evenly.
 
     Args:
-        environment: of the process; torchrun sets ``LOCAL_RANK``, ``srun`` ``SLURM_LOCALID``.
+        environment: the process's variables; torchrun sets ``LOCAL_RANK``, ``srun`` sets
+            ``SLURM_LOCALID``.
         count: how many GPUs it sees.
     """
     local = environment.get("LOCAL_RANK", environment.get("SLURM_LOCALID"))

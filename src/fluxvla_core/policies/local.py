@@ -25,7 +25,7 @@ PRECISIONS = ("float32", "bf16")
 @dataclass(frozen=True)
 class Question:
     """One episode's question: what it sees, its seed, how many it asked before, and what the
-    answer has to go on from."""
+    answer has to continue."""
 
     observation: Observation
     seed: int
@@ -47,8 +47,8 @@ class LocalPolicy(Policy):
         denormalize: ``{"action": (1, T, D), "states": (S,)}`` -> ``(T, dim)`` physical units.
         embodiment: the robot that it was trained for.
         cameras: names of the pictures that ``prepare`` looks at.
-        action_rate_hz, horizon: of a chunk.
-        device: where the model is.
+        action_rate_hz, horizon: rate and length of a chunk.
+        device: the torch device of the model.
         precision: ``float32`` or ``bf16`` (autocast).
         source: where it came from, for records.
     """
@@ -75,7 +75,8 @@ class LocalPolicy(Policy):
     ) -> None:
         if precision not in PRECISIONS:
             raise ConfigError(
-                f"mixed_precision_dtype {precision!r} is none of {', '.join(PRECISIONS)}"
+                f"mixed_precision_dtype {precision!r} is unknown; choose one of "
+                f"{', '.join(PRECISIONS)}"
             )
         self.model = model
         self.embodiment = embodiment
@@ -116,7 +117,7 @@ class LocalPolicy(Policy):
         return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """As ``predict_action``, for a chunk that goes on from ``rest``.
+        """As ``predict_action``, for a chunk that continues ``rest``.
 
         The model gets ``prev_actions`` ``(1, T, D)`` normalised, ``prefix_weights`` ``(1, T)``,
         ``prefix_len`` ``(1,)`` and ``max_guidance_weight`` ``(1,)``.
@@ -130,7 +131,7 @@ class LocalPolicy(Policy):
     def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
         """An answer to each of at most ``batch_size`` questions, in one forward pass.
 
-        Either all of them go on from a chunk, or none does.
+        Either all of them continue a chunk, or none does.
 
         Raises:
             DataError, ConfigError: an observation lacks something that the transforms need.
@@ -198,7 +199,7 @@ class LocalPolicy(Policy):
         scaling = scaling_of(self._denormalize, self.model.action_shape, states)
         if "prev_actions" not in self._takes or scaling is None:
             raise ConfigError(
-                f"the policy of {self.source or 'this model'} cannot go on from a chunk"
+                f"the policy of {self.source or 'this model'} cannot continue a chunk"
             )
         actions = scaling.normalized(rest.actions)
         return {

@@ -22,28 +22,31 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import Chunk, check_beginning
-from fluxvla_core.robot.control.commands import CommandSender, Sent
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
-from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.events import ChunkAccepted, CommandSent, Event, Phase, Reading, Refused
+from fluxvla_core.robot.control.sender import CommandSender
+from fluxvla_core.robot.events import ChunkAccepted, Event, Reading, Refused
 from fluxvla_core.robot.observation import ObservationReader
 from fluxvla_core.robot.policy_calls import Answer, PolicyCaller, PolicyEnded, PolicyThread
 from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.supervisor import EpisodeOver, Supervisor
 
 Array = npt.NDArray[np.float64]
-# How often a wait that may be long looks whether somebody wants it to end.
-_LOOK_S = 0.02
+# How often a wait that may be long checks for an interrupt.
+_POLL_S = 0.02
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A question under way: the ``(D,)`` command that the arm had then, and, in lockstep, the time
-    before which the answer does not count as there."""
+class PendingQuery:
+    """A query that the policy has not answered yet.
+
+    Args:
+        future: the future of the answer.
+        last: ``(D,)`` the last command when it was asked.
+        due: in lockstep, the time before which the answer does not count as there.
+    """
 
     future: Future[Answer]
     last: Array
@@ -55,15 +58,15 @@ class ControlLoop:
     """Plays a policy's chunks on a robot, for one episode.
 
     Args:
-        robot: whose clock counts.
-        reader: makes observations.
-        policy: is asked for chunks.
-        joiner: makes one motion of them.
-        sender: started at the arm's pose; sends every command.
-        supervisor: of the episode; learns when a chunk is there.
-        safety: ``starvation_s``, ``first_chunk_s`` and what a chunk's beginning is held against.
-        thread: where the policy thinks.
-        interrupts: looked at while waiting; the supervisor looks at them at every tick.
+        robot: the connected robot; its clock counts.
+        reader: reads the robot's observations.
+        policy: answers observations with chunks.
+        joiner: joins the chunks to one motion.
+        sender: sends every command; started at the arm's pose.
+        supervisor: the episode's supervisor; is notified of every accepted chunk.
+        safety: ``starvation_s``, ``first_chunk_s`` and the limits of a chunk's beginning.
+        thread: the thread in which the policy computes.
+        interrupts: signals; checked while waiting, and by the supervisor at every tick.
         emit: takes the events ``ChunkAccepted`` and ``Refused``.
         keyframe_hz, horizon: keyframes a second, and in each answer of the policy.
         keyframes: how many of a chunk's keyframes are played; None plays all.
@@ -112,26 +115,26 @@ class ControlLoop:
     def _play_whole(self) -> NoReturn:
         while True:
             self.sender.play(self._targets())
-            asked, since = self._ask(), self.robot.clock.now()
-            while not self._arrived(asked):
+            query, since = self._ask(), self.robot.clock.now()
+            while not self._arrived(query):
                 self._check_starved(self.robot.clock.now() - since)
                 self.sender.hold()
             # The arm may have been braking: the chunk starts where it is commanded to be now.
-            self._receive(self._answer(asked), self.sender.limiter.last)
+            self._receive(self._answer(query), self.sender.limiter.last)
 
     def _play_streamed(self) -> NoReturn:
         period = self.sender.rate.period
-        asked: Asked | None = None
+        query: PendingQuery | None = None
         starved_since: float | None = None
         ended: PolicyEnded | None = None
         while True:
             now = self.robot.clock.now()
             try:
-                asked = self._take(asked)
-                if asked is None and ended is None and self.joiner.wants_chunk(now):
-                    asked = self._take(self._ask())
+                query = self._take(query)
+                if query is None and ended is None and self.joiner.wants_chunk(now):
+                    query = self._take(self._ask())
             except PolicyEnded as over:
-                asked, ended = None, over
+                query, ended = None, over
             target = self.joiner.target(now + period)
             if target is not None:
                 starved_since = None
@@ -156,7 +159,7 @@ class ControlLoop:
             )
         return np.array(rows)
 
-    def _ask(self) -> Asked:
+    def _ask(self) -> PendingQuery:
         last, ahead = self.sender.limiter.last, self.joiner.ahead()
 
         def think(reading: Reading) -> Answer:
@@ -169,8 +172,8 @@ class ControlLoop:
             reading = self.reader.read()
             if time.monotonic() > until:
                 raise self._no_chunk(until)
-            return Asked(self.thread.submit(lambda: think(reading)), last, due)
-        return Asked(self.thread.submit(lambda: think(self.reader.read())), last, due)
+            return PendingQuery(self.thread.submit(lambda: think(reading)), last, due)
+        return PendingQuery(self.thread.submit(lambda: think(self.reader.read())), last, due)
 
     def _first(self) -> tuple[Answer, Array]:
         """The first answer: nothing moves, and the policy may have to warm up.
@@ -180,47 +183,47 @@ class ControlLoop:
         with the last.
         """
         until = time.monotonic() + self.safety.first_chunk_s
-        asked = self._ask()
-        answer = self._idle(asked, until)
+        query = self._ask()
+        answer = self._wait_for(query, until)
         for _ in range(0 if self.robot.lockstep else 2):
             self.policy.reset()
             began = time.monotonic()
-            asked = self._ask()
-            answer = self._idle(asked, until)
+            query = self._ask()
+            answer = self._wait_for(query, until)
             if time.monotonic() - began <= self.safety.starvation_s:
                 break
-        return answer, asked.last
+        return answer, query.last
 
-    def _take(self, asked: Asked | None) -> Asked | None:
+    def _take(self, query: PendingQuery | None) -> PendingQuery | None:
         """Receive the answer if it is there; else the question is still under way."""
-        if asked is None or not self._arrived(asked):
-            return asked
-        self._receive(self._answer(asked), asked.last)
+        if query is None or not self._arrived(query):
+            return query
+        self._receive(self._answer(query), query.last)
         return None
 
-    def _arrived(self, asked: Asked) -> bool:
+    def _arrived(self, query: PendingQuery) -> bool:
         if self.robot.lockstep:
             # Half a microsecond: the clock sums its steps, and the sum is rounded.
-            return self.robot.clock.now() >= asked.due - 5e-7
-        return asked.future.done()
+            return self.robot.clock.now() >= query.due - 5e-7
+        return query.future.done()
 
-    def _answer(self, asked: Asked) -> Answer:
+    def _answer(self, query: PendingQuery) -> Answer:
         # In lockstep time stands still until it is there.
         if not self.robot.lockstep:
-            return asked.future.result()
-        return self._idle(asked, time.monotonic() + self.safety.first_chunk_s)
+            return query.future.result()
+        return self._wait_for(query, time.monotonic() + self.safety.first_chunk_s)
 
-    def _idle(self, asked: Asked, until: float) -> Answer:
+    def _wait_for(self, query: PendingQuery, until: float) -> Answer:
         """The answer, waited for in real time; meanwhile the arm is held, if it was commanded."""
-        while not asked.future.done():
+        while not query.future.done():
             if time.monotonic() > until:
                 raise self._no_chunk(until)
             if self.holds:
                 self.sender.hold()
             else:
                 self.interrupts.check()
-                wait((asked.future,), timeout=_LOOK_S)
-        return asked.future.result()
+                wait((query.future,), timeout=_POLL_S)
+        return query.future.result()
 
     def _receive(self, answer: Answer, anchor: Array) -> None:
         accepted = self._accepted(answer)
@@ -261,91 +264,3 @@ class ControlLoop:
                 cause=late.cause,
                 next=late.next,
             )
-
-
-class EpisodeOver(BaseException):
-    """Ends an episode from inside a tick. Not an error, and nobody's ``except Exception``."""
-
-    def __init__(self, outcome: str) -> None:
-        self.outcome = outcome
-        super().__init__(outcome)
-
-
-class Supervisor:
-    """Watches the robot at every tick: its state, its tracking error, signals, the episode's end.
-
-    Args:
-        robot: connected.
-        tracking: holds its state against its commands.
-        interrupts: of the run.
-        max_steps: commands of the phase ``run`` after which the episode is over.
-        reporter: of the run.
-        emit: takes the event ``CommandSent``.
-
-    ``phase`` is where the episode is.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        tracking: TrackingWatch,
-        interrupts: Interrupts,
-        max_steps: int,
-        reporter: Reporter,
-        emit: Callable[[Event], None],
-    ) -> None:
-        self.phase = Phase.START
-        self._robot = robot
-        self._tracking = tracking
-        self._interrupts = interrupts
-        self._max_steps = max_steps
-        self._steps = 0
-        self._reporter = reporter
-        self._emit = emit
-
-    def chunk_accepted(self) -> None:
-        """The policy's motion begins, or goes on."""
-        self.phase = Phase.RUN
-
-    def after_tick(self, sent: Sent | None, sent_at: float, late_s: float) -> None:
-        """The tick after each command: reported always, supervised while it may still stop.
-
-        Args:
-            sent: the command; None at a tick without one.
-            sent_at: when it was sent.
-            late_s: how late that was.
-
-        Raises:
-            EpisodeOver: the task is done, or there were enough commands.
-            NotFollowing: the arm is not where it is commanded to be.
-            Interrupted: a signal came.
-            FluxError: the state could not be read.
-        """
-        robot, phase = self._robot, self.phase
-        try:
-            measured, problem = robot.state(), None
-        except FluxError as error:
-            # What was sent is recorded all the same; and a stream that fell silent stops an arm,
-            # it does not keep it from braking.
-            measured, problem = None, error
-        if sent is not None and phase is not Phase.OVER:
-            state = None if measured is None else measured.state
-            self._emit(CommandSent(robot.clock.now(), sent, phase, state, robot.sent_s, late_s))
-        # Between two episodes, too: an arm that is held may be switched off, or moved.
-        if phase not in (Phase.RAMP, Phase.READY, Phase.RUN, Phase.OVER):
-            return
-        if problem is not None:
-            raise problem
-        self._interrupts.check()
-        if sent is not None:
-            self._tracking.sent(sent.command, sent_at)
-        if measured is not None and robot.follows:
-            self._tracking.check(measured.state, measured.at)
-        if phase is not Phase.RUN or sent is None:
-            return
-        self._steps += 1
-        self._reporter.progress("commands", self._steps, self._max_steps)
-        if robot.done():
-            raise EpisodeOver("done")
-        if self._steps >= self._max_steps:
-            raise EpisodeOver("max_steps")

@@ -1,4 +1,4 @@
-"""One episode on a robot: to the start pose, the control loop, to rest.
+"""An episode on a robot: to the start pose, the control loop, to rest.
 
 Whatever happens in it, it ends in a safe stop: the arm brakes within its limits where it still
 obeys, and the operator's own ``stop`` is called where something went wrong.
@@ -18,14 +18,14 @@ from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.commands import CommandSender, Execute, Sent, come_to_rest, ramp
 from fluxvla_core.robot.control.delays import MACHINE
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
+from fluxvla_core.robot.control.sender import CommandSender, Execute, Sent, come_to_rest, ramp
 from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
-from fluxvla_core.robot.control_loop import ControlLoop, Supervisor
+from fluxvla_core.robot.control_loop import ControlLoop
 from fluxvla_core.robot.events import (
     EpisodeEnded,
     EpisodeObserver,
@@ -36,9 +36,10 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.observation import Look, ObservationReader
+from fluxvla_core.robot.observation import ObservationReader, Observe
 from fluxvla_core.robot.policy_calls import PolicyCaller, PolicyThread
 from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.supervisor import Supervisor
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]
@@ -55,7 +56,7 @@ class EpisodeSettings:
     """How an episode is driven.
 
     Args:
-        cameras: names of those that the policy looks at.
+        cameras: names of the cameras that the policy looks at.
         rate_hz: commands a second.
         safety: thresholds of the safety rules.
         start_pose: ``(D,)``, where the arm goes first; None stays.
@@ -76,25 +77,25 @@ class EpisodeSettings:
 
 
 @dataclass(frozen=True)
-class Equipment:
+class EpisodeParts:
     """What a run drives a robot with, in all of its episodes.
 
     Args:
         robot, policy: connected, loaded, and fitting each other.
-        look: makes observations.
+        observe: makes an observation of the robot's newest frame.
         filters: the config's ``action_filters``.
-        joiner: how chunks become one motion.
+        joiner: joins the chunks to one motion.
         execute: sends commands: ``(N, D)`` and the rate.
         latch: an episode does not begin while it is tripped.
         interrupts: signals that ask the run to end.
-        thread: where the policy thinks.
-        reporter: where progress goes.
-        observers: of every event.
+        thread: the thread in which the policy computes.
+        reporter: shows progress and warnings.
+        observers: receive every event.
     """
 
     robot: Robot
     policy: Policy
-    look: Look
+    observe: Observe
     filters: Sequence[ActionFilter]
     joiner: ChunkJoiner
     execute: Execute
@@ -109,11 +110,11 @@ class Episode:
     """Runs once; its observers see what happens.
 
     Args:
-        equipment: what to run with.
-        settings: how.
-        task: what to do.
+        parts: robot, policy and what else the run's episodes share.
+        settings: how the episode is driven.
+        task: the task to do.
         number: how many episodes the run had before.
-        seed: of the policy.
+        seed: the seed of the policy.
         before: ``(D,)`` the last command of the run, None before any.
         held: whether the arm was held by it since, without a stop.
 
@@ -124,7 +125,7 @@ class Episode:
 
     def __init__(
         self,
-        equipment: Equipment,
+        parts: EpisodeParts,
         settings: EpisodeSettings,
         task: Task,
         number: int,
@@ -132,9 +133,9 @@ class Episode:
         before: Array | None = None,
         held: bool = False,
     ) -> None:
-        robot, safety = equipment.robot, settings.safety
-        self._equipment, self._settings = equipment, settings
-        self._robot, self._latch, self._interrupts = robot, equipment.latch, equipment.interrupts
+        robot, safety = parts.robot, settings.safety
+        self._parts, self._settings = parts, settings
+        self._robot, self._latch, self._interrupts = robot, parts.latch, parts.interrupts
         self._task, self._number = task, number
         self._before, self._held = before, held
         lead_s = min(_LEAD_S, _LEAD_SHARE / settings.rate_hz)
@@ -143,22 +144,22 @@ class Episode:
             robot.embodiment, self._rate.period, safety.velocity_scale, safety.acceleration_scale
         )
         self._sender = CommandSender(
-            self._execute, self._rate, self._limiter, equipment.latch, equipment.filters,
+            self._execute, self._rate, self._limiter, parts.latch, parts.filters,
             self._after_tick, robot.speed,
         )  # fmt: skip
         self._tracking = TrackingWatch(robot.embodiment, safety)
         self._supervisor = Supervisor(
-            robot, self._tracking, equipment.interrupts, settings.max_steps, equipment.reporter,
+            robot, self._tracking, parts.interrupts, settings.max_steps, parts.reporter,
             self._emit,
         )  # fmt: skip
         self._reader = ObservationReader(
-            robot, equipment.look, task.instruction, settings.cameras, safety, settings.ready_s,
-            self._tracking, equipment.thread, equipment.interrupts, self._emit,
+            robot, parts.observe, task.instruction, settings.cameras, safety, settings.ready_s,
+            self._tracking, parts.thread, parts.interrupts, self._emit,
         )  # fmt: skip
-        self._policy = PolicyCaller(equipment.policy, robot.embodiment, safety, robot.delays, seed)
+        self._policy = PolicyCaller(parts.policy, robot.embodiment, safety, robot.delays, seed)
         self._columns = action_columns(robot.embodiment)
         self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
-        self._trips = len(equipment.latch.trips)
+        self._trips = len(parts.latch.trips)
         self._executing = False
         self.stop_failure: str | None = None
         self._emit(EpisodePrepared(robot.clock.now(), task, seed, settings.rate_hz))
@@ -241,25 +242,25 @@ class Episode:
             most = settings.safety.ramp_scale
             way = ramp(self._limiter, settings.start_pose, most)
             seconds = len(way) / settings.rate_hz
-            self._equipment.reporter.info(f"moving to the start pose, {seconds:.1f} s")
+            self._parts.reporter.info(f"moving to the start pose, {seconds:.1f} s")
             self._sender.move_along(way, most)
-        for each in self._equipment.filters:
+        for each in self._parts.filters:
             each.reset(self._limiter.last)
         self._rate.reset()
         self._tracking.reset()
         self._supervisor.phase = Phase.READY
 
     def _control_loop(self) -> ControlLoop:
-        equipment, settings, policy = self._equipment, self._settings, self._equipment.policy
+        parts, settings, policy = self._parts, self._settings, self._parts.policy
         return ControlLoop(
             robot=self._robot,
             reader=self._reader,
             policy=self._policy,
-            joiner=equipment.joiner,
+            joiner=parts.joiner,
             sender=self._sender,
             supervisor=self._supervisor,
             safety=settings.safety,
-            thread=equipment.thread,
+            thread=parts.thread,
             interrupts=self._interrupts,
             emit=self._emit,
             keyframe_hz=policy.action_rate_hz,
@@ -270,7 +271,7 @@ class Episode:
         )
 
     def _where(self, state: Array) -> Array:
-        """``(D,)`` the command to go on from: the one that holds the arm, else where it is.
+        """``(D,)`` the command to continue from: the one that holds the arm, else where it is.
 
         An arm droops; to begin where it droops to would be a jump of its command. A joint that is
         far from its command was moved, or nobody knows what its stop commanded: that one begins
@@ -291,18 +292,18 @@ class Episode:
 
     def _execute(self, actions: Array, rate: Rate) -> None:
         self._executing = True
-        self._equipment.execute(actions, rate)
+        self._parts.execute(actions, rate)
         self._executing = False
 
     def _after_tick(self, sent: Sent | None) -> None:
         self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
 
     def _emit(self, event: Event) -> None:
-        for observer in self._equipment.observers:
+        for observer in self._parts.observers:
             observer.on_event(event)
 
     def _note_stall(self, error: BaseException) -> None:
-        """Streams look old to a process that stood still: then that is said of them."""
+        """If this process was paused, name the pause as the cause of stale streams."""
         if not isinstance(error, FluxError) or self._rule(error) != Rule.FRESHNESS:
             return
         recent = time.monotonic() - _RECENT * self._settings.safety.max_age_s
@@ -332,7 +333,7 @@ class Episode:
                     patience_s=self._settings.safety.tracking_time_s,
                 )
             except (Exception, SystemExit) as error:  # noqa: BLE001 - the robot's own stop is next
-                self._equipment.reporter.warn(f"braking failed: {_what(error)}")
+                self._parts.reporter.warn(f"braking failed: {_what(error)}")
         failure = self._stop_robot()
         now = robot.clock.now()
         self._emit(Stopped(now, rule, problem, now - began, failure))
@@ -350,7 +351,7 @@ class Episode:
         """The operator's own stop; what went wrong with it."""
         self.stop_failure = failure = self._robot.stop()
         if failure:
-            self._equipment.reporter.warn(failure)
+            self._parts.reporter.warn(failure)
         return failure
 
     def _stop_held(self, error: FluxError) -> None:
@@ -365,7 +366,7 @@ class Episode:
         try:
             success = self._robot.success()
         except (Exception, SystemExit) as error:  # noqa: BLE001 - why it ended matters more
-            self._equipment.reporter.warn(f"task_success failed: {_what(error)}")
+            self._parts.reporter.warn(f"task_success failed: {_what(error)}")
             success = None
         trips = tuple(self._latch.trips[self._trips :])
         now, skipped = self._robot.clock.now(), self._rate.skipped

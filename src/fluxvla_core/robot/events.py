@@ -1,4 +1,4 @@
-"""What happens in an episode, as typed events, and who observes them.
+"""Typed events of an episode, and the observers that receive them.
 
 The episode engine emits events and knows nothing of files or plugins: an observer writes the
 record, another calls the plugins' hooks. Observers are called in order, in the thread that emits;
@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.robot.control.commands import Sent
 from fluxvla_core.robot.control.safety import Trip
+from fluxvla_core.robot.control.sender import Sent
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]
@@ -158,7 +158,7 @@ class HookObserver(EpisodeObserver):
     """Calls the plugins' hooks.
 
     Args:
-        hooks: of the run.
+        hooks: the hooks of the run.
     """
 
     def __init__(self, hooks: HookCaller) -> None:

@@ -20,36 +20,36 @@ from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.robot import Robot, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
-_LOOK_S = 0.5  # that a reading may take
+_READ_TIMEOUT_S = 0.5  # the least time that the first reading is given
 _LONG_S = 0.1  # a reading that takes longer makes its own streams old
 
 # A stamp may be this far in the future: the reading was taken while its age was computed.
 AHEAD_S = 0.005
 
-Look = Callable[[], tuple[dict[str, Any], Frame | None]]
-"""A runner's: makes an observation of the robot's newest frame and, if it can, gives the frame."""
+Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
+"""Makes an observation of the robot's newest frame; returns the frame as well if it has it."""
 
 
 class ObservationReader:
     """Reads what a policy is asked with, and lets nothing through that a policy must not act on.
 
     Args:
-        robot: connected.
-        look: see ``Look``.
-        instruction: of the task.
-        cameras: names of those that the policy looks at.
+        robot: the connected robot.
+        observe: makes an observation of the robot's newest frame.
+        instruction: the task in words.
+        cameras: names of the cameras that the policy looks at.
         safety: how old readings may be, and how far their streams may be apart.
         ready_s: how long the robot may take to give its first reading.
-        tracking: of the episode; each reading is held against the robot's commands.
-        thread: where a robot is read: cameras may be bound to one.
-        interrupts: looked at while waiting.
+        tracking: the episode's watch; compares each reading with the robot's commands.
+        thread: the thread in which the robot is read: cameras may be bound to one.
+        interrupts: signals; checked while waiting.
         emit: takes the events ``Observed`` and ``Refused``.
     """
 
     def __init__(
         self,
         robot: Robot,
-        look: Look,
+        observe: Observe,
         instruction: str,
         cameras: tuple[str, ...],
         safety: SafetySettings,
@@ -60,7 +60,7 @@ class ObservationReader:
         emit: Callable[[Event], None],
     ) -> None:
         self._robot = robot
-        self._look = look
+        self._observe = observe
         self._instruction = instruction
         self._cameras = cameras
         self._ready_s = ready_s
@@ -131,7 +131,7 @@ class ObservationReader:
         if self._robot.lockstep:
             return self._frame()
         # One that is begun shortly before the end is given its time, too.
-        until = max(until, time.monotonic() + _LOOK_S)
+        until = max(until, time.monotonic() + _READ_TIMEOUT_S)
         future = self._thread.submit(self._frame)
         while not future.done() and time.monotonic() < until:
             self._interrupts.check()
@@ -149,7 +149,7 @@ class ObservationReader:
         robot = self._robot
         try:
             with robot.delays.of(robot.reading):
-                observation, frame = self._look()
+                observation, frame = self._observe()
         except FluxError:
             raise
         except (Exception, SystemExit) as error:
@@ -226,9 +226,9 @@ class FreshnessGate:
         """Admit one observation.
 
         Args:
-            stamps: stream -> receipt time, on the clock that ``now`` is of.
+            stamps: stream -> receipt time, on the clock of ``now``.
             cameras: the streams that are needed besides the state.
-            now: seconds.
+            now: the current time in seconds.
 
         Returns:
             The age of its oldest stream, in seconds.
@@ -276,7 +276,7 @@ def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]
     Args:
         frame: as ``Operator.get_frame`` returns it.
         embodiment: whose state and cameras are expected.
-        cameras: the names of those that are needed.
+        cameras: names of the cameras that are needed.
 
     Raises:
         BadFrame: state of another shape or not finite; a camera missing; a picture that is not

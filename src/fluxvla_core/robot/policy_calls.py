@@ -59,10 +59,10 @@ class PolicyCaller:
 
     Args:
         policy: loaded.
-        embodiment: of the robot.
+        embodiment: the robot's.
         safety: thresholds of the checks.
         delays: notes how long calls take.
-        seed: of the policy in this episode.
+        seed: the policy's seed in this episode.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class PolicyCaller:
             ) from error
 
     def ask(self, reading: Reading, rest: Continuation | None) -> Answer:
-        """The policy's answer; ``rest`` of a chunk is what it has to go on from.
+        """The policy's answer; ``rest`` of a chunk is what it has to continue.
 
         Raises:
             PolicyFailed: the policy raised something that is no error of this project's.

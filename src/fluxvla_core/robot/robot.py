@@ -83,7 +83,7 @@ class Robot:
             )
         self.sent_s: float | None = None
         self._reads_state, self._stamps_state = self._has("get_state"), self._has("state_stamp")
-        # A recorded robot goes its own way; that it does is no fault of its.
+        # A replayed robot ignores commands, so tracking is not checked.
         self.follows = bool(self._operator.follows_commands)
         self.clock = clock_of(self._operator)
         self.lockstep = in_lockstep(self.clock)
@@ -267,7 +267,7 @@ class Robot:
     def _reported(self, method: str, function: Callable[[], object]) -> str | None:
         try:
             function()
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - reported; the rest of the stop goes on
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - reported; the rest of the stop follows
             return f"{self.name}.{method} raised {type(error).__name__}: {error}"
         return None
 

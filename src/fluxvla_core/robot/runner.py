@@ -31,13 +31,13 @@ from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control import priority
-from fluxvla_core.robot.control.commands import check_pose
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.episode import EpisodeSettings, Equipment
+from fluxvla_core.robot.control.sender import check_pose
+from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
 from fluxvla_core.robot.observation import scaled_views
 from fluxvla_core.robot.policy_calls import PolicyThread
@@ -91,7 +91,7 @@ class BaseInferenceRunner(Runner):
         action_filters: tables or callables that may alter an action, in order, before the limits.
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
-        device: of torch.
+        device: the torch device of the policy.
         record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
             and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
             work dir.
@@ -176,7 +176,7 @@ class BaseInferenceRunner(Runner):
         }
         for name, value in counts.items():
             if value is not None and value < 1:
-                raise self._wrong(name, f"must be at least 1, got {value}")
+                raise self.config_error(name, f"must be at least 1, got {value}")
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
         scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
         self.ros_operator = build_operator_from_cfg(operator, context, **scene)
@@ -185,15 +185,19 @@ class BaseInferenceRunner(Runner):
         self.embodiment = self.robot.embodiment
         self.publish_rate = self._checked_rate(publish_rate)
         if state_dim is not None and state_dim != self.embodiment.state_dim:
-            raise self._wrong(
+            raise self.config_error(
                 "state_dim",
                 f"is {state_dim}; {self.embodiment.name} has "
                 f"{self.embodiment.state_dim} state values",
             )
         if not 0.0 <= simulated_latency < math.inf:
-            raise self._wrong("simulated_latency", f"must be 0 or more, got {simulated_latency}")
+            raise self.config_error(
+                "simulated_latency", f"must be 0 or more, got {simulated_latency}"
+            )
         if simulated_latency and not self.robot.lockstep:
-            raise self._wrong("simulated_latency", "is for simulations; this robot has its own")
+            raise self.config_error(
+                "simulated_latency", "is for simulations; this robot has its own"
+            )
         built = [build_action_filter_from_cfg(each, context) for each in action_filters]
         self.action_filters = [ActionFilter.adapt(each) for each in built]
         if gripper_threshold is not None:
@@ -235,9 +239,9 @@ class BaseInferenceRunner(Runner):
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
         if self._joiner().continues and not self.policy.continues:
-            raise self._wrong(
+            raise self.config_error(
                 "chunk_joining",
-                f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot go on from a "
+                f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
                 "chunk: neither it nor its model takes what is left of the last one",
             )
         looks_at = tuple(self.policy.cameras)
@@ -246,9 +250,11 @@ class BaseInferenceRunner(Runner):
         known = self.embodiment.camera_names
         for name in (*self._cameras, *looks_at):
             if name not in known:
-                raise self._wrong("camera_names", f"{name!r} is none of {', '.join(known)}")
+                raise self.config_error(
+                    "camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}"
+                )
             if name not in self._cameras:
-                raise self._wrong("camera_names", f"the policy looks at {name!r} too")
+                raise self.config_error("camera_names", f"the policy looks at {name!r} too")
         for warning in scaled_views(self.policy.embodiment, self.embodiment, looks_at):
             self.context.reporter.warn(warning)
         if self.prepare_pose is not None:
@@ -291,7 +297,7 @@ class BaseInferenceRunner(Runner):
                 hooks.call("run_started")
                 source.open()
                 self.robot.connect()
-                with nullcontext() if self.robot.lockstep else priority.real_time():
+                with nullcontext() if self.robot.lockstep else realtime.real_time():
                     result = session.run(self._run_episode)
                 ended = "ok"
             except Interrupted as signal:
@@ -357,10 +363,10 @@ class BaseInferenceRunner(Runner):
             max_steps=self.max_publish_step,
             ready_s=self.ready_timeout,
         )
-        equipment = Equipment(
+        parts = EpisodeParts(
             robot=self.robot,
             policy=self.policy,
-            look=self._look,
+            observe=self._observe,
             filters=self.action_filters,
             joiner=joiner,
             execute=self._execute_actions,
@@ -370,10 +376,10 @@ class BaseInferenceRunner(Runner):
             reporter=reporter,
             observers=(self.recorder, *self._observers),
         )
-        session.play(equipment, settings, task)
+        session.play(parts, settings, task)
         return self.recorder.summary
 
-    def _look(self) -> tuple[dict[str, Any], Frame | None]:
+    def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
         window = self.update_observation_window()
         return window, self._frame
@@ -400,9 +406,9 @@ class BaseInferenceRunner(Runner):
         try:
             joiner = make_joiner(value)
         except ConfigError as error:
-            raise self._wrong("chunk_joining", error.what) from error
+            raise self.config_error("chunk_joining", error.what) from error
         if self.async_execution and not joiner.streamed:
-            raise self._wrong("chunk_joining", f"is {value!r}, and async_execution is set")
+            raise self.config_error("chunk_joining", f"is {value!r}, and async_execution is set")
         return value
 
     def _joiner(self) -> ChunkJoiner:
@@ -416,18 +422,19 @@ class BaseInferenceRunner(Runner):
         if publish_rate is None:
             return most
         if not 0 < publish_rate <= most:
-            raise self._wrong(
+            raise self.config_error(
                 "publish_rate",
                 f"is {publish_rate:g} Hz; {self.embodiment.name} takes up to "
                 f"{most:g} commands a second",
             )
         if self.robot.lockstep and publish_rate != most:
-            raise self._wrong(
+            raise self.config_error(
                 "publish_rate",
                 f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
             )
         return float(publish_rate)
 
-    def _wrong(self, key: str, what: str) -> ConfigError:
+    def config_error(self, key: str, what: str) -> ConfigError:
+        """An error about a key of this section."""
         section = self.context.section
         return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))

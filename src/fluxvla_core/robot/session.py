@@ -18,11 +18,11 @@ import numpy.typing as npt
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.episode import Episode, EpisodeSettings, Equipment
+from fluxvla_core.robot.episode import Episode, EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.policy_calls import PolicyFailed, PolicyThread
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _KEPT = ("task", "outcome", "success", "steps")
 
 
@@ -31,7 +31,7 @@ class RunHistory:
     """What a runner keeps from one ``run()`` to the next.
 
     Args:
-        episodes: how many there were.
+        episodes: number of episodes so far.
         commanded: ``(D,)`` the last command; None before any.
     """
 
@@ -43,12 +43,12 @@ class RobotSession:
     """Runs the tasks of a source, and keeps what goes from one episode to the next.
 
     Args:
-        source: open.
-        known: id -> instruction.
-        free: whether other instructions than those are allowed.
-        seed: of the first episode's policy; each later one adds 1.
-        history: of the runner; it goes on from there.
-        latch, interrupts, thread: of the run.
+        source: the opened task source.
+        known: task id -> instruction.
+        free: whether instructions that are not in ``known`` are allowed.
+        seed: the seed of the first episode's policy; each later episode adds 1.
+        history: earlier episodes of the runner; the session continues it.
+        latch, interrupts, thread: shared by all episodes of the run.
 
     ``stop_failure`` is what went wrong with the last stop.
     """
@@ -113,7 +113,7 @@ class RobotSession:
             )
         return result
 
-    def play(self, equipment: Equipment, settings: EpisodeSettings, task: Task) -> None:
+    def play(self, parts: EpisodeParts, settings: EpisodeSettings, task: Task) -> None:
         """Run the next episode.
 
         Raises:
@@ -121,18 +121,18 @@ class RobotSession:
         """
         number, before = self._history.episodes, self._history.commanded
         held = self._holding is not None
-        episode = Episode(equipment, settings, task, number, self._seed + number, before, held)
+        episode = Episode(parts, settings, task, number, self._seed + number, before, held)
         try:
             episode.run()
         finally:
             self._history.commanded = episode.commanded
             self.stop_failure = episode.stop_failure
         self._history.episodes += 1
-        if not equipment.robot.lockstep:
+        if not parts.robot.lockstep:
             self._holding = episode
 
     def _stopped(self, error: FluxError) -> None:
-        """Go on, without motion, where somebody can say ``rearm``; else raise ``error``."""
+        """Continue without motion where somebody can say ``rearm``; else raise ``error``."""
         self._holding = None
         # A policy that still thinks cannot be asked again.
         if not self._source.waits or self.thread.busy:
@@ -146,7 +146,7 @@ class RobotSession:
         self.interrupts.deferred = True
         self.interrupts.check()
         if self._holding is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             return
         try:
             self._holding.hold()

@@ -40,7 +40,7 @@ class Task:
     def warning(self) -> str:
         """The warning about an instruction that the config does not know."""
         return (
-            f"{self.instruction!r} is none of the config's task_descriptions: the policy is not "
+            f"{self.instruction!r} is not in the config's task_descriptions: the policy is not "
             "known to be trained on it, and the arm may do anything within its limits"
         )
 
@@ -149,7 +149,7 @@ class EndOfTasks(Exception):
 
 
 class TaskSource(ABC):
-    """Lines that name tasks. ``waits``: more may come while the run goes on."""
+    """Lines that name tasks. ``waits``: more may come while the run continues."""
 
     waits: ClassVar[bool] = False
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2 import images as images
     from fluxvla_core.ros2 import joints as joints
     from fluxvla_core.ros2 import qos as qos
-    from fluxvla_core.ros2.commands import checked_action as checked_action
     from fluxvla_core.ros2.connection import Connection as Connection
     from fluxvla_core.ros2.connection import require_rclpy as require_rclpy
     from fluxvla_core.ros2.faults import AMOUNTS as AMOUNTS
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.messages import BadMessage as BadMessage
     from fluxvla_core.ros2.messages import message_class as message_class
     from fluxvla_core.ros2.operator import RosOperator as RosOperator
+    from fluxvla_core.ros2.stop_motion import checked_action as checked_action
     from fluxvla_core.ros2.streams import CAMERA as CAMERA
     from fluxvla_core.ros2.streams import DEPTH as DEPTH
     from fluxvla_core.ros2.streams import SIDE as SIDE
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
     {
-        "fluxvla_core.ros2.commands": ["checked_action"],
+        "fluxvla_core.ros2.stop_motion": ["checked_action"],
         "fluxvla_core.ros2.connection": ["Connection", "require_rclpy"],
         "fluxvla_core.ros2.faults": ["AMOUNTS", "Fault", "Faults", "MODES", "Outbox"],
         "fluxvla_core.ros2.frames": ["RobotFrame"],

@@ -1,4 +1,4 @@
-"""One ROS 2 node in one context, spun by one thread, with the shutdown order that works.
+"""Connection to ROS 2: a node in a context, spun by one thread, shut down in the order that works.
 
 A ``MultiThreadedExecutor`` loses messages and burns a core in the rclpy releases that are in use;
 one thread that only stores messages keeps up with 240 VGA pictures a second. The context is our
@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from fluxvla_core.errors import ConfigError, Faulted, LoadFailed
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.streams import Stream
 
@@ -180,7 +180,7 @@ class Connection:
 
     def _spin(self) -> None:
         # The thread that sends commands waits for the interpreter lock while this one has it.
-        priority.just_below_real_time()
+        realtime.just_below_real_time()
         main = threading.main_thread()
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without

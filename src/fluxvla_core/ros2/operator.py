@@ -23,12 +23,12 @@ from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
-from fluxvla_core.ros2.commands import Motion, attempt, checked_action
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.ros2.messages import message_class
 from fluxvla_core.ros2.readings import POLL_S, Readings
 from fluxvla_core.ros2.startup import Startup
+from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action
 from fluxvla_core.ros2.streams import STATE, CommandSpec, Received, StreamSpec
 from fluxvla_core.ros2.sync import Stale
 from fluxvla_core.spec.embodiment import EmbodimentSpec

@@ -1,4 +1,4 @@
-"""What ``connect`` waits for and checks, with the error that names what is missing.
+"""Startup checks of ``connect``: waits for streams, and names in the error what is missing.
 
 Message losses are counted because a robot that sees one picture in thirty looks like a robot with
 a bad policy. Fast DDS hands messages to processes of the same machine through shared memory, in a

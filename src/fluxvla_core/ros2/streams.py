@@ -1,4 +1,4 @@
-"""What an operator reads and writes: declared as data, and subscribed to as streams of messages."""
+"""Streams and commands of an operator: their declarations, and subscriptions to messages."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ class Stream:
         return self.ring.newest()
 
     def refresh(self) -> None:
-        """Subscribe once there is a publisher, and anew when publishers offer something else."""
+        """Subscribe once there is a publisher, and again when publishers offer something else."""
         with self._lock:
             offers = self._node.get_publishers_info_by_topic(self.topic)
             wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)

@@ -103,7 +103,7 @@ class OperatorConformance:
         return None
 
     def settled(self, operator: Any) -> int | None:
-        """``commands_heard`` once no more come; fails if they go on for ``ready_within_s``."""
+        """``commands_heard`` once no more come; fails if they continue for ``ready_within_s``."""
         deadline = time.monotonic() + self.ready_within_s
         heard = self.commands_heard(operator)
         while heard is not None:

@@ -1,4 +1,4 @@
-"""What every train runner must do, as tests that a plugin inherits.
+"""Conformance tests for train runners, which a plugin inherits.
 
     from fluxvla_core.testing.train_runner import TrainRunnerConformance
 

@@ -386,7 +386,7 @@ def _rank(
     args: tuple[Any, ...],
 ) -> None:
     # A process has the way of its own start as its default; loader workers are to start as in a
-    # run from the command line, and one that is not forked imports torch anew.
+    # run from the command line, and one that is not forked imports torch again.
     multiprocessing.set_start_method(start_method, force=True)
     torch.set_num_threads(1)
     if ranks > 1:

@@ -20,7 +20,7 @@ class AlohaInferenceRunner(BaseInferenceRunner):
 
 
 class AlohaRTCInferenceRunner(AlohaInferenceRunner):
-    """``AlohaInferenceRunner`` with real-time chunking, for policies that can go on from a chunk.
+    """``AlohaInferenceRunner`` with real-time chunking, for policies that can continue a chunk.
 
     Args:
         chunk_joining: as ``BaseInferenceRunner`` takes it.

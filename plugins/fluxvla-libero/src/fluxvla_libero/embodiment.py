@@ -1,4 +1,4 @@
-"""What LIBERO's numbers mean: a Panda arm moved by pose deltas, seen from two cameras."""
+"""LIBERO's embodiment: a Panda arm moved by pose deltas, seen from two cameras."""
 
 from __future__ import annotations
 

@@ -90,9 +90,11 @@ class LiberoEnvironment(MujocoEnvironment):
         if min(height, width) < 16:
             raise ConfigError(f"pictures of {height}x{width} are too small")
         if begin not in (FIXED, RANDOM):
-            raise ConfigError(f"begin {begin!r} is none of {FIXED}, {RANDOM}")
+            raise ConfigError(f"begin {begin!r} is unknown; choose one of {FIXED}, {RANDOM}")
         if protocol not in (FLUXVLA, OPENVLA):
-            raise ConfigError(f"protocol {protocol!r} is none of {FLUXVLA}, {OPENVLA}")
+            raise ConfigError(
+                f"protocol {protocol!r} is unknown; choose one of {FLUXVLA}, {OPENVLA}"
+            )
         if protocol == OPENVLA and begin == RANDOM:
             raise ConfigError("protocol 'openvla' has fixed states: it cannot begin at random")
         if num_steps_wait < 0:
@@ -179,7 +181,7 @@ class LiberoEnvironment(MujocoEnvironment):
             RunFailed: see ``LiberoScene.reset``.
         """
         if task not in self.pairs:
-            raise ConfigError(f"{task!r} is none of this environment's tasks")
+            raise ConfigError(f"{task!r} is not a task of this environment")
         where, _ = self.pairs[task]
         state = None
         if self._begin == FIXED:

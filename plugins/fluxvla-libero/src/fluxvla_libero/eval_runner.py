@@ -103,9 +103,13 @@ class LiberoEvalRunner(EvalRunner):
         except ConfigError as error:
             raise self.config_error("task_suite_name", f"is wrong: {error.what}") from error
         if render not in RENDERS:
-            raise self.config_error("render", f"{render!r} is none of {', '.join(RENDERS)}")
+            raise self.config_error(
+                "render", f"{render!r} is unknown; choose one of {', '.join(RENDERS)}"
+            )
         if protocol not in (FLUXVLA, OPENVLA):
-            raise self.config_error("protocol", f"{protocol!r} is none of {FLUXVLA}, {OPENVLA}")
+            raise self.config_error(
+                "protocol", f"{protocol!r} is unknown; choose one of {FLUXVLA}, {OPENVLA}"
+            )
         if not 1 <= num_trials_per_task <= TRIALS:
             raise self.config_error(
                 "num_trials_per_task", f"must be 1 to {TRIALS}, got {num_trials_per_task}"

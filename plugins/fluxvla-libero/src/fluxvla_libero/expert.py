@@ -42,7 +42,7 @@ class Waypoint:
         position: ``(3,)`` m, in the world.
         gripper: its command.
         tolerance: m; the waypoint is reached within it.
-        hold: steps within the tolerance before going on.
+        hold: steps within the tolerance before continuing.
         speed: largest action, 1 being the controller's.
         free: nothing is near, so that the arm may be disturbed here.
     """

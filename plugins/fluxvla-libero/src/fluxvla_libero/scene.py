@@ -1,6 +1,6 @@
-"""One LIBERO task's scene: reset, step, look.
+"""Scene of one LIBERO task: reset, step, render.
 
-LIBERO builds the whole model anew for every episode (2 to 3 seconds). Here that happens once for a
+LIBERO builds the whole model again for every episode (2 to 3 seconds). Here that happens once for a
 scene; afterwards everything that an episode could leave behind is put back, which takes a
 hundredth of the time. A test holds both against each other, bit for bit.
 """
@@ -89,7 +89,7 @@ class LiberoScene:
     @functools.cached_property
     def _built(self) -> dict[str, Array]:
         """Where everything stands by the model's file, before anything was placed: there each of
-        LIBERO's own resets begins, because it builds the model anew."""
+        LIBERO's own resets begins, because it builds the model again."""
         with quiet():
             from robosuite.utils.binding_utils import MjSim
 
@@ -113,11 +113,11 @@ class LiberoScene:
         env = self._env
         np.random.seed(seed)
         if init_state is None:
-            self._place_anew(self._fixed, seed)
+            self._place_again(self._fixed, seed)
         else:
             loads = 1
             for _ in range(resets):
-                loads += self._place_anew(self._built, seed, loads)
+                loads += self._place_again(self._built, seed, loads)
         self._sim.forward()
         env._obs_cache = {}
         if init_state is not None:
@@ -176,7 +176,7 @@ class LiberoScene:
                 self._env.close()
             self._env = None
 
-    def _place_anew(self, model: Mapping[str, Array], seed: int, loads: int = 0) -> int:
+    def _place_again(self, model: Mapping[str, Array], seed: int, loads: int = 0) -> int:
         """Place everything, from what the model says; how many tries that took.
 
         Args:

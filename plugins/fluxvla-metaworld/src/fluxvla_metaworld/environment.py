@@ -117,7 +117,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
             MissingPlugin, RunFailed: Meta-World is not installed, or cannot be imported.
         """
         if task not in {known.name for known in self.spec.tasks}:
-            raise ConfigError(f"{task!r} is none of this environment's tasks")
+            raise ConfigError(f"{task!r} is not a task of this environment")
         if task != self._task or self._env is None:
             self._build(task)
         env = self._env

@@ -37,7 +37,7 @@ def check_render(render: str) -> None:
         ConfigError: it lists those that there are.
     """
     if render not in RENDERS:
-        raise ConfigError(f"render {render!r} is none of {', '.join(RENDERS)}")
+        raise ConfigError(f"render {render!r} is unknown; choose one of {', '.join(RENDERS)}")
 
 
 def set_render(model: Any, render: str) -> None:

@@ -43,7 +43,8 @@ class Video:
 class Score:
     """How many episodes succeeded; ``low``, ``high``: bounds of the 95 % interval, in 0..1.
 
-    ``errors`` episodes gave no result and are not among ``episodes`` (> 0).
+    ``errors`` episodes gave no result and are not among ``episodes`` (> 0). ``mean_return``: None
+    where the environment gives no rewards.
     """
 
     task: str
@@ -52,6 +53,7 @@ class Score:
     low: float
     high: float
     errors: int = 0
+    mean_return: float | None = None
 
     @property
     def rate(self) -> float:
@@ -99,6 +101,11 @@ class Evaluation:
     live: bool = False
     unseen: bool = False
     obeyed: Mapping[str, Score] = field(default_factory=dict)
+
+    @property
+    def has_returns(self) -> bool:
+        """Whether its episodes have a return, the sum of their rewards."""
+        return any(group.total.mean_return is not None for group in self.groups)
 
     def scored_by_instruction(self, group: Group) -> bool:
         """Whether the group's score is how often it follows its instruction, which is not that of

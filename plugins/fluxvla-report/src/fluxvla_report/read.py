@@ -140,6 +140,7 @@ def _score(name: str, counted: Any) -> Score | None:
         low=number(counted.get("low")),
         high=number(counted.get("high")),
         errors=int(number(counted.get("errors", 0))),
+        mean_return=number(counted["mean_return"]) if "mean_return" in counted else None,
     )
 
 

@@ -38,7 +38,7 @@ class CollectCommand:
             help="size of smooth noise on the executed commands; the recorded actions stay clean",
         )
         parser.add_argument(
-            "--resume", action="store_true", help="go on with an interrupted collection"
+            "--resume", action="store_true", help="continue an interrupted collection"
         )
         parser.add_argument(
             "--log-format",
@@ -58,7 +58,7 @@ class CollectCommand:
         environment = ENVIRONMENTS[args.robot]
         robot = environment.robot
         collection = Collection(
-            # What comes after a success teaches too: how to go on where it was missed by a little.
+            # What comes after a success teaches too: how to continue after a near miss.
             environment={"type": environment.__name__, "ends_with_success": False},
             policy={"type": "SimExpert", "action_rate_hz": args.fps, "noise": args.noise},
             episodes=args.episodes,

@@ -1,4 +1,4 @@
-"""What simulated robots share as operators: time, thread safety, refusals, frames."""
+"""Base of the simulated robots' operators: time, thread safety, refusals, frames."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class SimOperator(Operator):
     """One simulated robot behind the operator contract.
 
     In simulated time (the default) a control period passes with each ``send_action``, and the
-    world waits while the policy thinks. With ``realtime`` the world goes on: periods pass with the
-    wall clock, and the last command holds until the next one. Either way the physics is stepped
-    only in multiples of the control period, in the calling thread.
+    world waits while the policy thinks. With ``realtime`` the world keeps moving: periods pass
+    with the wall clock, and the last command holds until the next one. Either way the physics is
+    stepped only in multiples of the control period, in the calling thread.
 
     Args:
         robot: which.
@@ -85,7 +85,7 @@ class SimOperator(Operator):
                 self.reset(self.seed)
 
     def reset(self, seed: int) -> None:
-        """Begin an episode: robot at home, objects where ``seed`` puts them. Time goes on.
+        """Begin an episode: robot at home, objects where ``seed`` puts them. Time continues.
 
         Raises:
             NotReady: not connected.

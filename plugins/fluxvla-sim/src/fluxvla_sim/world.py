@@ -1,4 +1,4 @@
-"""What a simulated robot is placed in, and what can be asked for there.
+"""Worlds of simulated robots: scenes with their tasks and scripted experts.
 
 A ``World`` is one scene with its tasks and its scripted expert, a ``SimRobot`` is a robot with the
 worlds that it can be put into. Everything else (operators, evaluation, collection, ROS 2 nodes) is

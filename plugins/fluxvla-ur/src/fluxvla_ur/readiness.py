@@ -22,7 +22,7 @@ _MAY_MOVE = (1, 2)
 
 
 def check_not_paused(scaling: float) -> None:
-    """Refuse to command a robot that stands still until a person lets it go on.
+    """Refuse to command a robot that stands still until a person lets it continue.
 
     Args:
         scaling: share of the programmed speed that the robot runs at, 0 to 1.

@@ -141,7 +141,7 @@ class RobotiqGripper:
         if fault:
             raise Faulted(
                 f"the gripper reports fault {fault}",
-                next="the Robotiq manual explains the number; activate the gripper anew",
+                next="the Robotiq manual explains the number; activate the gripper again",
             )
         return 1.0 - self._get("POS") / CLOSED
 

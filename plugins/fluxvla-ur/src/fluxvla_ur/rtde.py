@@ -150,7 +150,7 @@ class URRTDEOperator(Operator):
         self._last: Array | None = None
         self._spoke = 0.0
         self._moving = False
-        # The client connects anew by itself and starts its script again, without the watchdog and
+        # The client reconnects by itself and starts its script again, without the watchdog and
         # without anybody's asking; what was lost once is not trusted again before ``connect``.
         self._broken = False
 
@@ -344,7 +344,7 @@ class URRTDEOperator(Operator):
         while not closing.wait(1.0 / _DATA_HZ):
             receive, now = self._receive, time.monotonic()
             try:
-                # A client that lost its controller goes on giving the last it heard.
+                # A client that lost its controller keeps returning the last state it received.
                 if receive is not None and receive.getTimestamp() != stamp:
                     stamp = receive.getTimestamp()
                     self._newest = _Reading(

@@ -30,7 +30,7 @@ def import_rtde() -> tuple[Any, Any]:
 
 
 def within(seconds: float, call: Callable[[], object]) -> bool:
-    """Whether ``call`` returns in that time; else it goes on in its thread. Failures are logged."""
+    """Whether ``call`` returns in that time; else its thread continues. Failures are logged."""
 
     def guarded() -> None:
         try:

@@ -139,7 +139,7 @@ def check_chunk(
 
     Args:
         chunk: ``(T, dim)`` keyframes from a policy.
-        embodiment: whose joints they are for.
+        embodiment: describes the joints of the keyframes.
         rate_hz: keyframes a second.
         settings: ``jump_s`` and ``excess``.
 
@@ -198,7 +198,7 @@ def check_beginning(
 
     Args:
         keyframes: ``(T, dim)`` that ``check_chunk`` let through.
-        embodiment: whose joints they are for.
+        embodiment: describes the joints of the keyframes.
         last: ``(dim,)`` the command that the arm has now.
         rate_hz: keyframes a second.
         settings: ``jump_s``.

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 from fluxvla_core.contracts.robot import Clock, Operator
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 
 
 class MonotonicClock(Clock):
@@ -79,7 +79,7 @@ class Rate:
 
     Args:
         hz: ticks a second.
-        clock: whose time counts; the monotonic clock by default.
+        clock: source of the time; the monotonic clock by default.
         lead_s: how long before each deadline ``sleep`` returns, less than a period.
 
     ``on_tick`` is called at each tick, after the wait; what it raises leaves ``sleep``. The runner
@@ -116,7 +116,7 @@ class Rate:
         self._waits = False
 
     def reset(self) -> None:
-        """Begin anew: the next deadline is one period from the next ``sleep``'s call."""
+        """Reset: the next deadline is one period from the next ``sleep``'s call."""
         self._deadline = self._due = self._woke = None
 
     def sleep(self) -> float:
@@ -142,10 +142,10 @@ class Rate:
         self.skipped += missed
         deadline += missed * self.period
         if self._keeps:
-            priority.share_interpreter()
+            realtime.share_interpreter()
         self.clock.sleep_until(deadline)
         if self._keeps:
-            priority.keep_interpreter()
+            realtime.keep_interpreter()
         self._woke = self.clock.now()
         late = max(0.0, self._woke - deadline)
         if not self._waits:
@@ -165,7 +165,7 @@ class Rate:
         self.late_s = 0.0
         if self._due is not None:
             if self._keeps:
-                priority.wait_until(self._due)
+                realtime.wait_until(self._due)
             else:
                 self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 # Calls that are shorter keep nobody waiting, and are not remembered.
 _LEAST_S = 0.005
-_LOOK_S = 0.05
+_POLL_S = 0.05
 # A look that comes this much too late shows that the process stood still, if it computed for less
 # than this share of that. While native code computes without giving up the interpreter, looks come
 # late as well, but the process is busy: that is not the machine's doing.
@@ -122,7 +122,7 @@ class DelayMonitor:
         def watch() -> None:
             warned: set[DelaySource] = set()
             self._looked = time.monotonic(), time.process_time()
-            while not ended.wait(_LOOK_S):
+            while not ended.wait(_POLL_S):
                 now = time.monotonic()
                 self._stalls.extend(self._stall(now))
                 self._looked = now, time.process_time()
@@ -148,7 +148,7 @@ class DelayMonitor:
         if self._looked is None:
             return []
         looked, computed = self._looked
-        lost = now - looked - _LOOK_S
+        lost = now - looked - _POLL_S
         busy = time.process_time() - computed
         return [(now - lost, now)] if lost > _STALL_S and busy < _BUSY_SHARE * lost else []
 

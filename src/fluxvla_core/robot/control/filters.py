@@ -124,7 +124,7 @@ class WorkspaceBox(ActionFilter):
     """Moves a target whose tool point is outside the box to the wall, along the least joint way.
 
     The way is found by damped least squares on the chain's Jacobian, so that a motion along a wall
-    goes on along it. A target for which that fails is not taken: the arm stays where it was last
+    continues along it. A target for which that fails is not taken: the arm stays where it was last
     allowed to go. Only the one point is watched: no elbow, no other arm, no object.
 
     The box holds for targets, and an arm that comes at a wall with speed needs its braking way

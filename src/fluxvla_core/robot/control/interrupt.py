@@ -84,7 +84,7 @@ class Interrupts:
             raise Interrupted(number)
 
     def resume(self) -> None:
-        """What ``stopping`` was set for is over and the run goes on: signals count again.
+        """What ``stopping`` was set for is over and the run continues: signals count again.
 
         Raises:
             Interrupted: one came meanwhile.

@@ -48,7 +48,7 @@ class ChunkJoiner(ABC):
     streamed: ClassVar[bool] = True
     """Whether it is asked at every tick; otherwise a chunk's commands are played in one piece."""
     continues: ClassVar[bool] = False
-    """Whether the policy is asked to go on from the chunk that is being played."""
+    """Whether the policy is asked to continue the chunk that is being played."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -67,7 +67,7 @@ class ChunkJoiner(ABC):
         """Whether the policy should be asked now, if it is free."""
 
     def ahead(self) -> Ahead | None:
-        """What the policy has to go on from; None for nothing."""
+        """What the policy has to continue; None for nothing."""
         return None
 
 
@@ -290,10 +290,10 @@ class RestOfChunk(Ahead):
 
 
 class RealTime(StreamedJoiner):
-    """Real-time chunking: the policy makes the next chunk go on from the one that is being played.
+    """Real-time chunking: the policy makes the next chunk continue the one that is being played.
 
     Black, Galliker and Levine 2025, "Real-Time Execution of Action Chunking Flow Policies" (arXiv
-    2506.07339). While a policy thinks, the arm goes on along the old chunk. The first ``d``
+    2506.07339). While a policy thinks, the arm continues along the old chunk. The first ``d``
     keyframes of the new one are over when it arrives, so they are fixed to what will have been
     executed; later ones are drawn to the old chunk the less the later they are; those that the old
     chunk does not reach are free. ``soft_mask`` has the weights, and the policy does the rest
@@ -327,7 +327,9 @@ class RealTime(StreamedJoiner):
         if schedule not in SCHEDULES:
             near = difflib.get_close_matches(str(schedule), SCHEDULES, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ConfigError(f"schedule {schedule!r} is none of {', '.join(SCHEDULES)}{hint}")
+            raise ConfigError(
+                f"schedule {schedule!r} is unknown; choose one of {', '.join(SCHEDULES)}{hint}"
+            )
         if not (math.isfinite(max_guidance_weight) and max_guidance_weight > 0):
             raise ConfigError(f"max_guidance_weight must be positive, got {max_guidance_weight!r}")
         if window < 1:

@@ -1,4 +1,4 @@
-"""Where a point of an arm is: forward kinematics of a chain of revolute joints, and its Jacobian.
+"""Forward kinematics of a point on a chain of revolute joints, and its Jacobian.
 
 A chain is written as URDF writes it, joint by joint: where the joint's frame is in the one before
 (``xyz`` in metres, ``rpy`` in radians, rotations about the fixed axes x, y, z in that order) and

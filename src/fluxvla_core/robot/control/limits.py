@@ -89,7 +89,7 @@ class CommandLimiter:
     """Keeps commands within an embodiment's limits; see the module's text for what and why.
 
     Args:
-        embodiment: whose joints limit.
+        embodiment: gives the limits of its joints.
         period: seconds from command to command.
         velocity_scale, acceleration_scale: share of the embodiment's limits to use, in (0, 1].
 
@@ -185,7 +185,7 @@ class CommandLimiter:
         self._begin(np.clip(pose, self.lower, self.upper), np.zeros_like(pose))
 
     def resume(self, last: npt.ArrayLike, before: npt.ArrayLike, seconds: float) -> None:
-        """Go on from commands that were sent already.
+        """Continue from commands that were sent already.
 
         Args:
             last: ``(D,)`` the last command, within the position limits.
@@ -366,10 +366,10 @@ class CommandLimiter:
 class PassThrough:
     """No limits, for actions that are no joint targets: commands are the targets.
 
-    What such an environment does with a value beyond its limits is its own affair; it is noted.
+    What such an environment does with a value beyond its limits is up to it; it is recorded.
 
     Args:
-        embodiment: whose limits the values are held against.
+        embodiment: gives the limits that the values are compared with.
     """
 
     def __init__(self, embodiment: EmbodimentSpec) -> None:

@@ -1,4 +1,4 @@
-"""Whether the arm follows its commands: ``TrackingWatch`` trips when it stays behind."""
+"""Tracking error: ``TrackingWatch`` trips when the arm does not follow its commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = npt.NDArray[np.float64]
 # A prismatic joint's tracking error in m, as a share of a revolute one's in rad.
 PRISMATIC_SHARE = 0.1
 # A joint further than this from its last command (rad, or m) was blocked, or moved since: it is
-# held where it is, and goes on from there.
+# held where it is, and continues from there.
 HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015, "gripper": np.inf}
 # Commands that are kept to hold a state against; an older one is too old to say anything.
 _REMEMBERED = 256
@@ -46,7 +46,7 @@ class TrackingWatch:
         self._sent: deque[tuple[float, Array]] = deque(maxlen=_REMEMBERED)
 
     def reset(self) -> None:
-        """Begin anew: the arm is where its command is."""
+        """Reset: the arm is where its command is."""
         self._since[:] = np.inf
 
     def sent(self, command: Array, at: float) -> None:

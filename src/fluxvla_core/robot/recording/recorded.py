@@ -42,7 +42,7 @@ class Pictures:
     ``times`` are seconds on the loop's clock, when each arrived.
 
     Args:
-        file: where they are.
+        file: the file that they are in.
         unpack: makes an array of a message and its type.
     """
 
@@ -179,7 +179,7 @@ class Recorded:
         return found
 
     def summary(self) -> dict[str, Any]:
-        """As ``episode.json``, counted anew."""
+        """As ``episode.json``, counted again."""
         return episode_log.summarise(self.events)
 
 
@@ -358,7 +358,8 @@ def check_same_embodiment(recordings: Iterable[Recorded]) -> EmbodimentSpec:
 def finish_recording(folder: str | Path) -> bool:
     """Write the index of a bag that lacks one, its ``metadata.yaml``, and ``episode.json``.
 
-    The bag is written anew aside and put in its place in one step; its messages stay as they are.
+    The bag is written again to another file and put in its place in one step; its messages stay
+    as they are.
 
     Args:
         folder: one episode.

@@ -40,9 +40,9 @@ class EpisodeRecorder(EpisodeObserver):
     Args:
         folder: where the record goes; opened with ``EpisodePrepared``, finished with
             ``EpisodeEnded``.
-        robot, policy: of the episode.
+        robot, policy: those that act in the episode.
         cameras: names of those that the policy looks at.
-        video_fps: of the videos; None records none.
+        video_fps: frames a second of the videos; None records none.
         everything: record pictures too, in a bag; otherwise lines of JSON.
         reporter: learns what was not recorded, and where the record is.
 

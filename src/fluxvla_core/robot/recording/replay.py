@@ -77,7 +77,7 @@ class ReplayOperator(Operator):
                 "this episode has no pictures: its robot cannot be replayed",
                 where=str(found.path),
                 cause="it was run without --record",
-                next="ReplayPolicy can replay its actions; record anew with --record DIR",
+                next="ReplayPolicy can replay its actions; record again with --record DIR",
             )
         return found
 
@@ -295,7 +295,7 @@ class ReplayPolicy(Policy):
         return self.actions == COMMANDS
 
     def reset(self, seed: int) -> None:
-        """Begin anew; nothing is drawn."""
+        """Reset; nothing is drawn."""
         self._next = 0
 
     def predict_action(self, observation: Observation) -> Array:
@@ -313,7 +313,7 @@ class ReplayPolicy(Policy):
         return self._chunks[self._next - 1].copy()
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
-        """The next answer, whatever it had to go on from when it was recorded."""
+        """The next answer, whatever it had to continue when it was recorded."""
         return self.predict_action(observation)
 
     @cached_property

@@ -93,7 +93,7 @@ class Packer:
     """Makes messages.
 
     Args:
-        store: see ``typestore``.
+        store: the message types, from ``typestore``.
     """
 
     def __init__(self, store: Any) -> None:
@@ -131,7 +131,7 @@ class Packer:
                 chunk, names["action"], stamps["observed"], float(rest["rate_hz"])
             )
             yield CHUNKS, TRAJECTORY, message
-        text = json.dumps(rest, default=plain)
+        text = json.dumps(rest, default=numpy_as_json)
         kind = self._store.types[STRING]
         yield EVENTS, STRING, self._store.serialize_cdr(kind(text), STRING)
 
@@ -240,7 +240,7 @@ class Unpacker:
     """Puts events together again.
 
     Args:
-        store: see ``typestore``.
+        store: the message types, from ``typestore``.
     """
 
     def __init__(self, store: Any) -> None:
@@ -310,7 +310,7 @@ class Unpacker:
             raise DataError(f"a recorded {kind} cannot be read: {error}") from error
 
 
-def plain(value: Any) -> Any:
+def numpy_as_json(value: Any) -> Any:
     """Arrays and numpy's numbers as JSON has them.
 
     Raises:

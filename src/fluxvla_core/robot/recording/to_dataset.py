@@ -110,7 +110,7 @@ def _with_cameras(recordings: Sequence[Recorded]) -> EmbodimentSpec:
             "this episode has no pictures",
             where=str(bare.path),
             cause="it was run without --record",
-            next="record anew with fluxvla run … --record DIR",
+            next="record again with fluxvla run … --record DIR",
         )
     return replace(spec, cameras=kept)
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from fluxvla_core import atomic
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.recording import ros_messages as ros
 from fluxvla_core.robot.recording.bag import Bag
 from fluxvla_core.robot.recording.video import VideoWriter
@@ -96,7 +96,7 @@ def _json(value: Any) -> str:
     """A chunk row by row: one call for all would keep the interpreter from the sending thread."""
     if isinstance(value, np.ndarray) and value.ndim > 1:
         return "[" + ", ".join(map(_json, value)) + "]"
-    return json.dumps(value, default=ros.plain)
+    return json.dumps(value, default=ros.numpy_as_json)
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class EpisodeTrace:
 
     def _run(self) -> None:
         # The sending thread waits for the interpreter while this thread has it.
-        priority.just_below_real_time()
+        realtime.just_below_real_time()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -247,7 +247,7 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
-        with priority.normal():
+        with realtime.normal():
             self._finish()
 
     def _finish(self) -> None:
@@ -260,7 +260,7 @@ class EpisodeTrace:
     def _guard(self, call: Any, *arguments: Any) -> None:
         try:
             call(*arguments)
-        except Exception as error:  # noqa: BLE001 - raised by close; the robot goes on
+        except Exception as error:  # noqa: BLE001 - raised by close; the run continues
             self._error = self._error or error
 
     def _put(self, item: Any) -> None:
@@ -268,7 +268,7 @@ class EpisodeTrace:
             self._log.add(item)
             return
         camera, stamp, image = item
-        with priority.normal():
+        with realtime.normal():
             if stamp is None:
                 self._film(camera, image)
             elif image.ndim == 2:
@@ -297,7 +297,7 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
-        with priority.normal():
+        with realtime.normal():
             self._poll_all(self._source)
 
     def _poll_all(self, source: Source) -> None:

@@ -25,7 +25,7 @@ class VideoWriter:
     Args:
         path: the mp4 to make; its folder is made if need be.
         fps: frames a second.
-        height, width: of every frame.
+        height, width: size of every frame in pixels.
 
     Raises:
         RunFailed: the ``av`` package is missing, or the file cannot be written.

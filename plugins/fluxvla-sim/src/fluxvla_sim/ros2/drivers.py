@@ -271,7 +271,7 @@ class URDriver:
     def _slide(self, percent: float, now: float) -> None:
         if not 0 <= percent <= 100:
             raise BadMessage(f"{self._SLIDER}: a speed slider goes from 0 to 100 %, got {percent}")
-        # What is left of a trajectory goes on from here at the new speed.
+        # What is left of a trajectory continues from here at the new speed.
         here, left = self.target(now), self._seconds - self._passed(now)
         self._from, self._since, self._seconds = here[: self._ARM], now, max(left, 0.0)
         self._percent = percent

@@ -46,7 +46,7 @@ from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, World
 _FACTS_EVERY = 5
 # Simulated seconds after a reset in which no command is taken.
 _SETTLE_S = 0.1
-# A process that was stopped for longer than this goes on from now, instead of catching up.
+# A process that was stopped for longer than this continues from now, instead of catching up.
 _FAR_BEHIND_S = 0.5
 _WELL = "well"
 # Commands that may wait while this process is kept from running: a UR ignores what comes after a

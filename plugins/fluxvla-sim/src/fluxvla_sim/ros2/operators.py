@@ -40,7 +40,7 @@ FACTS, RESET = "/sim/facts", "/sim/reset"
 STRING, INT64 = "std_msgs.msg:String", "std_msgs.msg:Int64"
 RESET_S = 10.0
 """How long a simulator may take to begin an episode, in its own seconds."""
-_LOOK_S = 0.01
+_POLL_S = 0.01
 _SETTLE_S = 0.2
 _KEPT = 0.95
 
@@ -244,7 +244,7 @@ class InSimulation(RosOperator):
                     cause="it hangs, it is overloaded, or a fault holds its messages back",
                     next="look at the terminal that fluxvla sim runs in",
                 )
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
 
 
 class AlohaSimROSOperator(InSimulation, AlohaOperator):

@@ -11,7 +11,8 @@ from fluxvla_core.ros2 import FLOAT64, ODOMETRY, Fault, depth_stream
 from fluxvla_sim.ros2.drivers import Driver
 from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS
 
-# Of a product of two rates; a billion parts are months.
+# The product of two rates may be rounded to just below an integer: without this tolerance
+# ``floor`` would then lose a state.
 _ROUNDING = 1e-9
 
 
@@ -119,7 +120,7 @@ def timed_fault(text: str) -> tuple[float, str, Fault]:
     try:
         seconds = float(after or 0.0)
     except ValueError as error:
-        raise UsageError(f"{text!r}: {after!r} is no number of seconds") from error
+        raise UsageError(f"{text!r}: {after!r} is not a number of seconds") from error
     return (seconds, *Fault.parse(fault))
 
 
@@ -135,5 +136,5 @@ def stream_latency(text: str) -> tuple[str, float]:
     except ValueError:
         latency = math.nan
     if not (stream and 0 <= latency < math.inf):
-        raise UsageError(f"{text!r} is no latency; write STREAM=SECONDS, as top=0.05")
+        raise UsageError(f"{text!r} is not a latency; write STREAM=SECONDS, as top=0.05")
     return stream, latency

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control import priority
+from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.chunks import Chunk, check_beginning
 from fluxvla_core.robot.control.clock import Rate
 from fluxvla_core.robot.control.limits import CommandLimiter
@@ -35,7 +35,7 @@ def state():
 
 def inside(code: str) -> list[str]:
     """What a process prints; its whole surroundings are its own."""
-    begin = "import os, sys, gc; from fluxvla_core.robot.control import priority\n"
+    begin = "import os, sys, gc; from fluxvla_core.robot.control import realtime\n"
     done = subprocess.run([sys.executable, "-c", begin + code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
@@ -46,8 +46,8 @@ def test_everything_is_as_before_afterwards_also_after_an_error():
     before = state()
 
     def fail() -> None:
-        with priority.real_time():
-            assert sys.getswitchinterval() == pytest.approx(priority.SHARED_S)
+        with realtime.real_time():
+            assert sys.getswitchinterval() == pytest.approx(realtime.SHARED_S)
             assert gc.get_freeze_count() > 0
             raise KeyError
 
@@ -59,7 +59,7 @@ def test_everything_is_as_before_afterwards_also_after_an_error():
 @on_linux
 def test_the_thread_has_a_real_time_priority_where_it_may_and_what_it_begins_has_not():
     seen = []
-    with priority.real_time() as real_time:
+    with realtime.real_time() as real_time:
         mine = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
         thread = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))
         thread.start()
@@ -95,7 +95,7 @@ def test_no_other_thread_takes_the_interpreter_before_a_deadline(counted):
     try:
         time.sleep(0.05)  # whoever waits with the old interval is done with it
         before, deadline = counted[0], time.monotonic() + 0.2
-        priority.wait_until(deadline)
+        realtime.wait_until(deadline)
         kept = counted[0] - before, time.monotonic() >= deadline
         time.sleep(0.05)
         given = counted[0] - before
@@ -134,7 +134,7 @@ def test_what_a_command_is_made_of_gives_the_interpreter_to_nobody(counted):
 
 @on_linux
 def test_from_waking_to_its_command_a_thread_keeps_the_interpreter_and_then_shares_it(counted):
-    with priority.real_time():
+    with realtime.real_time():
         rate, kept, given = Rate(50, lead_s=0.004), [], []
         for _ in range(25):
             before = counted[0]
@@ -152,15 +152,15 @@ def test_from_waking_to_its_command_a_thread_keeps_the_interpreter_and_then_shar
 @on_linux
 def test_the_interpreter_is_kept_only_where_somebody_goes_first():
     before = sys.getswitchinterval()
-    priority.keep_interpreter()
-    priority.share_interpreter()
+    realtime.keep_interpreter()
+    realtime.share_interpreter()
     assert sys.getswitchinterval() == before
-    with priority.real_time():
-        priority.keep_interpreter()
-        assert sys.getswitchinterval() == pytest.approx(priority.KEPT_S)
-        priority.wait_until(time.monotonic())
-        assert sys.getswitchinterval() == pytest.approx(priority.SHARED_S)
-        priority.keep_interpreter()
+    with realtime.real_time():
+        realtime.keep_interpreter()
+        assert sys.getswitchinterval() == pytest.approx(realtime.KEPT_S)
+        realtime.wait_until(time.monotonic())
+        assert sys.getswitchinterval() == pytest.approx(realtime.SHARED_S)
+        realtime.keep_interpreter()
     assert sys.getswitchinterval() == before
 
 
@@ -169,7 +169,7 @@ def test_the_interpreter_is_kept_only_where_somebody_goes_first():
 def test_without_the_right_to_it_the_thread_stays_an_ordinary_one():
     printed = inside(
         "import resource; resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0)); os.setuid(65534)\n"
-        "with priority.real_time() as real_time: print(real_time, os.sched_getscheduler(0))"
+        "with realtime.real_time() as real_time: print(real_time, os.sched_getscheduler(0))"
     )
 
     assert printed == ["False", str(os.SCHED_OTHER)]
@@ -184,7 +184,7 @@ def test_a_user_with_a_limit_gets_it_and_gives_it_back_again_and_again():
         "except ValueError: sys.exit(print('refused'))\n"
         "os.setuid(65534)\n"
         "for _ in range(2):\n"
-        "    with priority.real_time() as real_time: print(real_time)\n"
+        "    with realtime.real_time() as real_time: print(real_time)\n"
         "print((os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK) == os.SCHED_OTHER)"
     )
 
@@ -198,7 +198,7 @@ def test_a_user_with_a_limit_gets_it_and_gives_it_back_again_and_again():
 def test_a_priority_that_somebody_chose_is_kept():
     printed = inside(
         "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(7))\n"
-        "with priority.real_time() as changed:\n"
+        "with realtime.real_time() as changed:\n"
         "    print(changed, os.sched_getparam(0).sched_priority)\n"
         "print(os.sched_getscheduler(0) == os.SCHED_RR)"
     )
@@ -213,9 +213,9 @@ def test_the_second_comes_right_behind_the_first():
         "import threading\n"
         "seen = []\n"
         "def work():\n"
-        "    allowed = priority.just_below_real_time()\n"
+        "    allowed = realtime.just_below_real_time()\n"
         "    seen.append((allowed, os.sched_getparam(0).sched_priority))\n"
-        "with priority.real_time():\n"
+        "with realtime.real_time():\n"
         "    thread = threading.Thread(target=work); thread.start(); thread.join()\n"
         "    print(*seen[0], os.sched_getparam(0).sched_priority)\n"
     )
@@ -228,9 +228,9 @@ def test_the_second_comes_right_behind_the_first():
 def test_the_second_is_an_ordinary_one_while_it_computes_for_long():
     printed = inside(
         "def show(): print(os.sched_getparam(0).sched_priority)\n"
-        "with priority.normal(): show()\n"
-        "priority.just_below_real_time(); show()\n"
-        "with priority.normal(): show()\n"
+        "with realtime.normal(): show()\n"
+        "realtime.just_below_real_time(); show()\n"
+        "with realtime.normal(): show()\n"
         "show()"
     )
 

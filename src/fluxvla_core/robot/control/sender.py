@@ -45,7 +45,7 @@ class CommandFormer:
     """Makes commands of targets: the filters in their order, then the limits, always last.
 
     Args:
-        limiter: of the robot, or ``PassThrough`` where actions are no joint targets.
+        limiter: the robot's limits, or ``PassThrough`` where actions are no joint targets.
         filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
     """
 
@@ -136,7 +136,7 @@ class CommandSender:
         """Send one command for each row of ``(N, D)`` targets.
 
         Args:
-            targets: where to go.
+            targets: the positions to go to.
             filtered: through the filters.
             most: share of the velocity limits, in (0, 1], that no command goes beyond, however much
                 the robot allows.
@@ -202,7 +202,7 @@ class CommandSender:
         """Come to rest at the ``(D,)`` goal, or where the limits let it; also while tripped.
 
         Args:
-            goal: where to.
+            goal: the position to go to.
             most: commands after which the arm brakes, wherever it is.
         """
         reachable = np.clip(goal, self.limiter.lower, self.limiter.upper)
@@ -254,7 +254,7 @@ def come_to_rest(
     halts at once and goes back from there to where the joint is.
 
     Args:
-        sender: of the motion, which has begun.
+        sender: the sender of the motion, which has begun.
         tracking: knows which joints follow.
         state: reads where the arm is, ``(state_dim,)``; None where that is not known.
         blocked: whether joints that are too far from their commands do not obey.

@@ -1,4 +1,4 @@
-"""What an arm may be sent: checked actions, and the commands of a stop.
+"""Stop motions: the commands that brake an arm, and the check of actions that are sent.
 
 A stop goes from the last command to the one that holds the arm, within its limits.
 """
@@ -22,7 +22,7 @@ log = logging.getLogger("fluxvla.ros2")
 # A ``(state_dim,)`` state, and when it arrived.
 Measured = tuple[Array, float]
 PATIENCE_S = 0.25
-"""How long a joint that lags may go on towards its last command."""
+"""How long a joint that lags may keep moving towards its last command."""
 # Commands further apart than this are single ones, and no motion that could be braked.
 _APART_S = 0.25
 # No arm takes as long to come to rest.
@@ -109,8 +109,8 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Ar
     Args:
         last: ``(dim,)`` last command.
         state: ``(state_dim,)`` as measured.
-        moved: ``(state_dim,)`` how far each joint gets until it is looked at again, if it goes on
-            as it did; signed.
+        moved: ``(state_dim,)`` how far each joint gets until it is looked at again, if it keeps
+            moving as it did; signed.
     """
     where = {name: index for index, name in enumerate(embodiment.state_names)}
     target = last.copy()

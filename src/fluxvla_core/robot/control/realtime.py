@@ -1,4 +1,4 @@
-"""Real-time priority for the thread that sends commands, and first access to the interpreter.
+"""Real-time scheduling of the thread that sends commands: priority, GIL, garbage collection.
 
 Three things keep a Python thread from its deadline, and each has a means of its own:
 

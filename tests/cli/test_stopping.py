@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.checkpoints.checkpoint import folders, step_of
+from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.checkpoints.manifest import step_of
 
 from .jobs import FORMS, Job, gone, kill, linux, listening, outside
 

@@ -34,9 +34,9 @@ from fluxvla_core.checkpoints.manifest import (
     hash_file,
     read_manifest,
     step_name,
+    step_of,
 )
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.checkpoints.manifest import step_of as step_of
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.untrusted import parse_json, read_bytes
 

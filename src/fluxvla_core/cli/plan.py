@@ -162,7 +162,8 @@ def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
     Raises:
         UsageError: there are checkpoints, with both ways on.
     """
-    from fluxvla_core.checkpoints.checkpoint import folders, step_of
+    from fluxvla_core.checkpoints.checkpoint import folders
+    from fluxvla_core.checkpoints.manifest import step_of
 
     if resume == "auto":
         return

@@ -234,7 +234,7 @@ def on_first(world: World, work: Callable[[], str]) -> str:
 
 
 def share_buffers(world: World, model: nn.Module) -> None:
-    """Let all ranks have the first one's saved buffers; for a strategy's ``_update`` to end with.
+    """Copy the first rank's saved buffers to all; a strategy's ``optimizer_step`` ends with it.
 
     Each rank changes them by its own batches (batch-norm statistics, a running normaliser), and a
     run goes on with the first one's. Once the step is done they are the same for what may come

@@ -18,7 +18,7 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError, UsageError
-from fluxvla_core.training.weights import LeftOut, load_for_inference, model_tensors
+from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
 from fluxvla_core.untrusted import read_bytes
 
 TRAINING_ONLY = ("runner", "val_dataloader")
@@ -71,7 +71,7 @@ def export(source: str | Path, target: str | Path) -> Path:
         what="the export",
         go_on="export again, or name a folder on another disk; the checkpoint is as it was",
     ) as writer:
-        TensorFile.whole(ckpt.MODEL, model_tensors(model), True).write(writer)
+        TensorFile.whole(ckpt.MODEL, weights_by_name(model), True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, {**config, "config": tree, "origins": origins})
         for name in sorted(checkpoint.manifest.files):

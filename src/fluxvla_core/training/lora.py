@@ -7,14 +7,13 @@ trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the ba
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -72,8 +71,8 @@ class LoraOptions:
             raise ConfigError(f"lora must be a table, got {table!r}", where=where)
         for key in table:
             if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
+                near = nearest(str(key), known)
+                hint = f"did you mean {near!r}?" if near else f"it has {', '.join(known)}"
                 raise ConfigError(f"lora has no {key!r}; {hint}", where=where)
         lacking = [key for key in ("rank", "target_modules") if key not in table]
         if lacking:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.resolve import LOADER_KEYS
-from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.errors import ConfigError, Problem, nearest
 from fluxvla_core.training.lora import LoraOptions, check_installed
 from fluxvla_core.training.schedule import make_schedule
 
@@ -244,8 +243,8 @@ class LoaderOptions:
         found: list[tuple[str, str]] = []
         for key in table:
             if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+                near = nearest(key, known)
+                hint = f"; did you mean {near!r}?" if near else f"; known: {', '.join(known)}"
                 found.append((key, f"unknown key{hint}"))
         size, workers, together = table.get(known[0]), table.get(known[1], 0), table.get(known[2])
         if not _count(size, 1):

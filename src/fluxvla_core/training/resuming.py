@@ -12,6 +12,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
     EMA,
@@ -21,9 +22,9 @@ from fluxvla_core.checkpoints.checkpoint import (
     folders,
     newest_whole,
 )
-from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
+from fluxvla_core.checkpoints.lock import WorkDirLock, lock_work_dir
 from fluxvla_core.checkpoints.manifest import FOLDER, step_name
-from fluxvla_core.checkpoints.owner import Claim, claim
+from fluxvla_core.checkpoints.retention import clear_leftovers, name_best, set_aside_later
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
@@ -43,30 +44,34 @@ from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_ten
 AUTO = "auto"
 
 
-def take_over(world: World, context: RunContext) -> Claim | None:
+def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
     """Make the work dir's ``checkpoints`` folder, and keep other trainings out; the first rank has
-    the claim.
+    the lock.
 
     Raises:
         UsageError: it cannot be written, or another training is using it.
     """
-    claims: list[Claim] = []
+    locks: list[WorkDirLock] = []
 
     def take() -> str:
-        prepare(context.work_dir)
-        claims.append(claim(context.work_dir, context.reporter.warn))
+        prepare_folder(
+            context.work_dir / FOLDER,
+            "folder of the checkpoints",
+            next="name a folder that can be written: --work-dir DIR",
+        )
+        locks.append(lock_work_dir(context.work_dir, context.reporter.warn))
         return ""
 
     on_first(world, take)
-    return claims[0] if claims else None
+    return locks[0] if locks else None
 
 
-def choose(
+def choose_checkpoint(
     world: World, context: RunContext, resume: str | None, first: str | None = None
 ) -> Checkpoint | None:
     """The verified checkpoint to go on from, None to start afresh; the same on every rank.
 
-    Also clears what killed saves left in the work dir, which :func:`take_over` made this run's.
+    Also clears what killed saves left in the work dir, which :func:`lock_on_first` made this run's.
 
     Args:
         resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
@@ -267,7 +272,7 @@ def check_settings(
     return saved, (["\n".join([head, *listed])] if listed else []) + ([steps] if steps else [])
 
 
-def model_tensors(
+def load_weights(
     checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
 ) -> dict[str, Tensor]:
     """The checkpoint's weights by name; all fit ``model``.

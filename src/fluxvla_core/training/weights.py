@@ -71,7 +71,7 @@ def left_out(model: nn.Module) -> LeftOut:
     return LeftOut(sources, names, digest.hexdigest() if names else "")
 
 
-def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
+def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
     """Parameters and persistent buffers by name, but for those in ``without``.
 
     Raises:
@@ -90,7 +90,7 @@ def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Te
 
 def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
-    state = model_tensors(model)
+    state = weights_by_name(model)
     # strict=False only for what is left out of checkpoints: names and sizes have been checked.
     model.load_state_dict(
         {name: like(state[name].detach(), tensor) for name, tensor in tensors.items()},
@@ -119,7 +119,7 @@ def check_model_tensors(
     if lora.adapter_names(model):
         _check_base(brings, saved, where)
     check_left_out(brings, saved, where)
-    check_names(tensors, model_tensors(model, brings.names), "the weights", where)
+    check_names(tensors, weights_by_name(model, brings.names), "the weights", where)
 
 
 def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
@@ -183,7 +183,7 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
 
 def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """``tensors``, and tied weights under their other names too: averages have the first alone."""
-    state = model_tensors(model)
+    state = weights_by_name(model)
     known = {id(state[name]): tensor for name, tensor in tensors.items() if name in state}
     others = {name: known[id(own)] for name, own in state.items() if id(own) in known}
     return {**tensors, **others}
@@ -263,7 +263,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
         raise CheckpointError(f"there are no weights at {path}")
     tensors = read_tensors(path)
     brings = left_out(model).names - set(tensors)
-    check_names(tensors, model_tensors(model, brings), "the weights", str(path))
+    check_names(tensors, weights_by_name(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)
     return path
 

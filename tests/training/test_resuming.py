@@ -36,7 +36,7 @@ def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
         make(tmp_path).run_setup(37)
     assert str(caught.value) == (
         f"{tmp_path} already has checkpoints, up to step-000000006\n"
-        "  next: go on from there with --resume auto, or name another --work-dir"
+        "  next: resume from there with --resume auto, or name another --work-dir"
     )
     run(tmp_path / "other")
     with pytest.raises(UsageError, match="already has checkpoints"):

@@ -87,7 +87,7 @@ class Checkpoint:
     def open(cls, path: str | Path) -> Checkpoint:
         """Read the manifest in ``path``; a work dir or its checkpoints folder gives its newest.
 
-        Sizes and sums are looked at by :meth:`verify`, not here.
+        Sizes and hashes are checked by :meth:`verify`, not here.
 
         Raises:
             CheckpointError: there is nothing, no folder, no manifest, or a damaged one.

@@ -1,4 +1,4 @@
-"""One section of a config, run in this process, and what it leaves in its work dir."""
+"""Run one section of a config in this process, and write the records in its work dir."""
 
 from __future__ import annotations
 

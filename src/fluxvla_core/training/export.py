@@ -1,6 +1,6 @@
 """A checkpoint without what only training needs: for evaluation, servers and robots.
 
-The result is a checkpoint folder in every respect (manifest, sums, ``load_policy``), with all
+The result is a checkpoint folder in every respect (manifest, hashes, ``load_policy``), with all
 weights in one plain safetensors file: the averaged ones in their place if they were kept, adapters
 merged, frozen parts that the model would bring itself included. Optimizer, random states and the
 config's ``runner`` are left out, so that no training plugin is needed where it is used.
@@ -27,7 +27,7 @@ _COPIED = (ckpt.POLICY, ckpt.EMBODIMENT, ckpt.STATISTICS, ckpt.ENVIRONMENT)
 
 
 def export(source: str | Path, target: str | Path) -> Path:
-    """Write what acts of the checkpoint ``source`` into the new folder ``target``.
+    """Export the checkpoint ``source`` for inference into the new folder ``target``.
 
     Args:
         source: a checkpoint's folder, or a work dir, whose newest one is taken.
@@ -81,7 +81,7 @@ def export(source: str | Path, target: str | Path) -> Path:
 
 
 def _verified(checkpoint: Checkpoint, name: str) -> bytes:
-    """What is copied is what its sum says, even if the file changes while this runs.
+    """What is copied is what its hash says, even if the file changes while this runs.
 
     Raises:
         CheckpointError: it is not.

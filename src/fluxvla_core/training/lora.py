@@ -2,7 +2,7 @@
 
 peft puts its layers into the model in place, so that it stays the class that it is. What is
 trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the base stays where
-``init_from`` says that it came from, and a sum in the checkpoint proves that it is still the same.
+``init_from`` says that it came from, and a hash in the checkpoint proves that it is still the same.
 """
 
 from __future__ import annotations

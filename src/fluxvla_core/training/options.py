@@ -42,15 +42,15 @@ class TrainOptions:
     optimizer: Any = None
     """table of ``fluxvla.optimizers``; ``AdamW`` if None."""
     save_epoch_interval: int = 1
-    """epoch-based runs save after every so many epochs."""
+    """epoch-based runs save every N epochs."""
     save_iter_interval: int | None = None
-    """save every so many steps; 10000 in step-based runs that say nothing, only by epochs in
+    """save every N steps; 10000 in step-based runs that say nothing, only by epochs in
     epoch-based ones. The end of a run is always saved."""
     max_keep_ckpts: int = 2
     """newest checkpoints (by step) to keep; 0 keeps all."""
     async_save: bool = True
-    """write checkpoints beside the training, from a copy in memory; False waits for the disk and
-    needs no copy."""
+    """write checkpoints in the background while training continues, from a copy in memory; False
+    waits for the disk and needs no copy."""
     lr_scheduler_type: str = "constant"
     """``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``."""
     lr_schedule: Mapping[Any, float] | None = None
@@ -76,10 +76,10 @@ class TrainOptions:
     ema_decay: float | None = None
     """keep averaged weights too, and act with those; None does not."""
     val_iter_interval: int | None = None
-    """with a ``val_dataloader``: its loss every so many steps and at the end; None with every
+    """with a ``val_dataloader``: its loss every N steps and at the end; None with every
     checkpoint. The best one by it is kept and called ``best``."""
     early_stop_patience: int | None = None
-    """end after so many validations in a row without a better one."""
+    """end after N validations in a row without a better one."""
     seed: int = 42
     """initial weights, order of samples, and everything drawn, also by datasets that set no
     ``seed`` of their own."""
@@ -87,7 +87,7 @@ class TrainOptions:
     """``auto`` or a checkpoint's path; the command line's ``--resume`` goes first, but ``auto`` and
     restarts begin at that path while the work dir has no checkpoint."""
     log_iter_interval: int = 10
-    """fetch losses, and look for NaN, every so many steps; every step is logged all the same."""
+    """fetch losses, and look for NaN, every N steps; every step is logged all the same."""
     device: str = "auto"
     """``auto`` (a GPU if there is one), ``cpu``, ``cuda``."""
     peak_tflops: float | None = None
@@ -190,7 +190,7 @@ class TrainOptions:
 class LoaderOptions:
     """``train_dataloader`` of the config, without its dataset.
 
-    ``shuffle_episodes`` mixes so many episodes at a time; None mixes all samples.
+    ``shuffle_episodes`` mixes N episodes at a time; None mixes all samples.
     """
 
     per_device_batch_size: int

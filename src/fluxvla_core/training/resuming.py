@@ -1,4 +1,4 @@
-"""Choosing the checkpoint that a run goes on from, and refusing one that it cannot go on from."""
+"""Resume a training: choose the checkpoint, and refuse one that does not fit this run."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
 def choose_checkpoint(
     world: World, context: RunContext, resume: str | None, first: str | None = None
 ) -> Checkpoint | None:
-    """The verified checkpoint to go on from, None to start afresh; the same on every rank.
+    """The verified checkpoint to resume from, None to start afresh; the same on every rank.
 
     Also clears what killed saves left in the work dir, which :func:`lock_on_first` made this run's.
 
@@ -77,7 +77,7 @@ def choose_checkpoint(
         resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
             path (refused if damaged), or None (refused if there are checkpoints already).
         first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
-            first save goes on from where the run did.
+            first save starts from where the run did.
 
     Raises:
         CheckpointError: the one at the path is missing or damaged.
@@ -126,14 +126,14 @@ def _refuse_existing(work_dir: Path) -> None:
     if existing:
         raise UsageError(
             f"{work_dir} already has checkpoints, up to {existing[-1].name}",
-            next="go on from there with --resume auto, or name another --work-dir",
+            next="resume from there with --resume auto, or name another --work-dir",
         )
 
 
 def check_same_run(
     saved: Mapping[str, Any], plan: StepPlan, seeds: Sequence[int | None], where: str
 ) -> str | None:
-    """Refuse to go on with other data or another seed; a changed batch or world only is said.
+    """Refuse other data or another seed; a changed batch size or number of processes only warns.
 
     Args:
         saved: ``trainer.json``.
@@ -182,7 +182,7 @@ def _begin_another(checkpoint: str) -> str:
 
 
 def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
-    """Refuse to go on with another adapter than the checkpoint's, or with one, or without.
+    """Raise an error if the LoRA settings differ, or only one of the two runs uses LoRA.
 
     Raises:
         CheckpointError: says both.
@@ -197,7 +197,7 @@ def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, whe
 
 
 def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
-    """Refuse to go on without the averages that the checkpoint has, or with ones it has not.
+    """Raise an error if only one of the two runs keeps averaged weights.
 
     Raises:
         CheckpointError: says which.
@@ -218,7 +218,7 @@ def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
 
 
 def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
-    """Refuse to go on with data that are normalised by other numbers.
+    """Raise an error if the dataset is normalised by other statistics.
 
     Raises:
         CheckpointError: names the statistics that differ.
@@ -291,7 +291,7 @@ def load_weights(
 
 @contextmanager
 def state_of(what: str, where: str) -> Iterator[None]:
-    """Let what a class raises for a state that it did not write be a CheckpointError."""
+    """Turn errors of ``load_state_dict`` into CheckpointError."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -324,7 +324,7 @@ def forget_missing(
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
     """Give this rank the random states it was saved with, or fresh ones of its own.
 
-    On another number of ranks than before there is none to go on with: each rank then draws from
+    With another number of ranks than before there are none to restore: each rank then draws from
     a state that follows from the seed, its rank and the step.
     """
     if checkpoint is None:
@@ -341,19 +341,19 @@ TABLES = ("model", "train_dataloader", "val_dataloader")
 """What a run, and its best checkpoint, follow from, besides the section that runs."""
 HARMLESS = frozenset(
     {
-        # Where things are. A model's frozen weights are compared by their sum, data by statistics.
+        # Where things are. A model's frozen weights are compared by their hash, data by statistics.
         *("init_from", "resume_from", "device"),
         # How samples are fetched.
         *("per_device_num_workers", "cache_frames"),
         # What is logged and saved, and how often.
         *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
         *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
-        "early_stop_patience",  # how long it goes on
+        "early_stop_patience",  # when it ends
         # Samples a step: what they come to together is compared on its own.
         *("per_device_batch_size", "grad_accumulation_steps"),
     }
 )
-"""Keys that may change without a word."""
+"""Keys that may change without a warning."""
 LENGTH = frozenset({"max_epochs", "max_steps"})
 """And those that may where the learning rate does not follow from them."""
 _UNSET = "not set"

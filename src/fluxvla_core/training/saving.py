@@ -1,4 +1,4 @@
-"""What goes into a checkpoint, and how the ranks write it together."""
+"""Save checkpoints asynchronously: what goes in, and how the ranks write it together."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
 
 
 class Guarded:
-    """Passes calls on to a tracker until one fails; that is said once, and the run goes on."""
+    """Passes calls on to a tracker until one fails; that is said once, and the run continues."""
 
     def __init__(self, name: str, reporter: Reporter, make: Callable[[], Tracker]) -> None:
         self._name, self._reporter = name, reporter

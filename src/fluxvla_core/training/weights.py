@@ -1,4 +1,4 @@
-"""A model's weights in a checkpoint: which are in it, and whether they are this model's."""
+"""Model weights in a checkpoint: which are in it, and whether they are this model's."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SavedWeights:
 
 
 def left_out(model: nn.Module) -> LeftOut:
-    """What :class:`LeftOut` there is in ``model``; reads those weights once to sum them up."""
+    """What :class:`LeftOut` there is in ``model``; reads those weights once to hash them."""
     sources = frozen_sources(model)
     state = model.state_dict(keep_vars=True)
     # What stands in no part by itself but in the whole model may be a buffer that training changes.
@@ -211,7 +211,7 @@ def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None
     """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
 
     Args:
-        before: what the run goes on from; where it is asked for no other base, it keeps that one.
+        before: what the run resumes from; where it is asked for no other base, it keeps that one.
     """
     if before is None:
         return init_from
@@ -231,7 +231,7 @@ def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
 def exact_place(place: str | Path) -> str:
     """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
 
-    Which one is a work dir's newest, or its ``best``, changes while that run goes on.
+    Which one is a work dir's newest, or its ``best``, changes while that run continues.
 
     Raises:
         CheckpointError: there is none.
@@ -248,7 +248,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
 
     Returns:
         The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
-        ``best``, changes while that run goes on.
+        ``best``, changes while that run continues.
 
     Raises:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.

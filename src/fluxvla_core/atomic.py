@@ -62,12 +62,12 @@ def _finite(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text to a temporary file beside ``path``, in a folder that exists; rename it.
+    """Write UTF-8 text to a temporary file next to ``path``, in a folder that exists; rename it.
 
     A reader never sees half a file; a process that is killed leaves the old one.
 
     Raises:
-        OSError: it cannot be written; nothing is left beside it.
+        OSError: it cannot be written; no temporary file is left.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:

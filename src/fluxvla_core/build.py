@@ -25,7 +25,7 @@ from fluxvla_core.registries import ROWS, RegistryRow
 
 @dataclass(frozen=True)
 class RunContext:
-    """What a run knows that no config says.
+    """Command-line settings and paths of a run.
 
     Args:
         config: the whole resolved config tree.
@@ -75,7 +75,7 @@ def build_from_cfg(
     Raises:
         ConfigError: no ``type``, an injected parameter is set, the arguments do not fit, or the
             constructor fails at values of other types than it is annotated with.
-        PluginError: the class cannot be had.
+        PluginError: the class cannot be loaded.
     """
     if not isinstance(cfg, Mapping):
         return cfg
@@ -107,7 +107,7 @@ def build_from_cfg(
         explained = _explained(cls, cfg, context)
         if explained is None:
             raise
-        # An annotation may be wrong: what really happened stands beside it.
+        # An annotation may be wrong: what really happened is reported too.
         explained.cause = f"the constructor raised {type(error).__name__}: {error}"
         raise explained from error
 
@@ -117,7 +117,7 @@ def takes(cfg: Any, registry: Registry, name: str) -> bool:
 
     Raises:
         ConfigError: no ``type``.
-        PluginError: the class cannot be had.
+        PluginError: the class cannot be loaded.
     """
     return isinstance(cfg, Mapping) and name in parameters(_class_of(cfg.get("type"), registry))
 

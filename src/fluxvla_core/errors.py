@@ -3,7 +3,7 @@
 FluxError                     1
 ├── UsageError                2   the command line asks for something that cannot be
 ├── ConfigError               2   a config file is missing, unreadable or wrong
-├── PluginError               2   a class that a config names cannot be had
+├── PluginError               2   a class that a config names cannot be loaded
 │   ├── MissingPlugin             nothing installed provides the name
 │   ├── AmbiguousPlugin           several distributions provide it
 │   ├── IncompatiblePlugin        written for another core
@@ -75,7 +75,7 @@ class FluxError(Exception):
         what: the finding in one sentence, without a trailing full stop.
         where: ``file:line: dotted.key`` or a path; shown before ``what``.
         cause: the likely cause, if the finding alone does not say it.
-        next: the command, or the change, that mends it or shows more.
+        next: the command, or the change, that fixes it or shows more.
     """
 
     exit_code = EXIT_FAILED
@@ -175,7 +175,7 @@ class ConfigError(FluxError):
 
 
 class PluginError(FluxError):
-    """A class that a config or a command names cannot be had."""
+    """A class that a config or a command names cannot be loaded."""
 
     exit_code = EXIT_BAD_INPUT
 

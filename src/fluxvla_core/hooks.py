@@ -57,7 +57,7 @@ def build_hooks(context: RunContext) -> HookCaller:
 
     Raises:
         ConfigError: the value is no list of names and tables.
-        PluginError: a hook cannot be had, or has a method that is no hook.
+        PluginError: a hook cannot be loaded, or has a method that is no hook.
     """
     wanted = context.config.get("hooks", ())
     if not isinstance(wanted, (list, tuple)):

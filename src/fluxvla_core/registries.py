@@ -98,7 +98,7 @@ def check_api(registry: str, name: str, written: Any, origin: str) -> None:
         written: its ``api``; a class without one (None) is taken as is.
 
     Raises:
-        IncompatiblePlugin: too old or too new, with the upgrade that mends it.
+        IncompatiblePlugin: too old or too new, with the upgrade that fixes it.
     """
     from fluxvla_core.errors import IncompatiblePlugin
 

@@ -175,7 +175,7 @@ def test_opening_what_is_no_checkpoint(tmp_path):
     with pytest.raises(CheckpointError, match=r"old\.pt is a file; a checkpoint is a folder like"):
         Checkpoint.open(tmp_path / "old.pt")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CheckpointError, match=r"manifest\.json is missing, so this is no checkp"):
+    with pytest.raises(CheckpointError, match=r"manifest\.json is missing, so this is not a check"):
         Checkpoint.open(tmp_path / "empty")
 
 
@@ -221,7 +221,7 @@ def relisted(path, name):
 def test_files_outside_the_folder_are_refused_by_name(tmp_path, name):
     path = write(tmp_path, 1)
     relisted(path, name)
-    with pytest.raises(CheckpointError, match="no path inside") as caught:
+    with pytest.raises(CheckpointError, match="not a path inside") as caught:
         Checkpoint.open(path)
     assert repr(name) in str(caught.value)
 

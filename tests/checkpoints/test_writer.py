@@ -11,11 +11,11 @@ import sys
 
 import pytest
 
+from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.checkpoints.directory import (
+from fluxvla_core.checkpoints.retention import (
     clear_leftovers,
     name_best,
-    prepare,
     rotate,
     set_aside_later,
 )
@@ -244,11 +244,11 @@ def test_best_names_a_checkpoint_that_is_there_or_nothing(tmp_path):
 def test_a_work_dir_that_cannot_be_written_is_refused_before_training(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError) as caught:
-        prepare(tmp_path / "file" / "run")
+        prepare_folder(tmp_path / "file" / "run", "folder of the checkpoints", next="other DIR")
     assert caught.value.exit_code == 2
     assert str(caught.value) == (
-        f"checkpoints cannot be written to {tmp_path}/file/run/checkpoints: Not a directory\n"
-        "  next: name a folder that can be written: --work-dir DIR"
+        f"{tmp_path}/file/run: cannot write to the folder of the checkpoints: Not a directory\n"
+        "  next: other DIR"
     )
 
 
@@ -260,7 +260,7 @@ def test_no_permission_is_refused_before_training(tmp_path):
     if pid == 0:
         os.setuid(65534)
         try:
-            prepare(tmp_path / "run")
+            prepare_folder(tmp_path / "run", "folder of the checkpoints", next="other DIR")
         except UsageError as error:
             os._exit(7 if "Permission denied" in str(error) else 8)
         os._exit(9)

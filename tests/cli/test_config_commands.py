@@ -101,7 +101,7 @@ def test_check_and_run_name_a_section_alike(
     )
     ended = fluxvla(*command, "d.py", "--section", "x")
     assert ended.code == 2
-    assert "d.py: section 'x' cannot be run: it is no table whose type is a runner" in ended.err
+    assert "d.py: section 'x' cannot be run: it is not a table whose type is a runner" in ended.err
 
 
 def test_a_config_without_sections(fluxvla: Fluxvla, write: Write) -> None:

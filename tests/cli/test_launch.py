@@ -87,10 +87,10 @@ def test_two_ranks_train_and_one_talks(write: Write) -> None:
         (
             "rank 1 dies",
             1,
-            "rank 1 ended without a word: killed by SIGKILL\n"
+            "rank 1 ended without an error message: killed by SIGKILL\n"
             "  likely cause: this machine, or its container, ran out of memory (see dmesg), or "
             "somebody killed it\n"
-            "  next: go on with the same command and --resume auto\n",
+            "  next: run the same command again with --resume auto\n",
         ),
     ],
 )
@@ -119,7 +119,7 @@ def waiting(process: subprocess.Popen[str]) -> list[int]:
         (
             signal.SIGINT,
             130,
-            "interrupted: go on with the same command and --resume auto\n",
+            "interrupted: run the same command again with --resume auto\n",
         ),
         (signal.SIGTERM, 1, "stopped by SIGTERM\n"),
     ],
@@ -134,7 +134,7 @@ def test_signals_reach_the_ranks(write: Write, number: int, code: int, text: str
 
 KILLED = """1 of 2 ranks were killed, or had not begun, when they were to stop and save
   likely cause: saving took longer than --grace 1 (seconds)
-  next: {}: go on with the same command and --resume auto
+  next: {}: run the same command again with --resume auto
 """
 
 
@@ -338,7 +338,7 @@ def test_a_rank_that_lost_another_is_no_cause(
     assert ranks.record_failure(said, 1, expected=True, reason="rank lost")
     (lost,) = ranks.failures(tmp_path).values()
     assert lost.asked
-    killed = Failure(1, lost.time + 1, "ended without a word", 1, silent=True)
+    killed = Failure(1, lost.time + 1, "ended without an error message", 1, silent=True)
     assert root_cause([lost, killed]) is killed
 
 
@@ -358,7 +358,7 @@ def test_the_root_cause() -> None:
     asked = Failure(0, 1.0, "training was stopped by SIGTERM", 1, expected=True, asked=True)
     broken = Failure(1, 2.0, "RuntimeError: connection closed", 1)
     later = Failure(2, 2.5, "RuntimeError: connection closed", 1)
-    killed = Failure(3, 3.0, "ended without a word", 1, silent=True)
+    killed = Failure(3, 3.0, "ended without an error message", 1, silent=True)
     named = Failure(4, 4.0, "a.mp4: bad data", 2, expected=True)
     assert root_cause([asked, broken, later, killed, named]) is named
     assert root_cause([asked, broken, later, killed]) is killed

@@ -101,7 +101,7 @@ def differing(a: Path, b: Path) -> list[str]:
 def test_a_killed_rank_costs_nothing_but_time(tiny: None, whole: Path) -> None:
     code, out, err = start("cut", "--nproc", "2", "--max-restarts", "1")
     assert (code, err) == (0, "")
-    assert "warning: restart 1: rank 1 ended without a word: killed, or crashed" in out
+    assert "warning: restart 1: rank 1 ended without an error message: killed, or crashed" in out
     assert "resuming from cut/checkpoints/step-000000003 (step 3)" in out
     assert differing(whole, Path("cut")) == []
 
@@ -277,10 +277,10 @@ def test_why_there_was_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "2")
     monkeypatch.setenv("WORLD_SIZE", "3")
     assert ranks.restart_notice() == [
-        "restart 2: rank 1, 2 ended without a word: killed, or crashed below Python"
+        "restart 2: rank 1, 2 ended without an error message: killed, or crashed below Python"
     ]
     monkeypatch.delenv(ranks.ERROR_DIR)
-    assert ranks.restart_notice() == ["restart 2: a process ended without a word"]
+    assert ranks.restart_notice() == ["restart 2: a process ended without an error message"]
 
 
 def test_only_a_training_restarts(run: Fluxvla) -> None:

@@ -188,7 +188,8 @@ def test_one_section_is_the_default(run: Fluxvla, write: Write) -> None:
         (("--section", "zzz"), "c.py: no section 'zzz'\n"),
         (
             ("--section", "train_dataloader"),
-            "c.py: section 'train_dataloader' cannot be run: it is no table whose type is a runner",
+            "c.py: section 'train_dataloader' cannot be run: it is not a table whose type is a "
+            "runner",
         ),
     ],
 )
@@ -286,7 +287,7 @@ def test_a_fresh_training_does_not_land_on_another(run: Fluxvla, write: Write) -
     assert ended.code == 2
     assert ended.err == (
         "work_dirs/c: the work dir already holds checkpoints, up to step 200\n"
-        "  next: go on from there: --resume auto; or begin anew elsewhere: --work-dir DIR\n"
+        "  next: resume from there: --resume auto; or use another folder: --work-dir DIR\n"
     )
     assert run("--config", "c.py", "--section", "eval").code == 0
     ended = run("--config", "c.py", "--section", "runner", "--resume", "auto")
@@ -361,7 +362,7 @@ def test_several_processes_for_a_runner_that_is_one(run: Fluxvla, write: Write) 
         (
             "ctrl-c",
             130,
-            "interrupted: saved at step 3\n  next: go on with the same command and --resume auto\n",
+            "interrupted: saved at step 3\n  next: run the same command again with --resume auto\n",
         ),
         ("sigterm", 1, "stopped by SIGTERM\n"),
     ],
@@ -538,6 +539,6 @@ def test_ctrl_c_says_how_an_evaluation_goes_on(fluxvla: Fluxvla, write: Write) -
     ended = fluxvla("run", "--plugin", "refusing.py", "--config", "r.toml")
     assert (ended.code, ended.err) == (
         130,
-        "interrupted: finished episodes are kept\n  next: go on with the same command\n",
+        "interrupted: finished episodes are kept\n  next: run the same command again\n",
     )
     RUNNERS.unregister("RefusingRunner")

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.checkpoints.checkpoint import folders, step_of
+from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.checkpoints.manifest import step_of
 
 from .jobs import FORMS, Job, gone, kill, linux, listening, outside
 
@@ -95,7 +96,7 @@ def test_a_killed_rank_is_named_and_not_the_workers_of_the_others() -> None:
         code, _, err = job.ended()
         assert code == 1
         assert err.startswith(
-            "rank 1 ended without a word: killed by SIGKILL\n"
+            "rank 1 ended without an error message: killed by SIGKILL\n"
             "  likely cause: this machine, or its container, ran out of memory"
         )
         assert gone(pids)

@@ -457,7 +457,7 @@ def test_requirements(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     assert lines[0] == "4 problems in the config:"
     assert "requires.0: needs fluxvla-core>=99, but fluxvla-core " in lines[1]
     assert lines[2].endswith("requires.1: needs nobody-has-this>=1, which is not installed")
-    assert "requires.3: '>=1' is no requirement (PEP 508): " in lines[4]
+    assert "requires.3: '>=1' is not a requirement (PEP 508): " in lines[4]
     assert "requires: must be a list like ['fluxvla-ur>=0.3'], got 'pip'" in findings(
         "requires = 'pip'\n", write
     )

@@ -117,7 +117,7 @@ def test_a_lost_rank_is_explained_and_other_errors_are_not():
         "rank 1 of 2 lost another rank during step 12\n"
         "  likely cause: another process of this run ended; its own message says why "
         "([gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:4009)\n"
-        "  next: mend what that message names, then run the same command with --resume auto"
+        "  next: fix what that message names, then run the same command with --resume auto"
     )
     assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), TWO, 12) is None
     assert explain(error, ONE, 12) is None

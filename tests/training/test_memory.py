@@ -168,7 +168,7 @@ SHM = (
         ),
         (
             "DataLoader worker (pid(s) 5, 6) exited unexpectedly",
-            "a data worker (pid 5, 6) ended without a word at step 7",
+            "a data worker (pid 5, 6) ended without an error message at step 7",
             "a crash below Python",
             "python -X faulthandler",
         ),
@@ -179,7 +179,7 @@ def test_a_data_worker(text, what, cause, advice):
     assert told.what == what
     assert cause in told.cause
     assert advice in told.next
-    assert told.next.endswith("then go on with --resume auto: checkpoints are as they were")
+    assert told.next.endswith("then resume with --resume auto: checkpoints are as they were")
 
 
 class Deadly(TinyDataset):

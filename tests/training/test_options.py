@@ -42,7 +42,7 @@ def runner(**settings):
         ({"mixed_precision_dtype": "fp16"}, r"must be in \('bf16',\), got 'fp16'"),
         ({"enable_mixed_precision_training": 1}, "must be true or false, got 1"),
         ({"enable_gradient_checkpointing": "no"}, "must be true or false, got 'no'"),
-        ({"lr_scheduler_type": "cosine"}, "lr_scheduler_type: lr_scheduler_type 'cosine' is none"),
+        ({"lr_scheduler_type": "cosine"}, "lr_scheduler_type: unknown lr_scheduler_type 'cosine'"),
         ({"lr_schedule": {0: 1e-4}}, "lr_schedule belongs to lr_scheduler_type 'step-based'"),
     ],
 )

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from fluxvla_core.checkpoints import owner
+from fluxvla_core.checkpoints import lock
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.errors import CheckpointError, RunFailed, UsageError
 from fluxvla_core.testing.training import (
@@ -36,7 +36,7 @@ def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
         make(tmp_path).run_setup(37)
     assert str(caught.value) == (
         f"{tmp_path} already has checkpoints, up to step-000000006\n"
-        "  next: go on from there with --resume auto, or name another --work-dir"
+        "  next: resume from there with --resume auto, or name another --work-dir"
     )
     run(tmp_path / "other")
     with pytest.raises(UsageError, match="already has checkpoints"):
@@ -260,7 +260,7 @@ def test_the_rate_follows_the_part_of_the_epochs_that_is_done(tmp_path, before, 
 
 def other_run(work_dir, left):
     """In another process: what becomes of what ``left`` is while this one trains, and after."""
-    owner.PATIENCE_S = 0.0
+    lock.PATIENCE_S = 0.0
     try:
         make(work_dir, "auto").run_setup(37)
     except UsageError as error:

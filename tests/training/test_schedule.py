@@ -68,7 +68,7 @@ def test_step_based_changes_at_the_very_step(percent):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kind": "cosine"}, "lr_scheduler_type 'cosine' is none of 'constant'"),
+        ({"kind": "cosine"}, "unknown lr_scheduler_type 'cosine'; choose one of 'constant'"),
         ({"kind": "constant", "warmup_ratio": 1.0}, "warmup_ratio must be at least 0 and below 1"),
         ({"kind": "step-based"}, "lr_schedule belongs to lr_scheduler_type 'step-based'"),
         ({"kind": "wsd", "lr_schedule": {0: 1}}, "lr_schedule belongs to lr_scheduler_type"),

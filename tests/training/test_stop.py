@@ -86,7 +86,7 @@ def test_how_a_stopped_run_ends():
     assert str(error) == (
         "training was stopped by SIGTERM\n"
         "  likely cause: all is saved: step 3 in work\n"
-        "  next: go on with the same command and --resume auto"
+        "  next: run the same command again with --resume auto"
     )
 
 

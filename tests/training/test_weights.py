@@ -19,8 +19,8 @@ from fluxvla_core.training.weights import (
     check_model_tensors,
     left_out,
     load_for_inference,
-    model_tensors,
     put_model_tensors,
+    weights_by_name,
 )
 from tests.training.runs import run
 
@@ -47,7 +47,7 @@ class Model(nn.Module):
 
 def checkpoint(tmp_path, model, without, ema=None):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
-        tensors = model_tensors(model, without.names)
+        tensors = weights_by_name(model, without.names)
         TensorFile.whole("model.safetensors", tensors, True).write(writer)
         if ema is not None:
             TensorFile.whole("ema.safetensors", ema.shadow, True).write(writer)
@@ -106,7 +106,7 @@ def test_frozen_weights_of_another_version_are_refused(tmp_path):
 def test_weights_of_another_model_are_refused():
     """T3 of the field notes: a wrong checkpoint resumed silently."""
     model = Model()
-    tensors = {**model_tensors(model), "head.weight": torch.zeros(9, 4)}
+    tensors = {**weights_by_name(model), "head.weight": torch.zeros(9, 4)}
     del tensors["scale"]
     with pytest.raises(
         CheckpointError, match=r"1 missing in the checkpoint: scale\n.*head\.weight"
@@ -123,7 +123,7 @@ def test_state_that_is_no_tensor_is_refused():
             return
 
     with pytest.raises(CheckpointError, match="holds other than tensors: _extra_state"):
-        model_tensors(Odd(1, 1))
+        weights_by_name(Odd(1, 1))
 
 
 def test_averages_follow_the_weights_and_act_in_their_place(tmp_path):

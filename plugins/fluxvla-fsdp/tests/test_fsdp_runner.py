@@ -41,7 +41,9 @@ def build(work_dir, **settings):
 
 
 def test_an_unknown_strategy_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="sharding_strategy 'full' is none of 'full-shard'"):
+    with pytest.raises(
+        ConfigError, match="unknown sharding_strategy 'full'; choose one of 'full-shard'"
+    ):
         build(tmp_path, sharding_strategy="full")
 
 

@@ -1,1 +1,1 @@
-"""Checkpoints: written so that a kill loses nothing, summed so that a flipped bit is found."""
+"""Checkpoints: written atomically, so that a kill loses nothing; SHA-256 finds a flipped bit."""

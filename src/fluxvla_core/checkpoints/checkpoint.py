@@ -34,9 +34,9 @@ from fluxvla_core.checkpoints.manifest import (
     hash_file,
     read_manifest,
     step_name,
+    step_of,
 )
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.checkpoints.manifest import step_of as step_of
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.untrusted import parse_json, read_bytes
 
@@ -87,7 +87,7 @@ class Checkpoint:
     def open(cls, path: str | Path) -> Checkpoint:
         """Read the manifest in ``path``; a work dir or its checkpoints folder gives its newest.
 
-        Sizes and sums are looked at by :meth:`verify`, not here.
+        Sizes and hashes are checked by :meth:`verify`, not here.
 
         Raises:
             CheckpointError: there is nothing, no folder, no manifest, or a damaged one.

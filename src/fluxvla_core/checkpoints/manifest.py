@@ -1,6 +1,6 @@
-"""A checkpoint folder's name, and the list of its files with their sizes and SHA-256 sums.
+"""A checkpoint folder's name, and the list of its files with their sizes and SHA-256.
 
-A folder without a readable manifest is no checkpoint. The manifest carries a sum of itself, so
+A folder without a readable manifest is no checkpoint. The manifest carries a hash of itself, so
 that a flipped bit in it is not taken for damage of the file that it describes.
 """
 
@@ -57,7 +57,7 @@ class Manifest:
     files: Mapping[str, FileEntry]
 
     def to_bytes(self) -> bytes:
-        """JSON with a sum of the rest of it under ``sha256``."""
+        """JSON with a SHA-256 of the rest of it under ``sha256``."""
         body: dict[str, Any] = {
             "format": FORMAT,
             "step": self.step,
@@ -89,7 +89,7 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / NAME
     if not os.path.lexists(path):
-        raise CheckpointError(f"{NAME} is missing, so this is no checkpoint", where=str(folder))
+        raise CheckpointError(f"{NAME} is missing, so this is not a checkpoint", where=str(folder))
     try:
         content = read_bytes(path, CheckpointError, at_most=_LARGEST)
     except CheckpointError as error:
@@ -125,7 +125,7 @@ def _check_inside(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         parts = name.split("/")
         if {"", ".", ".."} & set(parts) or "\0" in name or "\\" in name:
-            why = "is no path inside the checkpoint's folder"
+            why = "is not a path inside the checkpoint's folder"
         elif os.path.commonpath([root, os.path.realpath(os.path.join(root, *parts))]) != root:
             why = "leads out of the checkpoint's folder by a symbolic link"
         else:

@@ -1,10 +1,10 @@
-"""Which part of a sharded tensor this rank holds, and reading any part back from saved ones.
+"""Parts of sharded tensors: which one this rank holds, and reading any part of saved ones.
 
 Each rank saves its own parts of the optimizer's state in a safetensors file, with the place of
 each part in its header, in the layout that torch.distributed.checkpoint's
 ``HuggingFaceStorageReader`` reads (torch/distributed/checkpoint/hf_storage.py). DCP's own writer
 is not used: its default one pickles the metadata and its safetensors one forms each file in
-memory as a whole, and neither can be summed, flushed and failed one operation at a time.
+memory as a whole, and neither can be hashed, flushed and failed one operation at a time.
 """
 
 from __future__ import annotations

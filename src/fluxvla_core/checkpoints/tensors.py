@@ -2,7 +2,7 @@
 
 The format (https://huggingface.co/docs/safetensors, 'Format'): eight bytes little-endian header
 length, a JSON header ``{name: {dtype, shape, data_offsets}}``, then the raw little-endian bytes.
-It is written here rather than by the library so that tensors can be gathered, summed and written
+It is written here rather than by the library so that tensors can be gathered, hashed and written
 one by one: no process ever holds a second copy of the model.
 """
 

@@ -45,7 +45,7 @@ class CheckpointWriter:
         rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
             by :meth:`report` and :meth:`join`.
         final: another folder than that of the step.
-        what, go_on: what is written, and how to go on where it cannot be, for the message; by
+        what, go_on: what is written, and how to continue where it cannot be, for the message; by
             default a training's checkpoint.
     """
 
@@ -190,7 +190,7 @@ class CheckpointWriter:
             f"the disk is full: {what}" if full else f"{what}: {error}",
             where=str(self.final),
             cause=f"{error.strerror}, or a quota or a limit on file sizes" if full else None,
-            next=f"{'make room' if full else 'mend the disk or the folder'}, then {self._go_on}",
+            next=f"{'make room' if full else 'fix the disk or the folder'}, then {self._go_on}",
         )
 
     def _put_in_place(self) -> None:
@@ -212,7 +212,7 @@ class CheckpointWriter:
 
 
 class HashedFile:
-    """One file of a checkpoint; its size and sum are known when it is closed."""
+    """One file of a checkpoint; its size and hash are known when it is closed."""
 
     def __init__(self, writer: CheckpointWriter, name: str) -> None:
         self._writer, self._name = writer, name
@@ -310,7 +310,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def free_name(path: Path) -> Path:
-    """A free name beside ``path`` that no reader takes for a checkpoint."""
+    """A free name next to ``path`` that no reader takes for a checkpoint."""
     number, free = 1, path.with_name(path.name + ".set-aside")
     while free.exists():
         number += 1

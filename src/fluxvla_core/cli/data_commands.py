@@ -103,14 +103,20 @@ class Convert:
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument(
-            "sources", metavar="DIR", nargs="+", help="an older dataset, or recordings; stay"
+            "sources",
+            metavar="DIR",
+            nargs="+",
+            help="an older dataset, or recordings; they are not changed",
         )
         parser.add_argument("out", metavar="OUT", help="the new dataset's folder")
         parser.once(
-            "--fps", type=float, metavar="HZ", help="of recordings; default: the robot's rate"
+            "--fps",
+            type=float,
+            metavar="HZ",
+            help="frame rate for recordings (default: the robot's rate)",
         )
         parser.add_argument(
-            "--successes", action="store_true", help="of recordings: those that succeeded, only"
+            "--successes", action="store_true", help="only recordings that succeeded"
         )
         _log_format(parser)
 
@@ -157,7 +163,9 @@ class Finish:
 
 
 def _log_format(parser: Parser) -> None:
-    parser.once("--log-format", choices=("text", "json"), default="text", help="of the progress")
+    parser.once(
+        "--log-format", choices=("text", "json"), default="text", help="format of progress messages"
+    )
 
 
 @contextmanager
@@ -186,17 +194,29 @@ class Collect:
         parser.once(
             "--policy", default="expert", metavar="TYPE", help="one of fluxvla.policies, or expert"
         )
-        parser.once("--episodes", type=positive, required=True, metavar="N", help="how many")
+        parser.once(
+            "--episodes", type=positive, required=True, metavar="N", help="number of episodes"
+        )
         parser.once("--out", required=True, metavar="DIR", help="the dataset to make")
-        parser.once("--tasks", nargs="+", metavar="NAME", help="all of the environment's")
-        parser.once("--seed", type=int, default=10_000, help="of the first episode: 10000")
-        parser.once("--cameras", nargs="+", metavar="NAME", help="all of the environment's")
-        parser.once("--height", type=positive, help="of the pictures; the cameras' own")
-        parser.once("--width", type=positive, help="of the pictures; the cameras' own")
-        parser.once("--workers", type=positive, default=2, metavar="N", help="default 2")
-        parser.add_argument("--resume", action="store_true", help="go on with an interrupted one")
+        parser.once("--tasks", nargs="+", metavar="NAME", help="tasks to record (default: all)")
+        parser.once(
+            "--seed", type=int, default=10_000, help="seed of the first episode (default 10000)"
+        )
+        parser.once("--cameras", nargs="+", metavar="NAME", help="cameras to record (default: all)")
+        parser.once(
+            "--height", type=positive, help="height of the images in pixels (default: the camera's)"
+        )
+        parser.once(
+            "--width", type=positive, help="width of the images in pixels (default: the camera's)"
+        )
+        parser.once(
+            "--workers", type=positive, default=2, metavar="N", help="worker processes (default 2)"
+        )
         parser.add_argument(
-            "--failures", action="store_true", help="keep what did not succeed, too"
+            "--resume", action="store_true", help="continue an interrupted collection"
+        )
+        parser.add_argument(
+            "--failures", action="store_true", help="also keep episodes that failed"
         )
         parser.add_argument(
             "--set",
@@ -207,7 +227,12 @@ class Collect:
             help="an argument: env.NAME=VALUE or policy.NAME=VALUE (a TOML value); repeatable",
         )
         add_plugin_files(parser)
-        parser.once("--log-format", choices=("text", "json"), default="text", help="of progress")
+        parser.once(
+            "--log-format",
+            choices=("text", "json"),
+            default="text",
+            help="format of progress messages",
+        )
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.evaluation.collect import Collection
@@ -246,7 +271,7 @@ def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> 
         )
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(
-            "finished episodes are kept\n  next: go on with the same command and --resume"
+            "finished episodes are kept\n  next: run the same command again with --resume"
         ) from error
     finally:
         reporter.close()

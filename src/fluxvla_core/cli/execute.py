@@ -1,4 +1,4 @@
-"""One section of a config, run in this process, and what it leaves in its work dir."""
+"""Run one section of a config in this process, and write the records in its work dir."""
 
 from __future__ import annotations
 
@@ -74,10 +74,10 @@ def _claimed(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
     """A training has its work dir for itself, from before it leaves the first file there."""
     if not plan.trains:
         return nullcontext()
-    from fluxvla_core.checkpoints.owner import claim
+    from fluxvla_core.checkpoints.lock import lock_work_dir
 
     plan.work_dir.mkdir(parents=True, exist_ok=True)
-    return closing(claim(plan.work_dir, reporter.warn))
+    return closing(lock_work_dir(plan.work_dir, reporter.warn))
 
 
 def _run_section(
@@ -154,7 +154,7 @@ def remove_folders(made: list[Path]) -> None:
 
 def _remove_records(folder: Path) -> None:
     """Remove a folder in which nothing is but what every run leaves as it begins."""
-    from fluxvla_core.checkpoints.owner import LOCK
+    from fluxvla_core.checkpoints.lock import LOCK
     from fluxvla_core.config.snapshot import ENVIRONMENT_FILE
 
     inside = list(folder.iterdir()) if folder.is_dir() else []

@@ -173,7 +173,7 @@ def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed |
     return RunFailed(
         f"{silent} of {nproc} ranks were killed, or had not begun, when they were to stop and save",
         cause=f"saving took longer than --grace {grace} (seconds)",
-        next=f"{left}: go on with the same command and --resume auto",
+        next=f"{left}: run the same command again with --resume auto",
     )
 
 
@@ -189,7 +189,7 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
         # SIGTERM came from us, and so did SIGKILL to one that did not answer it in time.
         late = process.exitcode == -signal.SIGKILL and now - first >= _STOP_S
         ours = late or process.exitcode == -signal.SIGTERM
-        text = f"ended without a word: {_ending(process.exitcode)}"
+        text = f"ended without an error message: {_ending(process.exitcode)}"
         if process.exitcode == -signal.SIGKILL:
             text += (
                 "\n  likely cause: this machine, or its container, ran out of memory (see "
@@ -200,7 +200,7 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
                 "\n  likely cause: a crash below Python; python -X faulthandler shows where, or "
                 "somebody sent it the signal"
             )
-        text += "\n  next: go on with the same command and --resume auto"
+        text += "\n  next: run the same command again with --resume auto"
         found.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=ours, silent=True))
     return found
 

@@ -77,9 +77,7 @@ COMMANDS: Mapping[str, Entry] = {
     "eval compare": Entry(
         "fluxvla_core.cli.policy_commands:Compare", "compare two evaluations, pair by pair"
     ),
-    "export": Entry(
-        "fluxvla_core.cli.policy_commands:Export", "write what acts of a checkpoint into a folder"
-    ),
+    "export": Entry("fluxvla_core.cli.policy_commands:Export", "export a checkpoint for inference"),
     "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
 }
 """Name -> where the command is and its help line, so that only one is imported."""

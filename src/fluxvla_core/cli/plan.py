@@ -1,4 +1,4 @@
-"""What ``fluxvla run`` is going to do, decided and checked before anything heavy is imported."""
+"""The plan of ``fluxvla run``: decided and checked before anything heavy is imported."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
         if type_key(wanted) in {problem.key for problem in checked.problems}:
             raise checked.error()  # without its plugin nothing shows that it is a runner's table
         if wanted in config.tree:
-            what = f"section {wanted!r} cannot be run: it is no table whose type is a runner"
+            what = f"section {wanted!r} cannot be run: it is not a table whose type is a runner"
         else:
             near = nearest(wanted, names)
             what = f"no section {wanted!r}" + (f"; did you mean {near!r}?" if near else "")
@@ -154,15 +154,16 @@ def default_work_dir(file: Path, sections: Collection[str] = ()) -> Path:
 def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
     """A training must not land among the checkpoints of another.
 
-    Here and not only where it begins: a restart would go on from whatever lies there.
+    Here and not only where it begins: a restart would continue from whatever lies there.
 
     Args:
-        resume: what it goes on from: ``auto``, a path, or None for nothing.
+        resume: the checkpoint to resume from: ``auto``, a path, or None for nothing.
 
     Raises:
         UsageError: there are checkpoints, with both ways on.
     """
-    from fluxvla_core.checkpoints.checkpoint import folders, step_of
+    from fluxvla_core.checkpoints.checkpoint import folders
+    from fluxvla_core.checkpoints.manifest import step_of
 
     if resume == "auto":
         return
@@ -174,5 +175,5 @@ def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
         raise UsageError(
             f"the work dir already holds checkpoints, up to step {step_of(found[-1])}",
             where=str(work_dir),
-            next="go on from there: --resume auto; or begin anew elsewhere: --work-dir DIR",
+            next="resume from there: --resume auto; or use another folder: --work-dir DIR",
         )

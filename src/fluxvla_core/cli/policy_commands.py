@@ -1,4 +1,4 @@
-"""What is done with trained policies: ``fluxvla eval compare`` and ``fluxvla export``."""
+"""Commands for trained policies: ``fluxvla eval compare`` and ``fluxvla export``."""
 
 from __future__ import annotations
 
@@ -38,13 +38,15 @@ class Compare:
 class Export:
     api = "1.0"
     help = (
-        "Write what acts of a checkpoint into a folder of its own: all weights in one safetensors "
+        "Export a checkpoint for inference into a new folder: all weights in one safetensors "
         "file, adapters merged, with config, statistics, robot and processors."
     )
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument(
-            "checkpoint", metavar="CHECKPOINT", help="its folder, or a work dir for its newest one"
+            "checkpoint",
+            metavar="CHECKPOINT",
+            help="a checkpoint's folder, or a work dir for its newest one",
         )
         parser.add_argument("folder", metavar="DIR", help="the folder to make")
 

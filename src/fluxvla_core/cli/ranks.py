@@ -45,10 +45,10 @@ def attempt() -> int:
 
 
 def resume_from(asked: str | None, work_dir: Path) -> str | None:
-    """What a training goes on from: ``--resume``, and after a restart what there is by then.
+    """What a training resumes from: ``--resume``, and after a restart what there is by then.
 
     That only where this job had begun: an attempt that was refused is refused again, and does not
-    go on with what others left.
+    continue with what others left.
     """
     if attempt() == 0 or not _started_here(work_dir):
         return asked
@@ -114,7 +114,7 @@ def restart_notice() -> list[str]:
     """What to report first after a restart: which one it is, and why there was need for one."""
     if attempt() == 0:
         return []
-    why = "a process ended without a word"
+    why = "a process ended without an error message"
     if launched():
         folder = Path(os.environ[ERROR_DIR])
         said = failures(folder, attempt() - 1)
@@ -125,7 +125,8 @@ def restart_notice() -> list[str]:
             first = root_cause(found)
             why = f"rank {first.rank} failed:\n{first.text.rstrip()}"
         elif silent:
-            why = f"rank {', '.join(silent)} ended without a word: killed, or crashed below Python"
+            listed = ", ".join(silent)
+            why = f"rank {listed} ended without an error message: killed, or crashed below Python"
     return [f"restart {attempt()}: {why}"]
 
 

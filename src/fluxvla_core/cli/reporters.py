@@ -23,7 +23,7 @@ class RunReporter(Reporter):
     """A reporter of the command line: one that is closed, so that the terminal stays usable."""
 
     def still_working(self, what: str, seconds: float) -> None:
-        """Nothing was reported for ``seconds`` since ``what``, and the work goes on."""
+        """Nothing was reported for ``seconds`` since ``what``, and the work continues."""
 
     def end_silence(self) -> None:
         """Something is reported again."""

@@ -32,7 +32,7 @@ def escape(text: str) -> str:
 
 
 class Left(ProgressColumn):
-    """``5:12 left``; what it took at the end; how long it goes on where nobody knows the end."""
+    """``5:12 left``; what it took at the end; how long it has taken where nobody knows the end."""
 
     def render(self, task: Task) -> Text:
         if task.total is None or task.finished:
@@ -86,7 +86,7 @@ class RichReporter(RunReporter):
         )
 
     def still_working(self, what: str, seconds: float) -> None:
-        """Nothing was said for ``seconds`` since ``what``, and the work goes on."""
+        """Nothing was said for ``seconds`` since ``what``, and the work continues."""
         if self._silence is None:
             self._bars.start()
             self._silence = self._bars.add_task("working", total=None, beside="")

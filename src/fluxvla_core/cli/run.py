@@ -46,7 +46,7 @@ class Run:
         add_overrides(parser)
         parser.once("--work-dir", metavar="DIR", help="default: work_dirs/<name of the config>")
         parser.once(
-            "--resume", metavar="auto|PATH", help="go on from the newest, or this, checkpoint"
+            "--resume", metavar="auto|PATH", help="resume from the newest checkpoint, or from PATH"
         )
         parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
         parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
@@ -151,7 +151,7 @@ class Run:
 
 @contextmanager
 def _resume_hint(plan: Plan) -> Iterator[None]:
-    """Ctrl-C says what is kept, and how the work goes on."""
+    """Ctrl-C says what is kept, and how to continue."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -160,10 +160,10 @@ def _resume_hint(plan: Plan) -> Iterator[None]:
         (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
         said = str(error)
         if plan.trains:
-            way = "go on with the same command and --resume auto"
+            way = "run the same command again with --resume auto"
         elif signature is not None and "episodes" in signature.names:
             said = said or "finished episodes are kept"
-            way = "go on with the same command"
+            way = "run the same command again"
         else:
             raise
         raise KeyboardInterrupt(f"{said}\n  next: {way}" if said else way) from error
@@ -204,7 +204,7 @@ def _check_options(args: argparse.Namespace, plan: Plan) -> None:
 
 
 def _divides(plan: Plan) -> bool:
-    """Whether the section's runner trains or has ``workers``, or may have, for all one can read."""
+    """Whether the section's runner trains or has ``workers``, or its signature is unreadable."""
     (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
     if plan.trains or signature is None or signature.open:
         return True

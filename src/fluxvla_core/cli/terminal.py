@@ -1,4 +1,4 @@
-"""What commands print: no traceback of its own, and no escapes of others."""
+"""Print to a terminal: messages without tracebacks, and escape sequences made harmless."""
 
 from __future__ import annotations
 

@@ -298,7 +298,7 @@ def _unmet(text: str) -> str | None:
     try:
         requirement = Requirement(text)
     except InvalidRequirement as error:
-        return f"{text!r} is no requirement (PEP 508): {str(error).splitlines()[0]}"
+        return f"{text!r} is not a requirement (PEP 508): {str(error).splitlines()[0]}"
     if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
         return None
     have = version(requirement.name)

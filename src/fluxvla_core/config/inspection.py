@@ -1,4 +1,4 @@
-"""What the constructor of a loaded class takes, and which values do not fit its annotations."""
+"""Constructor arguments of loaded classes, and values that do not fit their annotations."""
 
 from __future__ import annotations
 

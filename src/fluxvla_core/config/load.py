@@ -130,7 +130,7 @@ def _read(path: Path) -> str:
 
 
 def _base_path(base: str, child: Path, where: str) -> Path:
-    """A file beside ``child``, or ``package:path`` inside an installed plugin (not imported)."""
+    """A file next to ``child``, or ``package:path`` inside an installed plugin (not imported)."""
     package, colon, inside = base.partition(":")
     if not colon or not package.isidentifier():
         path = child.parent / base

@@ -1,4 +1,4 @@
-"""Where each key of a ``.py`` or ``.toml`` config is written: ``file:line``."""
+"""Source positions (``file:line``) of the keys of a ``.py`` or ``.toml`` config."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a ``type`` in a config to the class behind it, statically: nothing is imported."""
+"""Find the class behind a ``type`` in a config, statically: nothing is imported."""
 
 from __future__ import annotations
 

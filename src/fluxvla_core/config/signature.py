@@ -1,4 +1,4 @@
-"""What a class's constructor takes, read from source: nothing is imported.
+"""Constructor signatures, read from source: nothing is imported.
 
 ``**kwargs`` are followed into the constructors of base classes, ``**options`` into the fields of
 the dataclass that the class attribute ``Options`` names; what each parameter means is read from

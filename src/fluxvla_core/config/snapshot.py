@@ -1,4 +1,4 @@
-"""What a run leaves behind so that it can be run again: its config and its environment."""
+"""Snapshots of a run's config and environment, so that it can be run again."""
 
 from __future__ import annotations
 

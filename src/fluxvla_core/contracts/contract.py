@@ -1,4 +1,4 @@
-"""What all contracts have in common, and the one place where classes that inherit none are adapted.
+"""Base class of all contracts, and the one place where classes that inherit none are adapted.
 
 A contract is a base class. Its abstract methods must be there; everything else has a default that
 works. A class may inherit it, or only have its methods: ``Contract.adapt`` makes up for the rest,

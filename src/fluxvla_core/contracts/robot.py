@@ -118,7 +118,7 @@ class Operator(Contract):
         return None
 
     def get_state(self) -> npt.NDArray[np.float64] | None:
-        """The newest ``(state_dim,)`` state alone, at no cost; None where that cannot be had.
+        """The newest ``(state_dim,)`` state alone, at no cost; None where that is not available.
 
         The arm is then watched at every command. Called from the thread that sends commands.
         """

@@ -1,6 +1,6 @@
 """Read and write files of a dataset: parquet, JSON, staging folders; optional packages.
 
-A dataset is written into a staging folder beside it, ``.<name>.writing``, and renamed when it is
+A dataset is written into a staging folder next to it, ``.<name>.writing``, and renamed when it is
 complete. Errors name the file.
 """
 

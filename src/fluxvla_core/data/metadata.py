@@ -12,7 +12,6 @@ Source: LeRobot 0.3 (codebase version v2.1); 2.0 keeps its statistics elsewhere,
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ from fluxvla_core.data.files import (
     whole_numbers,
 )
 from fluxvla_core.data.lerobot import check_info, fill
-from fluxvla_core.errors import DataError
+from fluxvla_core.errors import DataError, nearest
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Ints = npt.NDArray[np.int64]
@@ -183,8 +182,8 @@ class Metadata:
     def hint(self, name: str, known: Sequence[str]) -> str:
         """The end of an error message: ``; did you mean …? there are …``."""
         short = {lerobot.camera_name(k): k for k in known}
-        near = difflib.get_close_matches(lerobot.camera_name(name), short, 1)
-        mean = f"; did you mean {short[near[0]]!r}?" if near else ";"
+        near = nearest(lerobot.camera_name(name), short)
+        mean = f"; did you mean {short[near]!r}?" if near else ";"
         return f"{mean} there are {', '.join(known) or 'none'}"
 
 

@@ -14,7 +14,6 @@ are shifted by it before and after.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LEVELS = 256
@@ -224,8 +223,8 @@ def check_norm_type(norm_type: str, who: str) -> None:
     """
     if norm_type in NORM_TYPES:
         return
-    near = difflib.get_close_matches(str(norm_type), NORM_TYPES, 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(str(norm_type), NORM_TYPES)
+    hint = f"; did you mean {near!r}?" if near else ""
     raise ConfigError(
         f"{who}: norm_type {norm_type!r} is none of {', '.join(NORM_TYPES)}{hint}",
         cause="state_key and action_key select the statistics, norm_type the formula",

@@ -1,6 +1,6 @@
 """``LeRobotWriter``: record a dataset episode by episode; a crash loses at most the current one.
 
-Everything goes into a staging folder beside the dataset, ``.<name>.writing``. An episode is saved
+Everything goes into a staging folder next to the dataset, ``.<name>.writing``. An episode is saved
 once its folder has its final name; the dataset exists once ``finalize`` has renamed the folder.
 """
 
@@ -204,7 +204,7 @@ class LeRobotWriter:
             raise DataError(
                 f"{self.root}: a recording was interrupted, or is under way: "
                 f"{len(saved)} saved episodes in {self._staging}",
-                next="LeRobotWriter(..., recover=True) goes on with them; or delete that folder",
+                next="LeRobotWriter(..., recover=True) continues with them; or delete that folder",
             )
         if saved:
             before = read_json(self._staging / _RECORDING)

@@ -1,4 +1,4 @@
-"""What is installed, from one scan of the distributions' metadata; nothing of theirs is imported.
+"""Index of installed entry points, from one scan of metadata; nothing of theirs is imported.
 
 ``.dist-info`` folders are read here: to import ``importlib.metadata``, which brings ``email``,
 takes as long as all the rest of ``fluxvla plugins list``. It reads what else there may be (an

@@ -64,7 +64,7 @@ def problems(
 
 
 def in_one_line(error: PluginError) -> str:
-    """What is wrong, and what mends it."""
+    """What is wrong, and how to fix it."""
     return error.what + (f"; {error.next}" if error.next else "")
 
 

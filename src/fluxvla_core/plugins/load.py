@@ -1,4 +1,4 @@
-"""From a name to a class: find the one plugin that provides it, check it, import it.
+"""Load a plugin class by name: find the one plugin that provides it, check it, import it.
 
 Also where a module's source file is, for those who read it and import nothing.
 """

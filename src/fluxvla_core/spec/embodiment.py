@@ -257,7 +257,7 @@ def check_match(
     who_b: str,
     cameras: Iterable[str] | None = None,
 ) -> None:
-    """Refuse to go on when ``a`` and ``b`` mean different things by the same numbers.
+    """Raise an error when ``a`` and ``b`` mean different things by the same numbers.
 
     Args:
         cameras: names that ``a`` needs and ``b`` must have; all of ``a``'s by default.
@@ -275,5 +275,5 @@ def check_match(
         raise SpecMismatch(
             f"{who_a} ({a.name}) and {who_b} ({b.name}) do not fit together:\n{lines}",
             cause="they were made for different robots or conventions",
-            next="use a checkpoint trained for this robot, or mend the spec that is wrong",
+            next="use a checkpoint trained for this robot, or fix the spec that is wrong",
         )

@@ -147,8 +147,8 @@ class BaseTrainRunner(Strategy):
         if self.world.first:
             self.metric.finalize()
         self.hooks.call("run_finished", outcome=outcome)
-        if self._claim is not None:
-            self._claim.close()
+        if self._work_dir_lock is not None:
+            self._work_dir_lock.close()
         distributed.stop(self.world, failed=outcome == "failed")
 
     def run_setup(self, n_train_examples: int) -> None:
@@ -235,21 +235,21 @@ class BaseTrainRunner(Strategy):
     def _prepare(self) -> None:
         """Join the other ranks, take over the work dir, choose a checkpoint to resume from."""
         from fluxvla_core.training import distributed
-        from fluxvla_core.training.resuming import choose, take_over
+        from fluxvla_core.training.resuming import choose_checkpoint, lock_on_first
 
         if self._world is not None:
             return
         self._world = distributed.start(self.options.device, self.needs_process_group)
-        self._claim = take_over(self._world, self.context)
+        self._work_dir_lock = lock_on_first(self._world, self.context)
         configured = self.options.resume_from
         wanted = self.context.resume or configured
-        self._checkpoint = choose(self._world, self.context, wanted, first=configured)
+        self._checkpoint = choose_checkpoint(self._world, self.context, wanted, first=configured)
 
     def check_work_dir(self) -> None:
-        """See that the work dir is still this run's; the first rank has the claim.
+        """See that the work dir is still this run's; the first rank has the lock.
 
         Raises:
             RunFailed: it was removed, moved or replaced.
         """
-        if self._claim is not None:
-            self._claim.check()
+        if self._work_dir_lock is not None:
+            self._work_dir_lock.check()

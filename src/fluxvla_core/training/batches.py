@@ -105,7 +105,7 @@ class StepPlan:
 
 
 def episode_shards(dataset: Any, together: int | None, where: str | None) -> EpisodeShards | None:
-    """How ``shuffle_episodes`` cuts ``dataset``: so many episodes ``together``, or not at all.
+    """How ``shuffle_episodes`` cuts ``dataset``: ``together`` episodes at a time, or not at all.
 
     Raises:
         ConfigError: the dataset does not say where its episodes end.

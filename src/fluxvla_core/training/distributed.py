@@ -234,10 +234,10 @@ def on_first(world: World, work: Callable[[], str]) -> str:
 
 
 def share_buffers(world: World, model: nn.Module) -> None:
-    """Let all ranks have the first one's saved buffers; for a strategy's ``_update`` to end with.
+    """Copy the first rank's saved buffers to all; a strategy's ``optimizer_step`` ends with it.
 
     Each rank changes them by its own batches (batch-norm statistics, a running normaliser), and a
-    run goes on with the first one's. Once the step is done they are the same for what may come
+    run continues with the first one's. Once the step is done they are the same for what may come
     next: another step, a validation, a checkpoint. DDP does so by itself.
     """
     if world.size == 1:
@@ -268,6 +268,6 @@ def explain(error: Exception, world: World, step: int) -> RunFailed | None:
         cause="another process of this run ended; its own message says why ("
         + str(error).strip().splitlines()[0][:200]
         + ")",
-        next="mend what that message names, then run the same command with --resume auto",
+        next="fix what that message names, then run the same command with --resume auto",
         reason="rank lost",
     )

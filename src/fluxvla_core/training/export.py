@@ -1,6 +1,6 @@
 """A checkpoint without what only training needs: for evaluation, servers and robots.
 
-The result is a checkpoint folder in every respect (manifest, sums, ``load_policy``), with all
+The result is a checkpoint folder in every respect (manifest, hashes, ``load_policy``), with all
 weights in one plain safetensors file: the averaged ones in their place if they were kept, adapters
 merged, frozen parts that the model would bring itself included. Optimizer, random states and the
 config's ``runner`` are left out, so that no training plugin is needed where it is used.
@@ -18,7 +18,7 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError, UsageError
-from fluxvla_core.training.weights import LeftOut, load_for_inference, model_tensors
+from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
 from fluxvla_core.untrusted import read_bytes
 
 TRAINING_ONLY = ("runner", "val_dataloader")
@@ -27,7 +27,7 @@ _COPIED = (ckpt.POLICY, ckpt.EMBODIMENT, ckpt.STATISTICS, ckpt.ENVIRONMENT)
 
 
 def export(source: str | Path, target: str | Path) -> Path:
-    """Write what acts of the checkpoint ``source`` into the new folder ``target``.
+    """Export the checkpoint ``source`` for inference into the new folder ``target``.
 
     Args:
         source: a checkpoint's folder, or a work dir, whose newest one is taken.
@@ -71,7 +71,7 @@ def export(source: str | Path, target: str | Path) -> Path:
         what="the export",
         go_on="export again, or name a folder on another disk; the checkpoint is as it was",
     ) as writer:
-        TensorFile.whole(ckpt.MODEL, model_tensors(model), True).write(writer)
+        TensorFile.whole(ckpt.MODEL, weights_by_name(model), True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, {**config, "config": tree, "origins": origins})
         for name in sorted(checkpoint.manifest.files):
@@ -81,7 +81,7 @@ def export(source: str | Path, target: str | Path) -> Path:
 
 
 def _verified(checkpoint: Checkpoint, name: str) -> bytes:
-    """What is copied is what its sum says, even if the file changes while this runs.
+    """What is copied is what its hash says, even if the file changes while this runs.
 
     Raises:
         CheckpointError: it is not.

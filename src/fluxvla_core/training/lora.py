@@ -2,19 +2,18 @@
 
 peft puts its layers into the model in place, so that it stays the class that it is. What is
 trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the base stays where
-``init_from`` says that it came from, and a sum in the checkpoint proves that it is still the same.
+``init_from`` says that it came from, and a hash in the checkpoint proves that it is still the same.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -72,8 +71,8 @@ class LoraOptions:
             raise ConfigError(f"lora must be a table, got {table!r}", where=where)
         for key in table:
             if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
+                near = nearest(str(key), known)
+                hint = f"did you mean {near!r}?" if near else f"it has {', '.join(known)}"
                 raise ConfigError(f"lora has no {key!r}; {hint}", where=where)
         lacking = [key for key in ("rank", "target_modules") if key not in table]
         if lacking:

@@ -43,7 +43,7 @@ _LESS_HOST = (
     "train_dataloader.per_device_batch_size=…, or --set "
     "train_dataloader.dataset.cache_frames=false"
 )
-_GO_ON = "then go on with --resume auto: checkpoints are as they were"
+_GO_ON = "then resume with --resume auto: checkpoints are as they were"
 
 
 def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
@@ -109,9 +109,8 @@ def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFai
         cause = "this machine, or its container, ran out of memory (see dmesg)"
         advice = _LESS_HOST
     else:
-        what = (
-            f"a data worker{pid} {f'ended: {ending}' if ending else 'ended without a word'}{when}"
-        )
+        how = f"ended: {ending}" if ending else "ended without an error message"
+        what = f"a data worker{pid} {how}{when}"
         cause = "a crash below Python, as in a video decoder, or it was killed from outside"
         advice = (
             "run with --set train_dataloader.per_device_num_workers=0 and python -X faulthandler "

@@ -30,7 +30,7 @@ class VLAMetric(Metric):
         run_id: the name that trackers show; the work dir's name by default. Which run of theirs
             goes on when this one does is kept in ``run_dir``.
         hparams: what is recorded as the run's settings; the config by default.
-        window_size: the ``loss`` of a record is the mean over so many steps; with more than one,
+        window_size: the ``loss`` of a record is the mean over N steps; with more than one,
             ``loss_raw`` is the step's own.
         grad_accumulation_steps: recorded with the settings; the runner's losses are already
             averaged over the batches of a step.

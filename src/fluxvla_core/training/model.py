@@ -1,4 +1,4 @@
-"""What training does with a model: its blocks, its forward arguments and its loss."""
+"""The model in training: its blocks, its forward arguments and its loss."""
 
 from __future__ import annotations
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.resolve import LOADER_KEYS
-from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.errors import ConfigError, Problem, nearest
 from fluxvla_core.training.lora import LoraOptions, check_installed
 from fluxvla_core.training.schedule import make_schedule
 
@@ -43,15 +42,15 @@ class TrainOptions:
     optimizer: Any = None
     """table of ``fluxvla.optimizers``; ``AdamW`` if None."""
     save_epoch_interval: int = 1
-    """epoch-based runs save after every so many epochs."""
+    """epoch-based runs save every N epochs."""
     save_iter_interval: int | None = None
-    """save every so many steps; 10000 in step-based runs that say nothing, only by epochs in
+    """save every N steps; 10000 in step-based runs that say nothing, only by epochs in
     epoch-based ones. The end of a run is always saved."""
     max_keep_ckpts: int = 2
     """newest checkpoints (by step) to keep; 0 keeps all."""
     async_save: bool = True
-    """write checkpoints beside the training, from a copy in memory; False waits for the disk and
-    needs no copy."""
+    """write checkpoints in the background while training continues, from a copy in memory; False
+    waits for the disk and needs no copy."""
     lr_scheduler_type: str = "constant"
     """``constant``, ``linear-warmup+cosine-decay``, ``step-based``, ``wsd``."""
     lr_schedule: Mapping[Any, float] | None = None
@@ -77,10 +76,10 @@ class TrainOptions:
     ema_decay: float | None = None
     """keep averaged weights too, and act with those; None does not."""
     val_iter_interval: int | None = None
-    """with a ``val_dataloader``: its loss every so many steps and at the end; None with every
+    """with a ``val_dataloader``: its loss every N steps and at the end; None with every
     checkpoint. The best one by it is kept and called ``best``."""
     early_stop_patience: int | None = None
-    """end after so many validations in a row without a better one."""
+    """end after N validations in a row without a better one."""
     seed: int = 42
     """initial weights, order of samples, and everything drawn, also by datasets that set no
     ``seed`` of their own."""
@@ -88,7 +87,7 @@ class TrainOptions:
     """``auto`` or a checkpoint's path; the command line's ``--resume`` goes first, but ``auto`` and
     restarts begin at that path while the work dir has no checkpoint."""
     log_iter_interval: int = 10
-    """fetch losses, and look for NaN, every so many steps; every step is logged all the same."""
+    """fetch losses, and look for NaN, every N steps; every step is logged all the same."""
     device: str = "auto"
     """``auto`` (a GPU if there is one), ``cpu``, ``cuda``."""
     peak_tflops: float | None = None
@@ -191,7 +190,7 @@ class TrainOptions:
 class LoaderOptions:
     """``train_dataloader`` of the config, without its dataset.
 
-    ``shuffle_episodes`` mixes so many episodes at a time; None mixes all samples.
+    ``shuffle_episodes`` mixes N episodes at a time; None mixes all samples.
     """
 
     per_device_batch_size: int
@@ -244,8 +243,8 @@ class LoaderOptions:
         found: list[tuple[str, str]] = []
         for key in table:
             if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+                near = nearest(key, known)
+                hint = f"; did you mean {near!r}?" if near else f"; known: {', '.join(known)}"
                 found.append((key, f"unknown key{hint}"))
         size, workers, together = table.get(known[0]), table.get(known[1], 0), table.get(known[2])
         if not _count(size, 1):

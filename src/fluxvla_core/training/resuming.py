@@ -1,4 +1,4 @@
-"""Choosing the checkpoint that a run goes on from, and refusing one that it cannot go on from."""
+"""Resume a training: choose the checkpoint, and refuse one that does not fit this run."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from fluxvla_core.atomic import prepare_folder
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
     EMA,
@@ -21,9 +22,9 @@ from fluxvla_core.checkpoints.checkpoint import (
     folders,
     newest_whole,
 )
-from fluxvla_core.checkpoints.directory import clear_leftovers, name_best, prepare, set_aside_later
+from fluxvla_core.checkpoints.lock import WorkDirLock, lock_work_dir
 from fluxvla_core.checkpoints.manifest import FOLDER, step_name
-from fluxvla_core.checkpoints.owner import Claim, claim
+from fluxvla_core.checkpoints.retention import clear_leftovers, name_best, set_aside_later
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
@@ -43,36 +44,40 @@ from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_ten
 AUTO = "auto"
 
 
-def take_over(world: World, context: RunContext) -> Claim | None:
+def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
     """Make the work dir's ``checkpoints`` folder, and keep other trainings out; the first rank has
-    the claim.
+    the lock.
 
     Raises:
         UsageError: it cannot be written, or another training is using it.
     """
-    claims: list[Claim] = []
+    locks: list[WorkDirLock] = []
 
     def take() -> str:
-        prepare(context.work_dir)
-        claims.append(claim(context.work_dir, context.reporter.warn))
+        prepare_folder(
+            context.work_dir / FOLDER,
+            "folder of the checkpoints",
+            next="name a folder that can be written: --work-dir DIR",
+        )
+        locks.append(lock_work_dir(context.work_dir, context.reporter.warn))
         return ""
 
     on_first(world, take)
-    return claims[0] if claims else None
+    return locks[0] if locks else None
 
 
-def choose(
+def choose_checkpoint(
     world: World, context: RunContext, resume: str | None, first: str | None = None
 ) -> Checkpoint | None:
-    """The verified checkpoint to go on from, None to start afresh; the same on every rank.
+    """The verified checkpoint to resume from, None to start afresh; the same on every rank.
 
-    Also clears what killed saves left in the work dir, which :func:`take_over` made this run's.
+    Also clears what killed saves left in the work dir, which :func:`lock_on_first` made this run's.
 
     Args:
         resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
             path (refused if damaged), or None (refused if there are checkpoints already).
         first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
-            first save goes on from where the run did.
+            first save starts from where the run did.
 
     Raises:
         CheckpointError: the one at the path is missing or damaged.
@@ -121,14 +126,14 @@ def _refuse_existing(work_dir: Path) -> None:
     if existing:
         raise UsageError(
             f"{work_dir} already has checkpoints, up to {existing[-1].name}",
-            next="go on from there with --resume auto, or name another --work-dir",
+            next="resume from there with --resume auto, or name another --work-dir",
         )
 
 
 def check_same_run(
     saved: Mapping[str, Any], plan: StepPlan, seeds: Sequence[int | None], where: str
 ) -> str | None:
-    """Refuse to go on with other data or another seed; a changed batch or world only is said.
+    """Refuse other data or another seed; a changed batch size or number of processes only warns.
 
     Args:
         saved: ``trainer.json``.
@@ -177,7 +182,7 @@ def _begin_another(checkpoint: str) -> str:
 
 
 def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, where: str) -> None:
-    """Refuse to go on with another adapter than the checkpoint's, or with one, or without.
+    """Raise an error if the LoRA settings differ, or only one of the two runs uses LoRA.
 
     Raises:
         CheckpointError: says both.
@@ -192,7 +197,7 @@ def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, whe
 
 
 def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
-    """Refuse to go on without the averages that the checkpoint has, or with ones it has not.
+    """Raise an error if only one of the two runs keeps averaged weights.
 
     Raises:
         CheckpointError: says which.
@@ -213,7 +218,7 @@ def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
 
 
 def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
-    """Refuse to go on with data that are normalised by other numbers.
+    """Raise an error if the dataset is normalised by other statistics.
 
     Raises:
         CheckpointError: names the statistics that differ.
@@ -267,7 +272,7 @@ def check_settings(
     return saved, (["\n".join([head, *listed])] if listed else []) + ([steps] if steps else [])
 
 
-def model_tensors(
+def load_weights(
     checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
 ) -> dict[str, Tensor]:
     """The checkpoint's weights by name; all fit ``model``.
@@ -286,7 +291,7 @@ def model_tensors(
 
 @contextmanager
 def state_of(what: str, where: str) -> Iterator[None]:
-    """Let what a class raises for a state that it did not write be a CheckpointError."""
+    """Turn errors of ``load_state_dict`` into CheckpointError."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -319,7 +324,7 @@ def forget_missing(
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
     """Give this rank the random states it was saved with, or fresh ones of its own.
 
-    On another number of ranks than before there is none to go on with: each rank then draws from
+    With another number of ranks than before there are none to restore: each rank then draws from
     a state that follows from the seed, its rank and the step.
     """
     if checkpoint is None:
@@ -336,19 +341,19 @@ TABLES = ("model", "train_dataloader", "val_dataloader")
 """What a run, and its best checkpoint, follow from, besides the section that runs."""
 HARMLESS = frozenset(
     {
-        # Where things are. A model's frozen weights are compared by their sum, data by statistics.
+        # Where things are. A model's frozen weights are compared by their hash, data by statistics.
         *("init_from", "resume_from", "device"),
         # How samples are fetched.
         *("per_device_num_workers", "cache_frames"),
         # What is logged and saved, and how often.
         *("metric", "log_iter_interval", "peak_tflops", "val_iter_interval"),
         *("save_epoch_interval", "save_iter_interval", "max_keep_ckpts", "async_save"),
-        "early_stop_patience",  # how long it goes on
+        "early_stop_patience",  # when it ends
         # Samples a step: what they come to together is compared on its own.
         *("per_device_batch_size", "grad_accumulation_steps"),
     }
 )
-"""Keys that may change without a word."""
+"""Keys that may change without a warning."""
 LENGTH = frozenset({"max_epochs", "max_steps"})
 """And those that may where the learning rate does not follow from them."""
 _UNSET = "not set"

@@ -1,4 +1,4 @@
-"""What goes into a checkpoint, and how the ranks write it together."""
+"""Save checkpoints asynchronously: what goes in, and how the ranks write it together."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
-from fluxvla_core.checkpoints.directory import rotate
 from fluxvla_core.checkpoints.parts import is_split, own_parts
+from fluxvla_core.checkpoints.retention import rotate
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT

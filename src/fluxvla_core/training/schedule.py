@@ -39,7 +39,8 @@ def make_schedule(
             rate that is negative or no number.
     """
     if kind not in TYPES:
-        raise ConfigError(f"lr_scheduler_type {kind!r} is none of {', '.join(map(repr, TYPES))}")
+        listed = ", ".join(map(repr, TYPES))
+        raise ConfigError(f"unknown lr_scheduler_type {kind!r}; choose one of {listed}")
     if not 0.0 <= warmup_ratio < 1.0:
         raise ConfigError(f"warmup_ratio must be at least 0 and below 1, got {warmup_ratio}")
     if (kind == "step-based") != (lr_schedule is not None):

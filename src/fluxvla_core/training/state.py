@@ -44,7 +44,7 @@ def rank_seed(seed: int, rank: int, step: int = 0) -> int:
 
 
 def rng_state() -> dict[str, Tensor]:
-    """Everything needed to go on drawing where this process is; sizes are equal on all ranks."""
+    """Everything needed to continue drawing where this process is; sizes are equal on all ranks."""
     version, words, gauss = random.getstate()
     _, key, position, has_gauss, cached = np.random.get_state(legacy=True)
     state = {
@@ -96,7 +96,7 @@ class SavedValidation:
 
 @dataclass(frozen=True)
 class SavedTrainer:
-    """``trainer.json`` as a training that goes on needs it; ``scheduler`` and ``metric`` are what
+    """``trainer.json`` as a resumed training needs it; ``scheduler`` and ``metric`` are what
     those classes made of their state."""
 
     global_step: Count

@@ -117,7 +117,7 @@ def stopped(number: int, place: str) -> BaseException:
     stop: FluxError = RunFailed(
         f"training was stopped by {signal.Signals(number).name}",
         cause=f"all is saved: {place}",
-        next="go on with the same command and --resume auto",
+        next="run the same command again with --resume auto",
         reason="stopped",
     )
     return stop

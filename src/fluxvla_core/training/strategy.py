@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
-    from fluxvla_core.checkpoints.owner import Claim
+    from fluxvla_core.checkpoints.lock import WorkDirLock
     from fluxvla_core.checkpoints.parts import Stored
     from fluxvla_core.data.sampler import EpisodeShards
     from fluxvla_core.training.batches import StepPlan
@@ -74,7 +74,7 @@ class Strategy(TrainRunner):
     late_stop: int = 0
     """The signal that asked for a stop when training was complete: nothing new is to begin."""
     _world: World | None = None
-    _claim: Claim | None = None
+    _work_dir_lock: WorkDirLock | None = None
     _checkpoint: Checkpoint | None = None
     _arguments: ForwardArguments | None = None
     _saver: Saver | None = None
@@ -212,7 +212,7 @@ class Strategy(TrainRunner):
         saved = self._saver.settle(wait) if self._saver is not None else None
         if saved is None or not self.world.first:
             return
-        from fluxvla_core.checkpoints.directory import name_best
+        from fluxvla_core.checkpoints.retention import name_best
 
         for warning in saved.warnings:
             self.context.reporter.warn(warning)
@@ -279,7 +279,7 @@ class Strategy(TrainRunner):
         )
         for warning in warnings if self.world.first else ():
             self.context.reporter.warn(warning)
-        self._load_model_state(resuming.model_tensors(checkpoint, self.model, self.left_out))
+        self._load_model_state(resuming.load_weights(checkpoint, self.model, self.left_out))
         described = checkpoint.json(ckpt.OPTIMIZER_META, SavedOptimizer)
         optimizer = checkpoint.optimizer_tensors()
         if self.load_optimizer_tensors(optimizer, described, where) is False:
@@ -322,9 +322,9 @@ class Strategy(TrainRunner):
 
     def model_tensors(self) -> Mapping[str, Tensor]:
         """Weights and buffers by name, to be saved; parts of them where they are sharded."""
-        from fluxvla_core.training.weights import model_tensors
+        from fluxvla_core.training.weights import weights_by_name
 
-        return model_tensors(self.model)
+        return weights_by_name(self.model)
 
     def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""

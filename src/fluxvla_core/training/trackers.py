@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from fluxvla_core import atomic
 from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 
 Records = Sequence[tuple[int, Mapping[str, float]]]
 """Optimizer steps, in order, each with its values."""
@@ -163,13 +163,12 @@ def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
     Raises:
         ConfigError: names the package.
     """
-    import difflib
     import importlib.util
 
     for name in names:
         if name not in _KINDS:
-            near = difflib.get_close_matches(name, _KINDS, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(_KINDS)}"
+            near = nearest(name, _KINDS)
+            hint = f"did you mean {near!r}?" if near else f"there are {', '.join(_KINDS)}"
             raise ConfigError(f"there is no tracker {name!r}; {hint}", where=where)
         package = _KINDS[name][1]
         if package is not None and importlib.util.find_spec(package) is None:
@@ -181,7 +180,7 @@ def check_trackers(names: tuple[str, ...], where: str | None = None) -> None:
 
 
 class Guarded:
-    """Passes calls on to a tracker until one fails; that is said once, and the run goes on."""
+    """Passes calls on to a tracker until one fails; that is said once, and the run continues."""
 
     def __init__(self, name: str, reporter: Reporter, make: Callable[[], Tracker]) -> None:
         self._name, self._reporter = name, reporter

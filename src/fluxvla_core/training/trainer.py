@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch.distributed as dist
 
-from fluxvla_core.checkpoints.directory import name_best
+from fluxvla_core.checkpoints.retention import name_best
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import make_loader
 from fluxvla_core.hooks import HookCaller

@@ -1,4 +1,4 @@
-"""A model's weights in a checkpoint: which are in it, and whether they are this model's."""
+"""Model weights in a checkpoint: which are in it, and whether they are this model's."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SavedWeights:
 
 
 def left_out(model: nn.Module) -> LeftOut:
-    """What :class:`LeftOut` there is in ``model``; reads those weights once to sum them up."""
+    """What :class:`LeftOut` there is in ``model``; reads those weights once to hash them."""
     sources = frozen_sources(model)
     state = model.state_dict(keep_vars=True)
     # What stands in no part by itself but in the whole model may be a buffer that training changes.
@@ -71,7 +71,7 @@ def left_out(model: nn.Module) -> LeftOut:
     return LeftOut(sources, names, digest.hexdigest() if names else "")
 
 
-def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
+def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
     """Parameters and persistent buffers by name, but for those in ``without``.
 
     Raises:
@@ -90,7 +90,7 @@ def model_tensors(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Te
 
 def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
-    state = model_tensors(model)
+    state = weights_by_name(model)
     # strict=False only for what is left out of checkpoints: names and sizes have been checked.
     model.load_state_dict(
         {name: like(state[name].detach(), tensor) for name, tensor in tensors.items()},
@@ -119,7 +119,7 @@ def check_model_tensors(
     if lora.adapter_names(model):
         _check_base(brings, saved, where)
     check_left_out(brings, saved, where)
-    check_names(tensors, model_tensors(model, brings.names), "the weights", where)
+    check_names(tensors, weights_by_name(model, brings.names), "the weights", where)
 
 
 def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
@@ -183,7 +183,7 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
 
 def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """``tensors``, and tied weights under their other names too: averages have the first alone."""
-    state = model_tensors(model)
+    state = weights_by_name(model)
     known = {id(state[name]): tensor for name, tensor in tensors.items() if name in state}
     others = {name: known[id(own)] for name, own in state.items() if id(own) in known}
     return {**tensors, **others}
@@ -211,7 +211,7 @@ def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None
     """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
 
     Args:
-        before: what the run goes on from; where it is asked for no other base, it keeps that one.
+        before: what the run resumes from; where it is asked for no other base, it keeps that one.
     """
     if before is None:
         return init_from
@@ -231,7 +231,7 @@ def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
 def exact_place(place: str | Path) -> str:
     """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
 
-    Which one is a work dir's newest, or its ``best``, changes while that run goes on.
+    Which one is a work dir's newest, or its ``best``, changes while that run continues.
 
     Raises:
         CheckpointError: there is none.
@@ -248,7 +248,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
 
     Returns:
         The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
-        ``best``, changes while that run goes on.
+        ``best``, changes while that run continues.
 
     Raises:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.
@@ -263,7 +263,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
         raise CheckpointError(f"there are no weights at {path}")
     tensors = read_tensors(path)
     brings = left_out(model).names - set(tensors)
-    check_names(tensors, model_tensors(model, brings), "the weights", str(path))
+    check_names(tensors, weights_by_name(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)
     return path
 

@@ -81,7 +81,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         model = self.model
         names = {id(p): name for name, p in model.named_parameters()}
         self._groups = [[names[id(p)] for p in g["params"]] for g in inner.param_groups]
-        # Stage 3 splits frozen weights as well: now is the time to sum them up.
+        # Stage 3 splits frozen weights as well: so they are hashed before that.
         self.left_out = left_out(model)
         self.vla = start(
             model, inner, self.zero_stage, self.max_grad_norm, self.compute_dtype, self.world

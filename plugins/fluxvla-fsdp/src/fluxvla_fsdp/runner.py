@@ -44,7 +44,7 @@ class FSDPTrainRunner(BaseTrainRunner):
         super().__init__(**kwargs)
         if sharding_strategy not in STRATEGIES:
             raise ConfigError(
-                f"sharding_strategy {sharding_strategy!r} is none of "
+                f"unknown sharding_strategy {sharding_strategy!r}; choose one of "
                 f"{', '.join(map(repr, STRATEGIES))}",
                 where=self.context.where(f"{self.context.section}.sharding_strategy"),
             )

@@ -14,16 +14,16 @@ from contextlib import closing
 
 import pytest
 
-from fluxvla_core.checkpoints import owner
-from fluxvla_core.checkpoints.owner import LOCK, claim
+from fluxvla_core.checkpoints import lock
+from fluxvla_core.checkpoints.lock import LOCK, lock_work_dir
 from fluxvla_core.errors import RunFailed, UsageError
 
 OWNER = """
 import os, sys, time
 from contextlib import closing
 from pathlib import Path
-from fluxvla_core.checkpoints.owner import claim
-held = claim(Path(sys.argv[1]), print)
+from fluxvla_core.checkpoints.lock import lock_work_dir
+held = lock_work_dir(Path(sys.argv[1]), print)
 worker = os.fork() if "worker" in sys.argv else 1
 if worker:
     print(worker, flush=True)
@@ -47,10 +47,10 @@ def end(process):
 
 def test_a_second_one_is_told_who_has_it_until_that_one_is_gone(tmp_path, monkeypatch):
     process, _ = start(tmp_path)
-    monkeypatch.setattr(owner, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
     try:
         with pytest.raises(UsageError) as caught:
-            claim(tmp_path, pytest.fail)
+            lock_work_dir(tmp_path, pytest.fail)
         said = json.loads((tmp_path / LOCK).read_text())
         assert said["pid"] == process.pid
         assert str(caught.value) == (
@@ -63,7 +63,7 @@ def test_a_second_one_is_told_who_has_it_until_that_one_is_gone(tmp_path, monkey
         )
     finally:
         end(process)
-    with closing(claim(tmp_path, pytest.fail)):
+    with closing(lock_work_dir(tmp_path, pytest.fail)):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
 
 
@@ -73,7 +73,7 @@ def test_a_loader_worker_that_lives_on_does_not_keep_it(tmp_path):
     end(process)
     try:
         os.kill(int(worker), 0)
-        with closing(claim(tmp_path, pytest.fail)) as mine:
+        with closing(lock_work_dir(tmp_path, pytest.fail)) as mine:
             assert mine.held
     finally:
         os.kill(int(worker), signal.SIGKILL)
@@ -82,8 +82,8 @@ def test_a_loader_worker_that_lives_on_does_not_keep_it(tmp_path):
 def in_use(work_dir):
     """Whether another process finds it taken."""
     code = (
-        "import sys; from pathlib import Path; from fluxvla_core.checkpoints import owner\n"
-        "owner.PATIENCE_S = 0.0; owner.claim(Path(sys.argv[1]), print)"
+        "import sys; from pathlib import Path; from fluxvla_core.checkpoints import lock\n"
+        "lock.PATIENCE_S = 0.0; lock.lock_work_dir(Path(sys.argv[1]), print)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(work_dir)], capture_output=True, text=True, check=False
@@ -93,8 +93,8 @@ def in_use(work_dir):
 
 
 def test_a_claim_within_a_claim_ends_without_it(tmp_path):
-    with closing(claim(tmp_path, pytest.fail)) as outer:
-        inner = claim(tmp_path, pytest.fail)
+    with closing(lock_work_dir(tmp_path, pytest.fail)) as outer:
+        inner = lock_work_dir(tmp_path, pytest.fail)
         assert not inner.held
         inner.close()
         assert outer.held
@@ -103,8 +103,8 @@ def test_a_claim_within_a_claim_ends_without_it(tmp_path):
 
 
 def test_a_claim_that_nobody_holds_any_more_is_none(tmp_path):
-    claim(tmp_path, pytest.fail)
-    assert claim(tmp_path, pytest.fail).held
+    lock_work_dir(tmp_path, pytest.fail)
+    assert lock_work_dir(tmp_path, pytest.fail).held
 
 
 def test_a_file_system_without_locks_is_said(tmp_path, monkeypatch):
@@ -113,8 +113,8 @@ def test_a_file_system_without_locks_is_said(tmp_path, monkeypatch):
 
     monkeypatch.setattr(fcntl, "lockf", refuse)
     said = []
-    outer = claim(tmp_path, said.append)
-    inner = claim(tmp_path, said.append)
+    outer = lock_work_dir(tmp_path, said.append)
+    inner = lock_work_dir(tmp_path, said.append)
     assert (outer.held, inner.held) == (False, False)
     assert said == [
         f"{tmp_path}/{LOCK} cannot be locked (No locks available): nothing keeps a second training "
@@ -135,8 +135,8 @@ def test_a_work_dir_that_was_taken_away_is_noticed(tmp_path, monkeypatch, how, l
     if not locks:
         monkeypatch.setattr(fcntl, "lockf", no_locks)
     with (
-        closing(claim(work, lambda text: None)) as outer,
-        closing(claim(work, pytest.fail)) as mine,
+        closing(lock_work_dir(work, lambda text: None)) as outer,
+        closing(lock_work_dir(work, pytest.fail)) as mine,
     ):
         mine.check()
         if how == "removed":
@@ -160,14 +160,14 @@ def test_a_work_dir_that_was_taken_away_is_noticed(tmp_path, monkeypatch, how, l
 
 
 def test_a_lock_that_was_removed_lets_another_in_and_is_noticed(tmp_path):
-    with closing(claim(tmp_path, pytest.fail)) as mine:
+    with closing(lock_work_dir(tmp_path, pytest.fail)) as mine:
         (tmp_path / LOCK).unlink()
         with pytest.raises(RunFailed, match=r"run\.lock in it was removed or replaced"):
             mine.check()
 
 
 def test_a_server_that_does_not_answer_takes_nothing_away(tmp_path, monkeypatch):
-    with closing(claim(tmp_path, pytest.fail)) as mine:
+    with closing(lock_work_dir(tmp_path, pytest.fail)) as mine:
 
         def times_out(path):
             raise OSError(errno.ETIMEDOUT, "Connection timed out")

@@ -1,37 +1,16 @@
-"""The checkpoint directory of a run: which checkpoints are kept, removed, set aside or the best."""
+"""Retention: which checkpoints of a run are kept, removed, set aside or named the best."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.checkpoints.manifest import FOLDER, step_name, step_of
 from fluxvla_core.checkpoints.writer import PARTIAL, Disk, free_name
-from fluxvla_core.errors import UsageError
 
 REMOVING = ".removing"
 BEST = "best"
-
-
-def prepare(work_dir: Path) -> None:
-    """Make ``work_dir/checkpoints`` and try to write in it, before hours are spent on training.
-
-    Raises:
-        UsageError: it cannot be made or written.
-    """
-    place = work_dir / FOLDER
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=place) as file:
-            file.write(b"x")
-            file.flush()
-    except OSError as error:
-        raise UsageError(
-            f"checkpoints cannot be written to {place}: {error.strerror or error}",
-            next="name a folder that can be written: --work-dir DIR",
-        ) from error
 
 
 def rotate(
@@ -71,7 +50,7 @@ def name_best(work_dir: Path, step: int) -> bool:
 def set_aside_later(work_dir: Path, step: int, disk: Disk | None = None) -> list[Path]:
     """Rename checkpoints of steps after ``step``, which a run resumed there no longer continues.
 
-    Left in place they would be taken for the newest and be kept in the resumed run's stead.
+    Left in place they would be taken for the newest and be kept instead of the resumed run's.
     """
     disk = disk or Disk()
     moved = []

@@ -26,16 +26,18 @@ PATIENCE_S = 5.0
 """How long a process that was killed just now may take to be gone."""
 
 
-class Claim:
-    """A work dir that is this process's until it is closed; ``claim`` makes it.
+class WorkDirLock:
+    """The lock of a work dir, held until it is closed; ``lock_work_dir`` makes it.
 
     Args:
         work_dir: absolute, with symbolic links as they are: one may be made to lead elsewhere.
         file: the lock; None where there is none to give back.
-        outer: the claim that this process has already; it lives as long as this one.
+        outer: the lock that this process has already; it lives as long as this one.
     """
 
-    def __init__(self, work_dir: Path, file: IO[str] | None, outer: Claim | None = None) -> None:
+    def __init__(
+        self, work_dir: Path, file: IO[str] | None, outer: WorkDirLock | None = None
+    ) -> None:
         self.work_dir, self._file, self._outer, self.active = work_dir, file, outer, False
         self._place = os.open(work_dir, os.O_RDONLY)
         self.active = True
@@ -52,9 +54,9 @@ class Claim:
             file.close()
 
     def check(self) -> None:
-        """See that the work dir is still the one that was claimed, before anything is written.
+        """See that the work dir is still the one that was locked, before anything is written.
 
-        A training that went on would fill a place that somebody cleared, or another one's.
+        A training that continued would fill a place that somebody cleared, or another one's.
 
         Raises:
             RunFailed: it was removed, moved or replaced; says where what was saved is.
@@ -80,7 +82,9 @@ class Claim:
             cause += "; what was saved there is gone with it"
         elif saved:
             cause += f"; the newest checkpoint is {saved[-1]}"
-            advice = f"go on with --work-dir {now} --resume auto, when no other training is there"
+            advice = (
+                f"continue with --work-dir {now} --resume auto, when no other training is there"
+            )
         else:
             cause += "; nothing was saved there yet"
         return RunFailed(
@@ -96,15 +100,16 @@ class Claim:
         return self._file is not None
 
 
-# By process too: a fork inherits the table, and not the locks.
-_held: WeakValueDictionary[tuple[int, Path], Claim] = WeakValueDictionary()
+# The key holds the process id because a forked process inherits this table but not the locks: it
+# would take its parent's lock for its own.
+_held: WeakValueDictionary[tuple[int, Path], WorkDirLock] = WeakValueDictionary()
 
 
-def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
-    """Keep other trainings out of ``work_dir``, which must exist, until the claim is closed.
+def lock_work_dir(work_dir: Path, warn: Callable[[str], None]) -> WorkDirLock:
+    """Keep other trainings out of ``work_dir``, which must exist, until the lock is closed.
 
     Args:
-        warn: called if the file system has no locks; the claim then keeps nobody out.
+        warn: called if the file system has no locks; the lock then keeps nobody out.
 
     Raises:
         UsageError: another process has it; says which.
@@ -113,7 +118,7 @@ def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
     place, path = work_dir.absolute(), Path(os.path.realpath(work_dir)) / LOCK
     before = _held.get((os.getpid(), path))
     if before is not None and before.active:
-        return Claim(place, None, before)
+        return WorkDirLock(place, None, before)
     try:
         file = _locked(path)
     except OSError as error:
@@ -122,7 +127,7 @@ def claim(work_dir: Path, warn: Callable[[str], None]) -> Claim:
             f"{path} cannot be locked ({error.strerror or error}): nothing keeps a second training "
             "out of this work dir"
         )
-    found = _held[os.getpid(), path] = Claim(place, file)
+    found = _held[os.getpid(), path] = WorkDirLock(place, file)
     return found
 
 
@@ -164,7 +169,7 @@ def _locked(path: Path) -> IO[str]:
 
 
 def _lock(file: IO[str]) -> bool:
-    """Whether the lock could be had; a predecessor is given time to be gone."""
+    """Try to take the lock; a process that was killed just now may keep it for a moment."""
     import fcntl
 
     until = time.monotonic() + PATIENCE_S

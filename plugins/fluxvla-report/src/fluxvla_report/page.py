@@ -241,23 +241,13 @@ def _evaluation(evaluation: Evaluation, sources: VideoSources) -> dict[str, Any]
     for number, group in enumerate(evaluation.groups):
         scores = group.tasks if len(group.tasks) > 1 else [group.total]
         if evaluation.scored_by_instruction(group):
-            followed = evaluation.obeyed[group.name]
+            named = [("follows the instruction", evaluation.obeyed[group.name])]
+        else:
+            named = [(score.task if len(group.tasks) > 1 else "", score) for score in scores]
+        for name, score in named:
             rows.append(
                 Interval(
-                    name=f"{group.label} · follows the instruction",
-                    note=f"{followed.successes} of {followed.episodes}",
-                    low=followed.low,
-                    value=followed.rate,
-                    high=followed.high,
-                    css=f"s{number % 6}",
-                )
-            )
-            continue
-        for score in scores:
-            task = f" · {score.task}" if len(group.tasks) > 1 else ""
-            rows.append(
-                Interval(
-                    name=f"{group.label}{task}",
+                    name=f"{group.label} · {name}" if name else group.label,
                     note=f"{score.successes} of {score.episodes}",
                     low=score.low,
                     value=score.rate,

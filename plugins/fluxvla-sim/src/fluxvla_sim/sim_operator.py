@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from fluxvla_mujoco import divergence
 
-from fluxvla_core.errors import Faulted, NotReady, Rejected
+from fluxvla_core.errors import Faulted, NotReady
 from fluxvla_core.operators import Frame, MonotonicClock, Operator, SimulatedClock
-from fluxvla_core.ros2 import STATE
+from fluxvla_core.ros2 import STATE, checked_action
 from fluxvla_sim.world import SimRobot, task_of
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class SimOperator(Operator):
             Faulted: the simulation diverged.
             Rejected: wrong shape, non-finite, or outside the embodiment's position limits.
         """
-        target = self._checked(action)
+        target = checked_action(self.embodiment, action)
         with self._lock:
             self._connected()
             self._catch_up()
@@ -203,20 +203,3 @@ class SimOperator(Operator):
         lower = [j.lower for j in self.embodiment.joints]
         upper = [j.upper for j in self.embodiment.joints]
         return np.clip(np.asarray(self._scene.state, dtype=np.float64), lower, upper)
-
-    def _checked(self, action: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        target = np.array(action, dtype=np.float64)
-        spec = self.embodiment
-        if target.shape != (spec.dim,):
-            raise Rejected(
-                f"{type(self).__name__} takes actions of shape ({spec.dim},), got {target.shape}"
-            )
-        for joint, value in zip(spec.joints, target, strict=True):
-            if not np.isfinite(value):
-                raise Rejected(f"{joint.name}: the command is {value}, not a finite number")
-            if not joint.lower <= value <= joint.upper:
-                raise Rejected(
-                    f"{joint.name}: the command {value:.4g} {joint.unit} is outside "
-                    f"[{joint.lower:.4g}, {joint.upper:.4g}]"
-                )
-        return target

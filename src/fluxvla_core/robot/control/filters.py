@@ -6,7 +6,6 @@ A filter is ``f(action) -> action`` on one ``(D,)`` target in physical units; se
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 from fluxvla_core.robot.control.kinematics import Chain, vector
 from fluxvla_core.robot.control.safety import BadCommand
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -218,7 +217,7 @@ def joint_columns(who: str, names: Sequence[str], known: dict[str, int]) -> Colu
     """
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(str(name), known, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(known)}"
+            near = nearest(str(name), known)
+            hint = f"; did you mean {near!r}?" if near else f"; there are {', '.join(known)}"
             raise ConfigError(f"{who}: there is no joint {name!r}{hint}")
     return np.array([known[name] for name in names], dtype=np.intp)

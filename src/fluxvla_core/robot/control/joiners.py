@@ -9,7 +9,6 @@ the beginning of its chunk. ``make_joiner`` makes the one that a config's ``chun
 from __future__ import annotations
 
 import bisect
-import difflib
 import inspect
 import math
 from abc import ABC, abstractmethod
@@ -22,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.policy import Continuation
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, nearest
 from fluxvla_core.robot.control.chunks import Chunk, sample
 
 Array = npt.NDArray[np.float64]
@@ -325,8 +324,8 @@ class RealTime(StreamedJoiner):
     ) -> None:
         super().__init__(every_s)
         if schedule not in SCHEDULES:
-            near = difflib.get_close_matches(str(schedule), SCHEDULES, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            near = nearest(str(schedule), SCHEDULES)
+            hint = f"; did you mean {near!r}?" if near else ""
             raise ConfigError(
                 f"schedule {schedule!r} is unknown; choose one of {', '.join(SCHEDULES)}{hint}"
             )
@@ -412,7 +411,7 @@ def make_joiner(value: str | Mapping[str, Any] | None, every_s: float = 0.0) -> 
 
 
 def _hint(name: Any, known: tuple[str, ...] | list[str]) -> str:
-    near = difflib.get_close_matches(str(name), known, 1)
+    near = nearest(str(name), known)
     if near:
-        return f"; did you mean {near[0]!r}?"
+        return f"; did you mean {near!r}?"
     return f"; there are {', '.join(known)}" if known else "; it takes nothing"

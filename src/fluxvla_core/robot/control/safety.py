@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, ClassVar
 
-from fluxvla_core.errors import ConfigError, FluxError, SafetyStop
+from fluxvla_core.errors import ConfigError, FluxError, SafetyStop, nearest
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,8 @@ class SafetySettings:
         names = [field.name for field in fields(cls)]
         for key in value:
             if key not in names:
-                near = difflib.get_close_matches(str(key), names, 1)
-                hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(names)}"
+                near = nearest(str(key), names)
+                hint = f"; did you mean {near}?" if near else f"; there are {', '.join(names)}"
                 raise ConfigError(f"safety has no setting {key!r}{hint}")
         return cls(**value)
 

@@ -72,7 +72,7 @@ def tests(session: nox.Session) -> None:
         ensure_needs(session)
         SKIPPED.unlink(missing_ok=True)
         # pip and mypy use one core each.
-        with shell.beside([sys.executable, "-m", "nox", "-s", "environments"], cwd=ROOT):
+        with shell.alongside([sys.executable, "-m", "nox", "-s", "environments"], cwd=ROOT):
             dev = dev_env(session)
             step("lint", lambda: check_lint(dev))
             step("types", lambda: dev.run("mypy", cwd=ROOT))

@@ -44,7 +44,7 @@ class FrozenConv(nn.Conv2d):
 
 
 class BasicBlock(nn.Module):
-    """Two convolutions beside a shortcut (He et al. 2015, figure 5 left)."""
+    """Two convolutions with a shortcut (He et al. 2015, figure 5 left)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()

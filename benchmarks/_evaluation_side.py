@@ -24,9 +24,9 @@ HEIGHT, WIDTH = 480, 640
 
 
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
-    """The evaluation engine: workers, episode log, records."""
+    """The evaluation engine: workers, evaluation log, records."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
+    from fluxvla_core.evaluation.episodes import EpisodeKey, open_eval_log, run_in_pool
     from fluxvla_core.evaluation.policies import PolicySource
     from fluxvla_core.evaluation.pool import WorkerPool
     from fluxvla_core.evaluation.rollout import RolloutSettings
@@ -45,7 +45,7 @@ def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, 
     with WorkerPool(_Worker(settings), processes) as pool, tempfile.TemporaryDirectory() as folder:
         for _ in pool.run(warm):
             continue
-        log = open_episode_log(Path(folder) / "episodes.jsonl", {}, SilentReporter())
+        log = open_eval_log(Path(folder) / "episodes.jsonl", {}, SilentReporter())
         began, own = time.perf_counter(), time.process_time()
         records = run_in_pool(pool, keys, log, SilentReporter())
         seconds, own = time.perf_counter() - began, time.process_time() - own

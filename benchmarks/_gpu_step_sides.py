@@ -113,7 +113,7 @@ def our_config(setup: Setup) -> dict[str, Any]:
 
 def by_runner(setup: Setup, work_dir: Path) -> tuple[Callable[[int], float], Any]:
     """What does so many steps and gives the last loss, and the runner; nothing is saved."""
-    from fluxvla_core.training.state import Progress
+    from fluxvla_core.training.progress import Progress
     from fluxvla_core.training.stop import StopRequest
     from fluxvla_core.training.trainer import Trainer
 

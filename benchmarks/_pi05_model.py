@@ -227,7 +227,7 @@ class BenchPi05(nn.Module):
     def __init__(self, size: str = "pi05", attention: str = "sdpa", device: str = "cpu") -> None:
         super().__init__()
         if attention not in ATTENTION:
-            raise ValueError(f"attention {attention!r} is none of {', '.join(ATTENTION)}")
+            raise ValueError(f"attention {attention!r} is not one of {', '.join(ATTENTION)}")
         self.size, self.attention = SIZES[size], attention
         with torch.device(device):
             self._build(self.size)

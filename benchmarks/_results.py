@@ -1,4 +1,4 @@
-"""What every results file begins with, and how it is kept.
+"""Results files of benchmarks: their common head, and writing them.
 
 args = options(__file__).parse_args()
 begun = head("torch", "av")

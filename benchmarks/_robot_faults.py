@@ -83,14 +83,15 @@ class BenchArm(RosOperator):
         self.sent: list[list[float]] = []
 
     def streams(self) -> list[StreamSpec]:
-        cameras = [camera_stream(c, f"/{c.name}/image") for c in ARM.cameras]
+        cameras = [camera_stream(c, f"/{c.name}/image") for c in self.embodiment.cameras]
         return [StreamSpec("arm", self.state_topic, JOINT_STATE), *cameras]
 
     def commands(self) -> list[CommandSpec]:
         return [CommandSpec(COMMAND)]
 
     def read_state(self, messages: Mapping[str, Any]) -> Array:
-        return joints.positions(messages["arm"], NAMES, f"arm ({self.state_topic})")
+        names = self.embodiment.joint_names
+        return joints.positions(messages["arm"], names, f"arm ({self.state_topic})")
 
     def on_connected(self, connection: Connection) -> None:
         # The arm and the listener: what is judged is what arrives there, from the first command on.
@@ -103,7 +104,8 @@ class BenchArm(RosOperator):
 
     def publish_action(self, action: Array) -> None:
         self.sent.append(action.tolist())
-        self.publish(COMMAND, joints.fill(message_class(JOINT_STATE)(), NAMES, action))
+        names = self.embodiment.joint_names
+        self.publish(COMMAND, joints.fill(message_class(JOINT_STATE)(), names, action))
 
 
 class Swing:
@@ -174,7 +176,8 @@ class Fault:
 
     Args:
         name: as docs/safety.md has it.
-        provoke: called once the arm moves; before the run for what is ``REFUSED``.
+        provoke: called with the stage (or the ``Program`` of two processes) once the arm moves;
+            before the run for what is ``REFUSED``.
         says: what the one line that names the cause contains, a regular expression.
         outcome: ``STOP``, ``REFUSED`` or ``GOES_ON``.
         exit_code: of the program.
@@ -185,7 +188,7 @@ class Fault:
     """
 
     name: str
-    provoke: Callable[[Stage], object]
+    provoke: Callable[[Any], object]
     says: str = ""
     outcome: str = STOP
     exit_code: int = 1
@@ -297,23 +300,23 @@ def play(stage: Stage, fault: Fault) -> Result:
             thread.join(60)
         for driver in stage.more:
             driver.close()
-    commands = _settled(stage)
+    commands = settled(stage)
     if fault.after is not None:
         fault.after(stage)
-        assert _settled(stage) == commands, "the arm was commanded after the run was over"
+        assert settled(stage) == commands, "the arm was commanded after the run was over"
     positions = np.array([c for _, c in commands]).reshape(-1, len(NAMES))
-    whole = _with_overtaken(positions.tolist(), stage.operator.sent)
+    whole = with_overtaken(positions.tolist(), stage.operator.sent)
     check_limits(whole, halts=not fault.braked)
     hold = None
     if fault.outcome == STOP and began and commands:
         strangers = [h["at"] for h in stage.ear.on(COMMAND) if tuple(h["name"]) != NAMES]
         fell_ill = min(strangers, default=stage.policy.spoiled or began[0])
-        hold = max(commands[-_resting(positions)][0] - fell_ill, 0.0)
+        hold = max(commands[-resting(positions)][0] - fell_ill, 0.0)
     provoked = fault.outcome == REFUSED or bool(began)
-    return Result(hold, said, ended - start, code, _record(stage.folder), positions, provoked)
+    return Result(hold, said, ended - start, code, record_of(stage.folder), positions, provoked)
 
 
-def _settled(stage: Stage) -> list[tuple[float, list[float]]]:
+def settled(stage: Stage) -> list[tuple[float, list[float]]]:
     """What was received once nothing more comes."""
     found = stage.commands()
     while True:
@@ -324,11 +327,11 @@ def _settled(stage: Stage) -> list[tuple[float, list[float]]]:
         found = now
 
 
-def _with_overtaken(received: list[list[float]], sent: list[list[float]]) -> Array:
+def with_overtaken(received: list[list[float]], sent: list[list[float]]) -> Array:
     """What was received, with the commands between that a newer one overtook: ``(N, 3)``.
 
     A command that was not taken before the next is there is dropped, and a starved listener is
-    slow. The next one is no jump then: more time went by.
+    slow. The next one is not a jump then: more time went by.
 
     Raises:
         AssertionError: something was received that was not sent, or in another order.
@@ -340,7 +343,7 @@ def _with_overtaken(received: list[list[float]], sent: list[list[float]]) -> Arr
     return np.array(sent[at[1] - 1 : at[-1]] if received else []).reshape(-1, len(NAMES))
 
 
-def _resting(positions: Array) -> int:
+def resting(positions: Array) -> int:
     """How many commands at the end are equal."""
     if not len(positions):
         return 0
@@ -373,6 +376,6 @@ def check_limits(positions: Array, halts: bool = False) -> None:
             assert abs(speed[halt + 1, index]) <= joint.acceleration / ARM.rate_hz * slack
 
 
-def _record(folder: Path) -> dict[str, Any] | None:
+def record_of(folder: Path) -> dict[str, Any] | None:
     found = sorted((folder / "inference").glob("*/episode.json"))
     return json.loads(found[-1].read_text(encoding="utf-8")) if found else None

@@ -1,4 +1,4 @@
-"""How long a checkpoint holds up the training, beside what a plain ``torch.save`` takes.
+"""Benchmarks how long saving a checkpoint holds up the training, against ``torch.save``.
 
     python -m benchmarks.checkpoint_save [--gigabytes 1] [--saves 4] [--steps 12]
 
@@ -6,7 +6,7 @@ One process trains a model of so many gigabytes with AdamW (its state is twice t
 save the same weights and optimizer state are written by ``torch.save`` to the same disk, without
 flushing it; then the runner saves: what counts is how long the step loop stands still, in the save
 itself and in the next optimizer step that waits for the copy. The first save makes the memory that
-the later ones copy into and is given by itself. What the writing beside the training costs the
+the later ones copy into and is given by itself. What writing in the background costs the
 steps that run meanwhile is given as the ratio of their times to those of steps without it. Goal:
 under a tenth. Writes ``benchmarks/results/checkpoint_save.json``.
 """
@@ -72,7 +72,7 @@ class TimedRunner(BaseTrainRunner):
         return path
 
     def optimizer_step(self) -> Tensor | None:
-        saver: Saver | None = self._saver
+        saver: Saver | None = self.saver
         began = time.perf_counter()
         if saver is not None:
             saver.copied()
@@ -128,12 +128,12 @@ def measure(layers: int, saves: int, steps: int, work_dir: Path) -> tuple[list[A
 
 
 def _writing(runner: Any) -> bool:
-    job = runner._saver._job
+    job = runner.saver._job
     return job is not None and job.thread is not None and job.thread.is_alive()
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when the goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when the goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--gigabytes", type=float, default=1.0)
     parser.add_argument("--saves", type=int, default=4)
@@ -146,8 +146,8 @@ def main() -> int:
     first, later = found[0], found[1:] or found
     ratio = statistics.median(save["blocked_s"] / save["plain_s"] for save in later)
     alone = [seconds for seconds, writing in taken[1:] if not writing]
-    beside = [seconds for seconds, writing in taken[1:] if writing]
-    slower = statistics.median(beside) / statistics.median(alone) if beside and alone else None
+    during = [seconds for seconds, writing in taken[1:] if writing]
+    slower = statistics.median(during) / statistics.median(alone) if during and alone else None
     result = {
         **begun,
         "what": "seconds the step loop stands still for a checkpoint over those of torch.save",
@@ -156,7 +156,7 @@ def main() -> int:
         "goal_met": ratio < MOST_RATIO,
         "first_save_ratio": round(first["blocked_s"] / first["plain_s"], 4),
         "steps_beside_writing_over_steps_without": None if slower is None else round(slower, 3),
-        "step_s": round(statistics.median(alone or beside), 3),
+        "step_s": round(statistics.median(alone or during), 3),
         "saves": [{k: round(v, 4) for k, v in save.items()} for save in found],
         "threads": torch.get_num_threads(),
     }

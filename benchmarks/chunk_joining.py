@@ -1,16 +1,16 @@
-"""What each way of joining chunks makes of a slow policy: success, time, and smoothness.
+"""Benchmarks the ways of joining chunks with a slow policy: success, time, and smoothness.
 
     python -m benchmarks.chunk_joining [--checkpoint work_dirs/aloha_sim_transfer] [--episodes 5]
 
 Two policies drive the simulated ALOHA. *trained* is the demo's, which hands the cube over; without
 its checkpoint that part is left as it was measured before. *wavering* needs none: its chunks follow
-one motion, each beside it by an offset of its own, as those of a policy that cannot make up its
-mind; it is run with the arms' own limits, and with a jerk limit besides. The latency is simulated
-(time stands still while the policy thinks, and then passes), so that the figures do not depend on
-how busy the machine is. They are: seconds until done, and successes; the largest step of the joined
-target from one command to the next, which is the seam between chunks; and acceleration and jerk of
-the commands (rms over the arms' joints, and the largest jerk), after the limits took up the seams.
-Writes ``benchmarks/results/chunk_joining.json``.
+one motion, each shifted from it by an offset of its own, as those of a policy that cannot make up
+its mind; it is run with the arms' own limits, and with a jerk limit besides. The latency is
+simulated (time stands still while the policy thinks, and then passes), so that the figures do not
+depend on how busy the machine is. They are: seconds until done, and successes; the largest step of
+the joined target from one command to the next, which is the seam between chunks; and acceleration
+and jerk of the commands (rms over the arms' joints, and the largest jerk), after the limits took up
+the seams. Writes ``benchmarks/results/chunk_joining.json``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ JERK = 400.0
 
 
 class Wavering:
-    """Swings the arms' joints; each chunk is beside the swing by up to ``offset`` rad.
+    """Swings the arms' joints; each chunk is shifted from the swing by up to ``offset`` rad.
 
     Told to go on from a chunk, it keeps to that as far as it is told.
     """
@@ -67,8 +67,8 @@ class Wavering:
     def predict_action(self, observation: Mapping[str, Any]) -> Array:
         times = self.now() + np.arange(1, self.horizon + 1) / self.action_rate_hz
         chunk = np.repeat(np.array(start_pose("viperx300"))[None], self.horizon, axis=0)
-        beside = self.rng.uniform(-self.offset, self.offset, len(ARM_COLUMNS))
-        chunk[:, ARM_COLUMNS] += 0.2 * np.sin(2.0 * times)[:, None] + beside
+        shift = self.rng.uniform(-self.offset, self.offset, len(ARM_COLUMNS))
+        chunk[:, ARM_COLUMNS] += 0.2 * np.sin(2.0 * times)[:, None] + shift
         return chunk
 
     def continue_action(self, observation: Mapping[str, Any], rest: Continuation) -> Array:

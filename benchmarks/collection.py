@@ -1,4 +1,4 @@
-"""How fast demonstrations are collected and policies evaluated in simulation.
+"""Benchmarks collecting demonstrations and evaluating policies in simulation.
 
     python -m benchmarks.collection [--rounds 3] [--episodes 8]
 
@@ -9,7 +9,8 @@ and the figure is the median over the rounds:
   processor time, which other work disturbs less);
 - collecting with two worker processes against one, and one against gym-aloha's own environment,
   which draws three 480 x 640 pictures after every step;
-- evaluating through the engine (processes, episode log) against the same episodes in a bare loop.
+- evaluating through the engine (processes, evaluation log) against the same episodes in a bare
+  loop.
 
 Loading libraries and the scene is left out everywhere. Writes
 ``benchmarks/results/collection.json``.
@@ -38,7 +39,7 @@ from fluxvla_sim.expert import SimExpert
 from benchmarks import _results
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.evaluation.collect import demonstrate
-from fluxvla_core.evaluation.episodes import EpisodeKey, open_episode_log, run_in_pool
+from fluxvla_core.evaluation.episodes import EpisodeKey, open_eval_log, run_in_pool
 from fluxvla_core.evaluation.policies import PolicySource
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
@@ -119,7 +120,7 @@ def evaluating(workers: int, episodes: int) -> tuple[float, float]:
     with WorkerPool(partial(EpisodeWorker, settings), workers) as pool:
         for _ in pool.run([EpisodeKey("policy", "lift_hold", 10**6)] * workers):
             continue
-        log = open_episode_log(folder / "episodes.jsonl", {}, SilentReporter())
+        log = open_eval_log(folder / "episodes.jsonl", {}, SilentReporter())
         began = time.perf_counter()
         run_in_pool(pool, keys, log, SilentReporter())
         engine = time.perf_counter() - began

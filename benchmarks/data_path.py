@@ -1,4 +1,4 @@
-"""Samples a second of the data path beside LeRobot's own ``LeRobotDataset``, on the same files.
+"""Benchmarks the data path (samples/s) against LeRobot's ``LeRobotDataset``, on the same files.
 
     python -m benchmarks.data_path [--rounds 3] [--seconds 4] [--episodes 4] [--frames 100]
 
@@ -123,7 +123,7 @@ def medians(found: Mapping[str, Sequence[float]]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when a goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement, at least")

@@ -1,4 +1,4 @@
-"""Samples a second of a whole training: ``fluxvla run`` beside ``lerobot-train``, ACT on the demo.
+"""Benchmarks a whole training in samples/s: ``fluxvla run`` and ``lerobot-train``, ACT on the demo.
 
     python -m benchmarks.end_to_end [--rounds 5] [--steps 10] [--workers 0] [--fps 10]
 
@@ -220,7 +220,7 @@ def summarise(runs: Mapping[str, Sequence[Mapping[str, float]]]) -> dict[str, An
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when the goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when the goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=16, help="to collect")

@@ -1,4 +1,4 @@
-"""How fast policies are evaluated, beside LeRobot's evaluation and beside bare stepping.
+"""Benchmarks policy evaluation against LeRobot's evaluation and against bare stepping.
 
     python -m benchmarks.evaluation [--rounds 3] [--checkpoint DIR]
 
@@ -37,7 +37,7 @@ from tools import rendering, shell
 SIDE = Path(__file__).with_name("_evaluation_side.py")
 EPISODE = 300
 NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0")
-"""The simulator, beside what LeRobot itself imports."""
+"""The simulator, in addition to what LeRobot itself imports."""
 KEYS = {"engine, stock pictures": "times_lerobot", "engine": "times_lerobot_cheap_pictures"}
 GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
 # side -> words of _evaluation_side.py: side, steps, episodes for each process, pictures

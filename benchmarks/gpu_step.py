@@ -3,8 +3,8 @@
     python -m benchmarks.gpu_step [--batch 16] [--nproc 1] [--recompute] [--compile] [--profile]
     python -m benchmarks.gpu_step --size tiny --device cpu     the same in seconds, no figures kept
 
-``FSDPTrainRunner`` beside a torch loop written by hand: the same model (``_pi05_model.py``), random
-batches made on the host (pictures as uint8), bf16 compute over fp32 weights, fused AdamW
+``FSDPTrainRunner`` against a torch loop written by hand: the same model (``_pi05_model.py``),
+random batches made on the host (pictures as uint8), bf16 compute over fp32 weights, fused AdamW
 and clipping. By hand one process has plain autocast; several have ``fully_shard``. The sides take
 turns as processes of their own (``--rounds``), each of which measures ``--blocks`` blocks of
 ``--steps`` steps after a warm-up; the hand-written loop waits for the device at the ends of a block
@@ -134,7 +134,7 @@ def alternate(setup: Setup, rounds: int, profile: bool) -> tuple[dict[str, list[
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test.
+    """Measure, print and write; 0 also when a goal is missed, for a benchmark is not a test.
 
     Without a GPU that is said: bad surroundings (2) for who asked for something, and nothing to
     fail for (0) where every benchmark is run as it is.
@@ -162,7 +162,7 @@ def main(words: Sequence[str] | None = None) -> int:
         "rounds": args.rounds,
         **rounded(summarise(runs, setup)),
     }
-    if not full and args.out == parser.get_default("out"):  # a tiny model's figures are no results
+    if not full and args.out == parser.get_default("out"):  # a tiny model's figures are not results
         print(json.dumps(summary, indent=1), table, sep="\n")
         return 0
     _results.keep(args.out, summary)

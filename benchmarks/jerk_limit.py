@@ -1,11 +1,11 @@
-"""What a jerk limit costs: time from rest to rest beside the least possible, and time to compute.
+"""Benchmarks the jerk limit: time from rest to rest against the least possible, and compute time.
 
     python -m benchmarks.jerk_limit [--rounds 2000]
 
 A joint of a ViperX is sent over ways of several lengths by the limiter, with and without a jerk
 limit. The least time for the same limits is Ruckig's (``pip install ruckig``, MIT; without it that
 column is empty), which plans in continuous time; a limiter that knows no plan, only the next
-target, cannot be faster. Beside it, what one command of 14 joints costs on this machine. Writes
+target, cannot be faster. Also, what one command of 14 joints costs on this machine. Writes
 ``benchmarks/results/jerk_limit.json``.
 """
 

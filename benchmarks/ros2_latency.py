@@ -1,4 +1,4 @@
-"""From a camera to an observation: AlohaOperator beside a bare rclpy script.
+"""Benchmarks the latency from a camera to an observation: AlohaOperator and a bare rclpy script.
 
     python -m benchmarks.ros2_latency [--rounds 4] [--seconds 8]
 
@@ -173,7 +173,7 @@ def summarise(sides: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when a goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=8.0)

@@ -1,4 +1,4 @@
-"""How long commands that only look take, beside bare Python and LeRobot.
+"""Benchmarks the startup time of read-only commands against bare Python and LeRobot.
 
     python -m benchmarks.startup [--rounds 15]
 
@@ -137,7 +137,7 @@ def install_many(site: Path) -> None:
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when a goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=15)
     args = parser.parse_args()

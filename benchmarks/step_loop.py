@@ -1,4 +1,4 @@
-"""What a train runner's loop costs beside a hand-written torch loop.
+"""Benchmarks a train runner's loop against a hand-written torch loop.
 
     python -m benchmarks.step_loop [--rounds 21] [--steps 10]
 
@@ -7,7 +7,7 @@ and 0.3 milliseconds, where the loop's own cost shows: in the shorter step with 
 each, both loops live in the same processes with equal models, data, loader, optimizer and clipping,
 and take turns, so that other work on the machine slows both alike; the figures are the medians over
 the rounds of the ratio of their times and of their difference. Processor time of the first rank,
-which other work disturbs less, is given beside it. The runner also does what a hand-written loop
+which other work disturbs less, is given next to it. The runner also does what a hand-written loop
 mostly leaves out: metrics of every step over all ranks, NaN detection, sample order that resumes,
 listening to signals. Goals: within 3 %, and an own cost of at most 0.15 ms a step in the model of
 one layer. Writes ``benchmarks/results/step_loop.json``.
@@ -164,7 +164,7 @@ def by_hand(kind: str, name: str) -> Callable[[int], None]:
 
 def by_runner(kind: str, name: str, work_dir: Path) -> Callable[[int], None]:
     """A function that lets the runner's loop do so many steps; checkpoints are not written."""
-    from fluxvla_core.training.state import Progress
+    from fluxvla_core.training.progress import Progress
     from fluxvla_core.training.stop import StopRequest
     from fluxvla_core.training.trainer import Trainer
 
@@ -246,7 +246,7 @@ def summarise(taken: dict[str, list[float]], name: str) -> dict[str, object]:
 
 
 def main() -> int:
-    """Measure, print and write; 0 also when a goal is missed, for a benchmark is no test."""
+    """Measure, print and write; 0 also when a goal is missed, for a benchmark is not a test."""
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=21)
     parser.add_argument("--steps", type=int, default=10)

@@ -36,8 +36,8 @@ from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import FluxError
 from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions
-from fluxvla_core.training.optim import SavedOptimizer
-from fluxvla_core.training.state import Progress, SavedTrainer
+from fluxvla_core.training.optimizer_state import SavedOptimizer
+from fluxvla_core.training.progress import Progress, SavedTrainer
 from fluxvla_core.training.weights import SavedWeights
 
 CASES = 60

@@ -67,12 +67,12 @@ def test_many_problems_are_counted() -> None:
 def test_a_pipe_does_not_wait(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with pytest.raises(DataError, match="no regular file"):
+    with pytest.raises(DataError, match="not a regular file"):
         read_bytes(pipe, DataError)
 
 
 def test_a_device_is_not_read() -> None:
-    with pytest.raises(DataError, match="no regular file"):
+    with pytest.raises(DataError, match="not a regular file"):
         read_bytes(Path("/dev/zero"), DataError)
 
 

@@ -69,7 +69,7 @@ class Env:
         self.run("python", "-m", "pip", "install", *options, *words, quiet=quiet, echo=not quiet)
 
     def create(self) -> None:
-        """Make it anew and empty, with the Python that runs this."""
+        """Make it again, empty, with the Python that runs this."""
         shutil.rmtree(self.root, ignore_errors=True)
         shell.run([sys.executable, "-m", "virtualenv", "-q", self.root])
 

@@ -2,7 +2,7 @@
 
 LeRobot cannot share an environment with this project: it wants an older torch, its torchvision and
 its PyAV. Here it gets the torch of ``constraints.txt`` all the same, which its datasets and
-policies work with: torchvision's compiled part cannot be loaded beside a CPU build of torch, and
+policies work with: torchvision's compiled part cannot be loaded with a CPU build of torch, and
 nothing here calls it; torchcodec uses the FFmpeg that PyAV's wheel brings, so nothing has to be
 installed into the system.
 
@@ -47,7 +47,7 @@ except Exception as error:
     missing = [line.strip() for line in str(error).splitlines() if "libpython" in line]
     raise SystemExit(missing[0] if missing else f"torchcodec: {error}")
 """
-# Beside a torch for which torchvision's library is not built, its import stops at these operators.
+# With a torch for which torchvision's library is not built, its import stops at these operators.
 DECLARED = """
 # Added by tools/lerobot_env.py
 if not _has_ops():
@@ -66,7 +66,7 @@ class LeRobotEnv(Env):
         return self.root / "ffmpeg"
 
     def create(self) -> None:
-        """Make it anew with ``venv``: pytest's environment has no virtualenv."""
+        """Make it again with ``venv``: pytest's environment has no virtualenv."""
         shell.run([sys.executable, "-m", "venv", "--clear", self.root], quiet=True, echo=False)
 
     def variables(self) -> dict[str, str]:
@@ -113,7 +113,7 @@ def declare_operators(env: Env) -> None:
 
 
 def _link_ffmpeg(env: LeRobotEnv) -> None:
-    """Give PyAV's FFmpeg libraries the names that torchcodec asks for, beside their own."""
+    """Give PyAV's FFmpeg libraries the names that torchcodec asks for, in addition to their own."""
     env.ffmpeg.mkdir(exist_ok=True)
     for library in env.root.glob("lib/python*/site-packages/av.libs/*.so*"):
         stem, _, rest = library.name.partition("-")

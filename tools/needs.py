@@ -1,4 +1,4 @@
-"""What the tests need of the system, without which some of them would be skipped in silence."""
+"""System packages that the tests need, without which some of them would be skipped in silence."""
 
 from __future__ import annotations
 

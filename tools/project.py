@@ -1,4 +1,4 @@
-"""What stands in the repository: its distributions, and the versions that constraints.txt names."""
+"""Contents of the repository: its distributions, and the versions that constraints.txt names."""
 
 from __future__ import annotations
 

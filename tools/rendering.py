@@ -20,7 +20,7 @@ VARIABLES = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
 
 
 class CannotRender(Exception):
-    """Rendering does not work and may not be mended from here; the text says what to type."""
+    """Rendering does not work and may not be fixed from here; the text says what to type."""
 
 
 def probe(env: Env) -> str | None:
@@ -80,7 +80,7 @@ def apt_commands(rights: Sequence[str]) -> list[list[str]]:
 
 
 def advice(reason: str, *, have_apt: bool) -> str:
-    """What to tell a user whose machine cannot render and who must mend it by hand."""
+    """What to tell a user whose machine cannot render and who must fix it by hand."""
     head = f"MuJoCo cannot render without a display: {reason}\n"
     if have_apt:
         line = " && ".join(" ".join(command) for command in apt_commands(["sudo"]))

@@ -34,7 +34,7 @@ class StepFailed(Exception):
 def child_environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
     """The environment of this process without what would leak another Python into a child.
 
-    Nor may it keep a child from writing bytecode: every process would compile torch anew.
+    Nor may it keep a child from writing bytecode: every process would compile torch again.
     """
     left_out = ("PYTHONPATH", "PYTHONHOME", "PYTHONDONTWRITEBYTECODE", "__PYVENV_LAUNCHER__")
     env = {k: v for k, v in os.environ.items() if k not in left_out}
@@ -84,7 +84,7 @@ def run(
 
 
 @contextmanager
-def beside(command: Sequence[str | os.PathLike[str]], *, cwd: Path) -> Iterator[None]:
+def alongside(command: Sequence[str | os.PathLike[str]], *, cwd: Path) -> Iterator[None]:
     """Run a command while the body does something else, and wait for it after that.
 
     Its output is kept back, and shown if it fails; that is all: whoever needs what it was to do

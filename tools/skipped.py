@@ -1,4 +1,4 @@
-"""What the stages of ``nox -s tests`` skipped, gathered by the root conftest: a list at the end."""
+"""Skipped tests of the stages of ``nox -s tests``, gathered by the root conftest and listed."""
 
 from __future__ import annotations
 

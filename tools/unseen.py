@@ -1,6 +1,6 @@
 """A plugin that the repository has never seen, and broken ones, made from text when asked for.
 
-They stand for what a third party publishes: a wheel with entry points, installed beside the core.
+They stand for what a third party publishes: a wheel with entry points, installed next to the core.
 """
 
 from __future__ import annotations
@@ -148,18 +148,18 @@ def good(folder: Path) -> Path:
 
 
 def failing(folder: Path) -> Path:
-    """``fluxvla-broken``: its module does not import, and its runner would be no class."""
+    """``fluxvla-broken``: its module does not import, and its runner would not be a class."""
     return write_project(folder, "fluxvla-broken", "BrokenOperator", "BrokenRunner", BROKEN)
 
 
 def mistyped(folder: Path) -> Path:
-    """``fluxvla-typo``: imports, but its entry points name what is no class, or is not there."""
+    """``fluxvla-typo``: imports, but its entry points name what is not a class, or is not there."""
     module = "AcmeTypo = 7\n"
     return write_project(folder, "fluxvla-typo", "NobodyOperator", "AcmeTypo", module)
 
 
 def garbled(folder: Path) -> Path:
-    """``fluxvla-garbled``: its module is no Python."""
+    """``fluxvla-garbled``: its module is not Python."""
     module = '"""Cut short."""\n\n\nclass GarbledOperator:\n    def __init__(self,\n'
     return write_project(folder, "fluxvla-garbled", "GarbledOperator", "GarbledRunner", module)
 
@@ -198,7 +198,7 @@ def remove(env: Env, *names: str) -> None:
 
 
 def check(env: Env, builder: Env, folder: Path) -> None:
-    """Install a stranger's plugin into ``env``, run it by config alone, also beside broken ones.
+    """Install a stranger's plugin into ``env``, run it by config alone; also with broken ones.
 
     ``env`` is as before when this returns or raises.
 

@@ -14,7 +14,7 @@ def attach(
     """``__getattr__``, ``__dir__`` and ``__all__`` of a public module.
 
     A module is exported by its own name alone: ``{"fluxvla_core.ros2.joints": ["joints"]}``.
-    ``if TYPE_CHECKING`` imports beside it let type checkers and editors know the names;
+    ``if TYPE_CHECKING`` imports next to it let type checkers and editors know the names;
     ``tests/test_surface.py`` compares the two.
 
     Args:

@@ -47,7 +47,7 @@ def json_text(value: Any, indent: int | None = None) -> str:
     try:
         return encoder.encode(value)
     except (TypeError, ValueError):
-        # NaN, an infinity, or a mapping that is no dict.
+        # NaN, an infinity, or a mapping that is not a dict.
         return encoder.encode(_finite(value))
 
 
@@ -75,3 +75,12 @@ def write_text(path: Path, text: str) -> None:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any, indent: int = 1) -> None:
+    """Write ``value`` as indented JSON, as :func:`write_text` writes text.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    write_text(path, json.dumps(value, indent=indent, ensure_ascii=False) + "\n")

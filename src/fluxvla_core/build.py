@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.config.inspection import misfits, option_fields
 from fluxvla_core.config.resolve import INJECTED
+from fluxvla_core.config.runtime_signature import misfits, option_fields
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter

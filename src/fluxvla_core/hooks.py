@@ -56,8 +56,8 @@ def build_hooks(context: RunContext) -> HookCaller:
     """The hooks that ``config['hooks']`` names: a list of class names or tables with ``type``.
 
     Raises:
-        ConfigError: the value is no list of names and tables.
-        PluginError: a hook cannot be loaded, or has a method that is no hook.
+        ConfigError: the value is not a list of names and tables.
+        PluginError: a hook cannot be loaded, or has a method that is not a hook.
     """
     wanted = context.config.get("hooks", ())
     if not isinstance(wanted, (list, tuple)):

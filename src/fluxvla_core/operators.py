@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.frame import STATE as STATE
     from fluxvla_core.contracts.frame import Frame as Frame
     from fluxvla_core.contracts.frame import Observation as Observation
+    from fluxvla_core.contracts.part import Part as Part
     from fluxvla_core.contracts.policy import Continuation as Continuation
     from fluxvla_core.contracts.policy import Policy as Policy
     from fluxvla_core.contracts.robot import ActionFilter as ActionFilter
@@ -43,6 +44,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
     {
         "fluxvla_core.build": ["RunContext"],
         "fluxvla_core.contracts.frame": ["Frame", "Observation", "STATE"],
+        "fluxvla_core.contracts.part": ["Part"],
         "fluxvla_core.contracts.policy": ["Continuation", "Policy"],
         "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator"],
         "fluxvla_core.robot.control.clock": ["MonotonicClock", "SimulatedClock"],

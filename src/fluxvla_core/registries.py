@@ -23,7 +23,7 @@ _RUNNER = "fluxvla_core.contracts.runner"
 
 
 class RegistryRow(NamedTuple):
-    """What there is to know of one registry.
+    """Description of one registry.
 
     Args:
         name: in messages and code; the entry-point group is ``fluxvla.<name>``.
@@ -107,7 +107,7 @@ def check_api(registry: str, name: str, written: Any, origin: str) -> None:
         return
     have, want = _version(speaks), _version(str(written))
     if want is None or have is None:
-        raise IncompatiblePlugin(f"{origin}: {name}.api = {written!r} is no version")
+        raise IncompatiblePlugin(f"{origin}: {name}.api = {written!r} is not a version")
     if want == have or (want[0] == have[0] and want[1] <= have[1] and have[0] > 0):
         return
     upgrade = "fluxvla-core" if want > have else origin.partition(" ")[0]

@@ -1,4 +1,4 @@
-"""What runs leave behind: their files, for reports and dashboards.
+"""Public API for reading the files of a run, for reports and dashboards.
 
 ``episode_log`` names the events of an episode and sums them up; ``read_bag`` reads a recording.
 ``read_json``, ``parse_json`` and ``read_bytes`` read untrusted files: typed, bounded.

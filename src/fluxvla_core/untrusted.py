@@ -31,7 +31,7 @@ def read_bytes(path: Path, error: type[FluxError], *, at_most: int = AT_MOST) ->
     """The content of a regular file.
 
     Raises:
-        error: it is missing, cannot be read, is no regular file (a pipe, a device, a folder), or
+        error: it is missing, cannot be read, is not a regular file (a pipe, a device, a folder), or
             holds more than ``at_most`` bytes.
     """
     try:
@@ -39,7 +39,7 @@ def read_bytes(path: Path, error: type[FluxError], *, at_most: int = AT_MOST) ->
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise error("is no regular file, so it is not read", where=str(path))
+                raise error("is not a regular file, so it is not read", where=str(path))
             content = file.read(at_most + 1)
     except (OSError, ValueError) as problem:  # ValueError: a NUL in the name
         reason = getattr(problem, "strerror", None) or str(problem)
@@ -64,11 +64,11 @@ def read_json(path: Path, kind: type[T], error: type[FluxError], *, at_most: int
 def parse_json(content: bytes | str, kind: type[T], error: type[FluxError], where: str) -> T:
     """JSON as a ``kind``: a dataclass, a TypedDict, ``dict[str, float]``, …
 
-    Types are checked strictly: ``"3"`` and ``true`` are no numbers. Fields that ``kind`` does not
+    Types are checked strictly: ``"3"`` and ``true`` are not numbers. Fields that ``kind`` does not
     have are ignored.
 
     Raises:
-        error: it is no JSON, nested deeper than 200, or a field is missing or of another type.
+        error: it is not JSON, nested deeper than 200, or a field is missing or of another type.
     """
     return _validated(
         lambda adapter: adapter.validate_json(content, strict=True), kind, error, where
@@ -79,7 +79,7 @@ def checked(value: object, kind: type[T], error: type[FluxError], where: str) ->
     """``value``, which was parsed before, as a ``kind``; as strict as ``parse_json``.
 
     Raises:
-        error: a field is missing or of another type, or it is no JSON value.
+        error: a field is missing or of another type, or it is not a JSON value.
     """
     try:
         content = json.dumps(value)

@@ -196,5 +196,5 @@ def test_places_turn_by_distance_alone() -> None:
 
 
 def test_an_unknown_way_of_attention_is_refused() -> None:
-    with pytest.raises(ValueError, match="attention 'flash' is none of sdpa, packed"):
+    with pytest.raises(ValueError, match="attention 'flash' is not one of sdpa, packed"):
         BenchPi05("tiny", attention="flash")

@@ -248,11 +248,11 @@ def test_a_manifest_that_is_no_file_is_refused_at_once(tmp_path):
     manifest = path / "manifest.json"
     manifest.unlink()
     os.mkfifo(manifest)
-    with pytest.raises(CheckpointError, match=r"manifest\.json is no regular file"):
+    with pytest.raises(CheckpointError, match=r"manifest\.json is not a regular file"):
         Checkpoint.open(path)
     manifest.unlink()
     manifest.symlink_to("/dev/zero")
-    with pytest.raises(CheckpointError, match=r"manifest\.json is no regular file"):
+    with pytest.raises(CheckpointError, match=r"manifest\.json is not a regular file"):
         Checkpoint.open(path)
 
 

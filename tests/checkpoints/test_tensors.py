@@ -120,17 +120,30 @@ def with_header(path, header, length=None):
     return path
 
 
+def processor_s(work):
+    """Seconds of this process that the quickest of three takes, whatever else the machine does."""
+    found = []
+    for _ in range(3):
+        begin = time.process_time()
+        work()
+        found.append(time.process_time() - begin)
+    return min(found)
+
+
 def test_headers_larger_than_any_models_are_refused_before_they_are_parsed(tmp_path):
     entry = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     many = with_header(tmp_path / "many", {f"{i:06d}": entry for i in range(600_000)})
     few = with_header(tmp_path / "few", {f"{i:06d}": entry for i in range(150_000)})
     stated = with_header(tmp_path / "stated", {}, 1 << 60)
-    begin = time.perf_counter()
+    whole = processor_s(lambda: json.loads(few.read_bytes()[8:]))
     for path, fact in ((many, "16 MiB"), (few, "150000 tensors"), (stated, "16 MiB")):
         for read in (read_tensors, lambda path: StoredTensors([path])):
-            with pytest.raises(CheckpointError, match=fact):
-                read(path)
-    assert time.perf_counter() - begin < 10
+
+            def refused(path=path, fact=fact, read=read):
+                with pytest.raises(CheckpointError, match=fact):
+                    read(path)
+
+            assert processor_s(refused) < whole / 4
 
 
 @pytest.mark.parametrize(

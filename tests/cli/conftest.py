@@ -54,6 +54,11 @@ class ToyTrainRunner:
         report.progress("train", 1, 2, loss=0.5)
         if self.mode == "denied":
             raise DataError("bad data", where="a.mp4", next="look at it")
+        if self.mode == "silent":
+            time.sleep(0.5)
+        if self.mode == "hints":
+            text = "--set <section>.mode=a, --set <ToyDataset>.size=2 or --set <Gone>.size=2"
+            raise DataError("bad data", next=text)
         if self.mode == "full":
             raise OSError(28, "No space left on device", "big.bin")
         if self.mode == "ctrl-c":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 
@@ -37,6 +39,29 @@ def arm(install: Install) -> Install:
         files={"acme_arm.py": ARM},
     )
     return install
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [("list", "1 distribution(s) could not be read"), ("doctor", "METADATA")],
+)
+def test_a_pipe_for_metadata_keeps_no_command_waiting(
+    install: Install, command: str, said: str
+) -> None:
+    """As commands of their own: one that waited would wait for ever."""
+    folder = install("acme-pipe", entry_points="[fluxvla.operators]\nPipe = acme_pipe:Pipe\n")
+    (folder / "METADATA").unlink()
+    os.mkfifo(folder / "METADATA")
+    ended = subprocess.run(
+        [sys.executable, "-m", "fluxvla_core", "plugins", command],
+        env={**os.environ, "PYTHONPATH": str(folder.parent)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert said in ended.stdout + ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def test_list(fluxvla: Fluxvla, arm: Install) -> None:
@@ -82,6 +107,8 @@ def test_show(fluxvla: Fluxvla, arm: Install) -> None:
             "  defined at   acme_arm.py:5\n"
             "  contract     operators 1.0\n"
             "  about        Moves things.\n"
+            "  process      runs in one process with the policy: a policy that keeps the "
+            "interpreter's lock delays commands\n"
             "  keys\n"
             "    port: str   [required]\n"
             "    rate: int = 30\n"
@@ -137,6 +164,48 @@ class Arm(Base):
         "  keys\n    topic = '/a'\n        where it listens.\n"
         "    rate = 30\n        commands a second, by default 30.\n"
     )
+
+
+DIVIDED = """raise RuntimeError("show must not import")
+from fluxvla_core.operators import Operator
+from elsewhere import Unknown
+class Whole(Operator):
+    def connect(self): raise RuntimeError("show must not connect")
+class Divided(Operator):
+    def without_cameras(self):
+        return self
+    def without_commands(self):
+        return self
+class Inherits(Divided): ...
+class Duck:
+    def without_cameras(self): return self
+class Hidden(Unknown): ...
+def make(): ...
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Whole", "runs in one process with the policy: a policy that keeps"),
+        ("Divided", "can be divided: commands are sent from a process of its own\n"),
+        ("Inherits", "can be divided: "),
+        ("Duck", "can be divided: "),
+        ("Hidden", "not known: its source, or that of a base class, cannot be read\n"),
+        ("make", "not known: "),
+    ],
+)
+def test_show_says_whether_an_operator_can_be_divided(
+    fluxvla: Fluxvla, install: Install, name: str, said: str
+) -> None:
+    points = f"[fluxvla.operators]\n{name} = acme_divided:{name}\n"
+    install("acme-divided", entry_points=points, files={"acme_divided.py": DIVIDED})
+
+    assert f"\n  process      {said}" in fluxvla("plugins", "show", name).out
+
+
+def test_show_says_nothing_of_processes_where_there_is_no_operator(fluxvla: Fluxvla) -> None:
+    assert "process" not in fluxvla("plugins", "show", "LowPass").out
 
 
 def test_show_of_two_with_one_name(fluxvla: Fluxvla, arm: Install) -> None:
@@ -220,7 +289,7 @@ def entry(name: str, module: str) -> str:
 def test_doctor_of_a_sound_installation(
     fluxvla: Fluxvla, install: Install, alone: Callable[[], None]
 ) -> None:
-    """What a robot needs when it is connected, or prints when it is imported, is no problem."""
+    """What a robot needs when it is connected, or prints when it is imported, is not a problem."""
     lazy = "print('hello')\nclass Lazy:\n    def get_frame(self): import acme_vendor_sdk\n"
     install("acme-lazy", entry_points=entry("Lazy", "lazy"), files={"lazy.py": lazy})
     install("acme-desk", entry_points=entry("Desk", "desk"), files={"desk.py": DESK})

@@ -22,12 +22,13 @@ import pytest
 
 from fluxvla_core.cli import reporters
 from fluxvla_core.cli.reporters import (
+    EVERY_S,
     JsonReporter,
     KeepAliveReporter,
     LineReporter,
     Throttle,
-    plain,
-    shown,
+    format_fields,
+    json_values,
 )
 from fluxvla_core.commands import make_reporter
 
@@ -153,6 +154,11 @@ def test_a_silence_is_broken_and_a_person_who_types_is_left_alone() -> None:
     assert "fluxvla-keep-alive" not in {thread.name for thread in threading.enumerate()}
 
 
+def test_nobody_waits_longer_than_five_seconds_for_a_word() -> None:
+    assert EVERY_S <= 5.0
+    assert KeepAliveReporter.__init__.__defaults__ == (EVERY_S,)
+
+
 def test_a_silence_for_machines() -> None:
     out = io.StringIO()
     reporter = KeepAliveReporter(JsonReporter(out), every=0.2)
@@ -187,7 +193,8 @@ def test_count_bar_and_time_left_stay_where_the_terminal_is_narrow(columns: int)
     """In a terminal of its own: the program that draws runs behind a real pty."""
     code = (
         "import sys, time\n"
-        "from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter\n"
+        "from fluxvla_core.cli.choose_reporter import make_reporter\n"
+        "from fluxvla_core.cli.reporters import KeepAliveReporter\n"
         "reporter = KeepAliveReporter(make_reporter('text'), every=0.4)\n"
         "for step in range(340, 344):\n"
         "    time.sleep(0.3)\n"
@@ -231,5 +238,5 @@ def behind_a_terminal(command: list[str], columns: int) -> str:
 
 
 def test_values() -> None:
-    assert shown({"a": 1, "b": 123456.789, "c": None}) == "a 1  b 1.235e+05"
-    assert plain({1: (float("inf"), {2})}) == {"1": [None, "{2}"]}
+    assert format_fields({"a": 1, "b": 123456.789, "c": None}) == "a 1  b 1.235e+05"
+    assert json_values({1: (float("inf"), {2})}) == {"1": [None, "{2}"]}

@@ -12,6 +12,7 @@ import pytest
 
 from fluxvla_core import RUNNERS, atomic
 from fluxvla_core.cli.plan import default_work_dir
+from fluxvla_core.cli.reporters import KeepAliveReporter
 from fluxvla_core.config.load import load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.snapshot import write_resolved
@@ -54,6 +55,24 @@ def test_training(run: Fluxvla) -> None:
         "steps: 2",
         "work dir: work_dirs/c",
     ]
+
+
+def test_a_hint_names_the_tables_of_the_config(run: Fluxvla) -> None:
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode=hints")
+    assert ended.code == 2
+    assert (
+        "next: --set runner.mode=a, --set train_dataloader.dataset.size=2 or --set <Gone>.size=2"
+        in ended.err
+    )
+
+
+def test_a_section_that_is_silent_is_said_to_be_working(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1,))
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode=silent")
+    assert ended.code == 0
+    assert "s since: train 1/2" in ended.out
 
 
 def test_what_records_a_robots_run_is_part_of_the_config(run: Fluxvla) -> None:

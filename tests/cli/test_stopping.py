@@ -88,6 +88,56 @@ def test_no_signal_loses_a_step(form: str, workers: int, name: str, target: str)
     stops_with_all_saved(form, workers, name, target)
 
 
+@pytest.mark.parametrize("form", ["plain", "nproc"])
+def test_under_nohup_a_closed_terminal_changes_nothing(form: str) -> None:
+    with Job(form, workers=1, nohup=True) as job:
+        job.train(3)
+        pids, before = job.processes(), job.steps()
+        tell(job, "all", signal.SIGHUP)
+        job.train(before + 3)
+        assert set(pids) <= set(job.processes())
+        assert folders(job.work_dir) == []
+        job.process.terminate()
+        code, _, err = job.ended()
+        assert code == 1
+        assert "training was stopped by SIGTERM" in err
+        assert [step_of(folder) for folder in folders(job.work_dir)] == [job.steps()]
+
+
+@pytest.mark.parametrize("form", ["plain", "nproc"])
+def test_sigquit_ends_a_training_at_once_without_saving(form: str) -> None:
+    with Job(form, workers=1) as job:
+        job.train(3)
+        pids = job.processes()
+        os.killpg(job.process.pid, signal.SIGQUIT)
+        assert job.ended()[0] == -signal.SIGQUIT
+        assert gone(pids)
+        assert folders(job.work_dir) == []
+
+
+@pytest.mark.parametrize("runner", ["DDPTrainRunner", "FSDPTrainRunner"])
+def test_ranks_that_may_be_started_again_open_nothing_and_pickle_nothing(runner: str) -> None:
+    """torch's own rendezvous unpickles what is under ``torch.rendezvous.<id>`` in its store."""
+    from torch.distributed import TCPStore  # type: ignore[attr-defined]
+
+    if runner == "FSDPTrainRunner":
+        pytest.importorskip("fluxvla_fsdp")
+    words = ("--max-restarts", "2", "--set", f"runner.type={runner}")
+    with Job("nproc", *words) as job:
+        job.train(2)
+        pids = job.processes()
+        assert listening(pids) != []
+        assert outside(pids) == []
+        environ = Path(f"/proc/{job.rank(1)}/environ").read_bytes().decode().split("\0")
+        told = dict(line.split("=", 1) for line in environ if line)
+        assert told["MASTER_ADDR"] == "127.0.0.1"
+        store = TCPStore(told["MASTER_ADDR"], int(told["MASTER_PORT"]), is_master=False)
+        keys = store.list_keys()
+        assert keys
+        assert [key for key in keys if "torch.rendezvous" in key] == []
+        assert [key for key in keys if store.get(key).startswith(b"\x80")] == [], "pickled"
+
+
 def test_a_killed_rank_is_named_and_not_the_workers_of_the_others() -> None:
     with Job("nproc", workers=2) as job:
         job.train(3)

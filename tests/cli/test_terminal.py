@@ -1,4 +1,4 @@
-"""What is printed: escapes from files are shown, full disks and poor terminals are no traceback."""
+"""Printing: escapes from files are shown, full disks and poor terminals cause no traceback."""
 
 from __future__ import annotations
 

@@ -117,7 +117,63 @@ def test_an_unknown_key(write: Write) -> None:
     assert "ToyTrainRunner takes no 'zzz' (defined at toy/runners.py:4)" in text
 
 
-def test_a_misspelt_key_beside_the_inherited_one(write: Write) -> None:
+@pytest.mark.parametrize(
+    ("annotation", "known"),
+    [
+        ("Blur", True),
+        ("Blur | None", True),
+        ("'Blur | None'", True),
+        ("Optional[Blur]", True),
+        ("Blur | Mapping[str, Any] | None", True),
+        ("settings.Blur", True),
+        ("Sharp | None", True),
+        ("Mapping[str, Any]", False),
+        ("Blur | str", False),
+        ("Blur | Sharp", False),
+        ("Own | None", False),
+        ("Foreign", False),
+        ("list[Blur]", False),
+        ("Gone", False),
+    ],
+)
+def test_a_key_of_a_table_whose_parameter_names_a_dataclass(
+    annotation: str, known: bool, install: Install, write: Write
+) -> None:
+    points = "[fluxvla.transforms]\nToyBlur = blur.pixels:ToyBlur\n"
+    files = {
+        "blur/__init__.py": "raise RuntimeError('a check must not import')\n",
+        "blur/settings.py": "from dataclasses import dataclass\n"
+        "from typing import TypedDict\n"
+        "from nowhere import Anything\n"
+        "@dataclass\nclass Edge:\n    mode: str = 'wrap'\n"
+        "@dataclass\nclass Base:\n    sigma: float\n"
+        "@dataclass\nclass Blur(Base):\n    radius: int = 3\n    edge: Edge | None = None\n"
+        "class Plain(TypedDict):\n    sigma: float\n"
+        "class Sharp(Plain, total=False):\n    radius: int\n    edge: Edge\n"
+        "@dataclass\nclass Own:\n    a: int\n    def __init__(self, **keys): ...\n"
+        "@dataclass\nclass Foreign(Anything):\n    a: int\n",
+        "blur/pixels.py": "from collections.abc import Mapping\n"
+        "from typing import Any, Optional\n"
+        "from blur import settings\n"
+        "from blur.settings import Blur, Foreign, Own, Sharp\n"
+        f"class ToyBlur:\n    def __init__(self, blur: {annotation} = None): ...\n",
+    }
+    install("fluxvla-blur", entry_points=points, files=files)
+    resize = "dict(type='ToyResize', height=1, width=2)"
+    given = "dict(type='ToyBlur', blur=dict(\n radus=3, edge=dict(mod='wrap')))"
+    config = load_config(write("c.py", GOOD.replace(resize, given)))
+    where = "train_dataloader.dataset.transforms.0.blur"
+    name = "Sharp" if "Sharp" in annotation else "Blur"
+    places = {"Blur": 12, "Sharp": 17}
+    assert [str(problem) for problem in examine(config).problems] == [
+        f"c.py:6: {where}.radus: {name} takes no 'radus'; did you mean 'radius'? "
+        f"(defined at blur/settings.py:{places[name]})",
+        f"c.py:6: {where}.edge.mod: Edge takes no 'mod'; did you mean 'mode'? "
+        "(defined at blur/settings.py:6)",
+    ][: 2 if known else 0]
+
+
+def test_a_misspelt_key_next_to_the_inherited_one(write: Write) -> None:
     write("base.py", GOOD.replace("max_epochs=1", "max_epochs=1,\n  learning_rate=1e-3"))
     path = write("c.toml", "_base_ = 'base.py'\n[runner]\nmax_epoch = 2\nlearning_rte = 1.0\n")
     config = apply_overrides(load_config(path), ["runner.learning_rat+=1"])

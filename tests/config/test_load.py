@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -336,21 +337,37 @@ def test_another_json_is_refused(write: Write) -> None:
     assert "this has format None" in message(write("f.json", "[1]"))
 
 
+def processor_s(work: Callable[[], object]) -> float:
+    """Seconds of this process that the quickest of three takes, whatever else the machine does."""
+    found = []
+    for _ in range(3):
+        begin = time.process_time()
+        work()
+        found.append(time.process_time() - begin)
+    return min(found)
+
+
 def test_keys_by_the_hundred_thousand_are_refused_at_once(write: Write) -> None:
-    begin = time.perf_counter()
-    text = message(write("c.toml", "".join(f"a{i}=1\n" for i in range(400_000))))
-    assert "more than 1 MiB" in text
-    text = message(write("d.toml", "".join(f"a{i}=1\n" for i in range(90_000))))
-    assert "90000 keys; 5000 are the most" in text
-    assert time.perf_counter() - begin < 10
+    def keys(count: int) -> Path:
+        return write(f"c{count}.toml", "".join(f"a{i}=1\n" for i in range(count)))
+
+    allowed, too_many, too_large = keys(4_000), keys(90_000), keys(400_000)
+    assert "more than 1 MiB" in message(too_large)
+    assert "90000 keys; 5000 are the most" in message(too_many)
+    usual = processor_s(lambda: load_config(allowed))
+    assert processor_s(lambda: message(too_large)) < usual
+    assert processor_s(lambda: message(too_many)) < 2 * usual * 90_000 / 4_000
 
 
 def test_places_of_many_keys_are_found_in_linear_time(write: Write) -> None:
-    lines = [f"a{i} = 'x'\n" for i in range(4_000)]
-    path = write("c.toml", "\n" * 500_000 + "".join(lines))
-    begin = time.perf_counter()
-    assert load_config(path).where("a3999").endswith("c.toml:504000")
-    assert time.perf_counter() - begin < 5
+    def seconds(size: int) -> float:
+        lines = [f"a{i} = 'x'\n" for i in range(8 * size)]
+        path = write(f"c{size}.toml", "\n" * (1000 * size) + "".join(lines))
+        place = f"c{size}.toml:{1008 * size}"
+        assert str(load_config(path).where(f"a{8 * size - 1}")).endswith(place)
+        return processor_s(lambda: load_config(path))
+
+    assert seconds(500) < 15 * seconds(100), "25 times as long is quadratic"
 
 
 @pytest.mark.parametrize("twice", [True, False])
@@ -407,6 +424,6 @@ def test_files_that_are_none_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     endless.symlink_to("/dev/zero")
     loop.symlink_to(loop)
-    assert "is no regular file" in message(pipe)
-    assert "is no regular file" in message(endless)
+    assert "is not a regular file" in message(pipe)
+    assert "is not a regular file" in message(endless)
     assert "no such config" in message(loop)

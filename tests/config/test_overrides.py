@@ -144,9 +144,9 @@ def test_all_that_do_not_fit_are_listed() -> None:
     assert "'first' must be a number, it counts items of a list from 0" in text
     assert "it is there already, as 1; += adds a key or appends, = replaces" in text
     assert "--set nothing: an override is key=value, or key+=value to add" in text
-    assert "'[1' is no TOML value: " in text
-    assert "'.5' is no TOML number; write it as 0.5, or '\".5\"' for text" in text
-    assert "'007' is no TOML number; write it as 7, or" in text
+    assert "'[1' is not a TOML value: " in text
+    assert "'.5' is not a TOML number; write it as 0.5, or '\".5\"' for text" in text
+    assert "'007' is not a TOML number; write it as 7, or" in text
 
 
 @pytest.mark.parametrize(

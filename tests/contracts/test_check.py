@@ -157,7 +157,7 @@ Index = type("Index", (), {"__len__": lambda self: 1, "get_sample": lambda self,
 @pytest.mark.parametrize(
     ("registry", "base", "body", "problem"),
     [
-        ("vlas", object, {"forward": lambda self, images: {}}, "it is no torch.nn.Module"),
+        ("vlas", object, {"forward": lambda self, images: {}}, "it is not a torch.nn.Module"),
         ("vlas", nn.Module, {}, "it needs forward(), or predict_action()"),
         ("vlas", nn.Module, {"forward": 3}, "forward is a int, not a method"),
         ("vlas", Fit, {"fsdp_units": lambda self, x: []}, "fsdp_units() must accept no argument"),
@@ -262,6 +262,39 @@ def test_a_class_that_inherits_must_bring_what_is_abstract():
     body = {"stop": lambda self: None, "begin_episode": lambda self, task: None}
     with pytest.raises(LoadFailed, match=r"begin_episode\(\) must accept 2 arguments"):
         check_class("operators", type("Other", (Half,), body), "here")
+
+
+@pytest.mark.parametrize(
+    ("there", "lacks"),
+    [("without_cameras", "without_commands"), ("without_commands", "without_cameras")],
+)
+@pytest.mark.parametrize("base", [object, Operator])
+def test_an_operator_is_divided_into_both_parts_or_not_at_all(base, there, lacks):
+    class Whole(base):
+        embodiment = None
+
+        def connect(self): ...
+        def get_frame(self): ...
+        def send_action(self, action): ...
+        def stop(self): ...
+        def close(self): ...
+
+    check_class("operators", Whole, "here")
+    half = type("Half", (Whole,), {there: lambda self: self})
+    message = (
+        r"here: Half does not fulfil the contract of fluxvla\.operators: "
+        rf"it has {there}\(\) but no {lacks}\(\); these are needed together, or not at all"
+    )
+    with pytest.raises(LoadFailed, match=message):
+        check_class("operators", half, "here")
+    check_class("operators", type("Both", (half,), {lacks: lambda self: self}), "here")
+
+
+def test_a_robot_is_not_divided_unless_its_operator_says_so():
+    made = Operator.adapt(Sends())
+
+    assert made.without_cameras() is None
+    assert made.without_commands() is None
 
 
 def test_a_model_that_inherits_has_a_forward_all_the_same():

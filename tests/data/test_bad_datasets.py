@@ -53,15 +53,15 @@ def edit_column(root, file, name, change):
 
 def test_missing(tmp_path):
     text = refused(tmp_path / "nowhere")
-    assert f"{tmp_path / 'nowhere'}: there is no dataset here: the folder does not exist" in text
+    assert f"{tmp_path / 'nowhere'}: there is not dataset here: the folder does not exist" in text
     assert "check data_root_path" in text
 
 
 def test_a_file_or_another_folder(tmp_path, dataset):
     (tmp_path / "a.txt").write_text("")
-    assert "this is no LeRobot dataset: it is a file" in refused(tmp_path / "a.txt")
+    assert "this is not a LeRobot dataset: it is a file" in refused(tmp_path / "a.txt")
     text = refused(dataset.parent)
-    assert "this is no LeRobot dataset: it has no meta/info.json" in text
+    assert "this is not a LeRobot dataset: it has no meta/info.json" in text
     assert f"did you mean {dataset}?" in text
 
 
@@ -159,7 +159,7 @@ def test_pictures_that_are_not_in_the_tables(dataset):
     edit_info(dataset, features=info["features"])
     with pytest.raises(DataError, match=r"'observation\.images\.side' is of shape \(32, 48, 1\)"):
         ParquetDataset(str(dataset), [], ["side"])
-    with pytest.raises(DataError, match="'action' is stored as 'float32', it is no camera"):
+    with pytest.raises(DataError, match="'action' is stored as 'float32', it is not a camera"):
         ParquetDataset(str(dataset), [], ["action"])
 
 
@@ -230,7 +230,7 @@ def test_tasks_that_do_not_exist(dataset):
 
 def test_an_embodiment_that_is_none(dataset):
     (dataset / "meta/fluxvla_embodiment.json").write_text('{"name": "x"}')
-    with pytest.raises(SpecMismatch, match="this is no embodiment spec"):
+    with pytest.raises(SpecMismatch, match="this is not an embodiment spec"):
         read_metadata(dataset)
 
 

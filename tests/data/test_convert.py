@@ -197,7 +197,7 @@ def test_a_full_disk(old, tmp_path, monkeypatch):
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(convert_module, "write_json", full)
+    monkeypatch.setattr(convert_module, "write_metadata", full)
     with pytest.raises(RunFailed, match="no space left on the disk") as caught:
         convert(old, tmp_path / "new")
     assert caught.value.exit_code == 1

@@ -17,7 +17,7 @@ from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset, first_dataset, shares
 from fluxvla_core.data.sampler import EpochSampler, SampleKey
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
-from fluxvla_core.training.state import seeds_of
+from fluxvla_core.training.rng import seeds_of
 
 NOISE = {"type": "SampleFlowNoise"}
 NORMALISE = {"type": "NormalizeStatesAndActions"}

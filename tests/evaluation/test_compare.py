@@ -9,12 +9,12 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import UsageError
 from fluxvla_core.evaluation.compare import compare, describe, read
-from fluxvla_core.evaluation.episodes import EpisodeLog
+from fluxvla_core.evaluation.episodes import EvalLog
 
 
 def evaluated(folder, outcomes, group="policy", name="episodes.jsonl", **about):
     what = {"policy": "checkpoint", "checkpoint": "abc", "settings": {"max_steps": 9}, **about}
-    log = EpisodeLog(folder / "eval" / name, what)
+    log = EvalLog(folder / "eval" / name, what)
     for (task, seed), success in outcomes.items():
         status = {"status": "done", "success": success} if success is not None else {
             "status": "error", "error": "it crashed",
@@ -39,6 +39,15 @@ def test_pairs_are_counted_over_all_and_by_task(tmp_path):
     assert found["tasks"]["push"]["neither"] == 1
     assert (found["all"]["a"]["successes"], found["all"]["b"]["successes"]) == (3, 1)
     assert found["differences"] == []
+
+
+def test_one_task_is_not_said_to_be_all_of_them(tmp_path):
+    several = describe(compare(*map(read, sides(tmp_path / "two", A, B))))
+    assert [line.partition(":")[0] for line in several[2:5]] == ["lift", "push", "all 2 tasks"]
+    one = [{k: v for k, v in side.items() if k[0] == "lift"} for side in (A, B)]
+    lines = describe(compare(*map(read, sides(tmp_path / "one", *one))))
+    assert lines[2].startswith("lift: A 3/3")
+    assert "task" not in " ".join(lines[2:]).replace("all episodes", "")
 
 
 def test_the_command_says_it_in_words_and_in_json(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Episodes: order, resuming after anything, errors that are no failures, summaries."""
+"""Episodes: order, resuming after anything, errors that are not failures, summaries."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.evaluation.episodes import EpisodeKey, EpisodeLog, open_episode_log, run_in_pool
+from fluxvla_core.evaluation.episodes import EpisodeKey, EvalLog, open_eval_log, run_in_pool
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.statistics import describe_rate, summarise
+from fluxvla_core.evaluation.success_rates import describe_rate, summarise
 from tests.evaluation.workers import Episodes
 
 
@@ -43,7 +43,7 @@ def keys_of(count, task="task", group="policy"):
 
 def run(folder, keys, workers=2, reporter=None, what=None):
     reporter = reporter or Listener()
-    log = open_episode_log(folder / "episodes.jsonl", what or {"about": "this"}, reporter)
+    log = open_eval_log(folder / "episodes.jsonl", what or {"about": "this"}, reporter)
     with WorkerPool(Episodes(str(folder)), workers) as pool:
         return run_in_pool(pool, keys, log, reporter)
 
@@ -105,19 +105,19 @@ CODE = {"versions": {"mujoco": "3.3.0", "numpy": "2"}, "hash": "abc"}
 
 def test_an_episode_log_of_other_versions_is_asked_for(tmp_path):
     path, record = tmp_path / "episodes.jsonl", {**keys_of(1)[0].__dict__, "status": "done"}
-    EpisodeLog(path, {"a": 1}, code=CODE).add({**record, "success": True, "return": float("nan")})
+    EvalLog(path, {"a": 1}, code=CODE).add({**record, "success": True, "return": float("nan")})
     assert json.loads(path.read_text().splitlines()[1])["return"] is None, "JSON has no NaN"
-    assert len(EpisodeLog(path, {"a": 1}, code=CODE).records(keys_of(1))) == 1
+    assert len(EvalLog(path, {"a": 1}, code=CODE).records(keys_of(1))) == 1
     newer = {**CODE, "versions": {"mujoco": "3.4.0", "numpy": "2"}}
     with pytest.raises(UsageError, match=r"ran them: mujoco 3\.3\.0 -> 3\.4\.0\n"):
-        EpisodeLog(path, {"a": 1}, code=newer)
+        EvalLog(path, {"a": 1}, code=newer)
     beside = tmp_path / "episodes-0000-of-0002.jsonl"
     with pytest.raises(UsageError, match=r"mujoco 3\.3\.0 -> 3\.4\.0"):
-        EpisodeLog(beside, {"a": 1}, "episodes*.jsonl", newer)
-    log = EpisodeLog(path, {"a": 1}, code=newer, reuse=True)
+        EvalLog(beside, {"a": 1}, "episodes*.jsonl", newer)
+    log = EvalLog(path, {"a": 1}, code=newer, reuse=True)
     assert log.reused == set(keys_of(1))
     log.add({**record, "success": False})  # run again, by this code
-    assert EpisodeLog(path, {"a": 1}, code=newer).reused == set()
+    assert EvalLog(path, {"a": 1}, code=newer).reused == set()
 
 
 def test_an_episode_log_of_the_former_format_says_nothing_of_its_code(tmp_path):
@@ -126,12 +126,10 @@ def test_an_episode_log_of_the_former_format_says_nothing_of_its_code(tmp_path):
     lines += [{"group": "policy", "task": "task", "seed": 0, "status": "done", "success": True}]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     with pytest.raises(UsageError, match="a former version of FluxVLA kept these episodes"):
-        EpisodeLog(path, {"a": 1}, code=CODE)
-    log = EpisodeLog(path, {"a": 1}, code=CODE, reuse=True)
+        EvalLog(path, {"a": 1}, code=CODE)
+    log = EvalLog(path, {"a": 1}, code=CODE, reuse=True)
     assert (len(log.records(keys_of(1))), len(log.reused)) == (1, 1)
-    assert EpisodeLog(path, {"a": 2}, code=CODE).set_aside is not None, (
-        "another evaluation still is"
-    )
+    assert EvalLog(path, {"a": 2}, code=CODE).set_aside is not None, "another evaluation still is"
 
 
 def test_a_crash_is_an_error_and_not_a_failure(tmp_path):
@@ -224,12 +222,12 @@ def test_an_episode_log_that_cannot_be_written_is_named(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(RunFailed, match="episodes cannot be kept") as caught:
-        EpisodeLog(blocked / "episodes.jsonl", {})
+        EvalLog(blocked / "episodes.jsonl", {})
     assert str(blocked) in str(caught.value)
 
 
 def test_a_full_disk_says_how_to_go_on(tmp_path, monkeypatch):
-    log = EpisodeLog(tmp_path / "episodes.jsonl", {})
+    log = EvalLog(tmp_path / "episodes.jsonl", {})
 
     def full(descriptor):
         raise OSError(28, "No space left on device")

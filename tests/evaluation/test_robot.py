@@ -241,7 +241,7 @@ class TestRealRobot:
     ("arguments", "message"),
     [
         ({"section": "other"}, "section: 'other' is not in the config"),
-        ({"tasks": ["9"]}, "tasks: '9' is no task of inference; there are 1, 2"),
+        ({"tasks": ["9"]}, "tasks: '9' is not a task of inference; there are 1, 2"),
         ({"episodes": 0}, "episodes: must be at least 1, got 0"),
     ],
 )

@@ -97,7 +97,7 @@ def test_joint_targets_are_joined_and_kept_within_the_limits(walk):
         ([0.1], r"chunk has shape \(1,\); \(T, 1\) is needed"),
         (np.zeros((0, 1)), r"chunk has shape \(0, 1\)"),
         ([[1.0, 2.0]], r"chunk has shape \(1, 2\)"),
-        ([[1.0], [1.0, 2.0]], "chunk is no array of numbers: "),
+        ([[1.0], [1.0, 2.0]], "chunk is not an array of numbers: "),
     ],
 )
 def test_chunks_of_another_shape_are_refused(walk, chunk, text):

@@ -24,7 +24,7 @@ class Walk:
         limited: actions are places, not steps.
         marks: a folder in which each reset leaves a mark, and where what shall crash does: seeds
             below ``crashing`` crash at every attempt, those below ``shaky`` at the first alone.
-        diverging: below this seed the place is no number after three steps.
+        diverging: below this seed the place is not a number after three steps.
     """
 
     expert = "Walker"

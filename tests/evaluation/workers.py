@@ -105,11 +105,11 @@ class Episodes:
 def evaluate_forever(folder: str) -> None:
     """What a killed or interrupted evaluation runs: slow episodes into a log."""
     from fluxvla_core.contracts.reporter import SilentReporter
-    from fluxvla_core.evaluation.episodes import EpisodeKey, EpisodeLog, run_in_pool
+    from fluxvla_core.evaluation.episodes import EpisodeKey, EvalLog, run_in_pool
     from fluxvla_core.evaluation.pool import WorkerPool
 
     keys = [EpisodeKey("policy", "task", seed) for seed in range(40)]
-    log = EpisodeLog(Path(folder) / "episodes.jsonl", {"about": "this"})
+    log = EvalLog(Path(folder) / "episodes.jsonl", {"about": "this"})
     try:
         with WorkerPool(Episodes(folder, 0.15), 2) as pool:
             run_in_pool(pool, keys, log, SilentReporter())

@@ -157,10 +157,12 @@ def test_my_robots_operators_pass_the_conformance_kit(installed, ros_domain):
     limits = ("timeout=120", "faulthandler_timeout=150", "faulthandler_exit_on_timeout=true")
     options = [word for limit in limits for word in ("-o", limit)]
     tests = EXAMPLES / "fluxvla-myrobot" / "tests"
-    done = installed.python("-m", "pytest", "-v", *options, tests)
+    done = installed.python("-m", "pytest", "-v", "-rs", *options, tests)
 
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "skipped" not in done.stdout
+    # The one of the specification's shape has no parts.
+    skipped = [line for line in done.stdout.splitlines() if line.startswith("SKIPPED")]
+    assert [line for line in skipped if "cannot be divided" not in line] == []
 
 
 def test_my_train_runner_trains_and_saves_in_its_own_format(place):

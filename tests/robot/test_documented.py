@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._process_faults import PROCESS_FAULTS
 from benchmarks._robot_fault_list import FAULTS
 from fluxvla_core.operators import SafetySettings
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "time_to_hold.json"
-TEST = re.compile(r"`((?:tests/\w+/)?test_\w+\.py)(?:::(\w+))?`")
+TEST = re.compile(r"`((?:tests/(?:\w+/)+)?test_\w+\.py)(?:::(\w+))?`")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def test_every_test_that_the_page_names_exists(page):
 
 
 def test_the_table_has_the_faults_that_are_provoked_and_nothing_blank(rows):
-    assert [row[0] for row in rows] == [fault.name for fault in FAULTS]
+    assert [row[0] for row in rows] == [fault.name for fault in (*FAULTS, *PROCESS_FAULTS)]
     for row in rows:
         assert len(row) == 5
         assert all(row), row

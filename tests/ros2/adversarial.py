@@ -88,8 +88,11 @@ class Arm:
         return Frame(state, {} if kind == "blind" else {"front": image}, stamps)
 
     def send_action(self, action: np.ndarray) -> None:
-        self.moving = True
+        first, self.moving = not self.moving, True
         self._follow(action)
+        if first:
+            # The one before was a stop's: as ``Motion`` has it, no motion of this episode's.
+            self.before = None
 
     def _follow(self, action: np.ndarray) -> None:
         self.send(action)
@@ -228,6 +231,28 @@ def chunk_of(kind: str, a: float, b: float, pose: np.ndarray) -> np.ndarray:
     if kind == "shape":
         return np.zeros((4, 2))
     return np.repeat(pose[None], 4, axis=0)
+
+
+def hold_against_limits(path: np.ndarray, start: np.ndarray, halts: bool) -> None:
+    """Positions, speeds and accelerations of ``(N, 3)`` commands, from rest at ``start`` to rest.
+
+    ``halts``: joints that do not obey may halt at once, which must not push them on.
+    """
+    if not len(path):
+        return
+    assert np.isfinite(path).all()
+    whole = np.vstack([start, start, path])
+    speed = np.diff(whole, axis=0) * ARM.rate_hz
+    push = np.diff(speed, axis=0) * ARM.rate_hz
+    for column, joint in enumerate(ARM.joints):
+        assert path[:, column].min() >= joint.lower, joint.name
+        assert path[:, column].max() <= joint.upper, joint.name
+        assert np.abs(speed[:, column]).max() <= joint.velocity, joint.name
+        beyond = np.flatnonzero(np.abs(push[:, column]) > joint.acceleration)
+        assert beyond.size <= halts, joint.name
+        for halt in beyond:
+            assert abs(speed[halt + 1, column]) <= joint.acceleration / ARM.rate_hz, joint.name
+        assert abs(speed[-1, column]) <= joint.acceleration / ARM.rate_hz, joint.name
 
 
 class Shaken:

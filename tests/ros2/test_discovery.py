@@ -84,8 +84,9 @@ def test_only_others_count_as_commanders():
     assert discovery.other_publishers([publisher("me")], "me") == []
 
 
-def test_a_node_without_a_name_counts():
-    infos = [publisher("_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_")]
+@pytest.mark.parametrize("name", ["_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"])
+def test_a_node_without_a_name_counts(name):
+    infos = [publisher(name, name)]
 
     assert discovery.other_publishers(infos, "me") == ["a node without a name yet"]
 

@@ -20,7 +20,16 @@ from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import FluxError
 from fluxvla_core.ros2 import JOINT_STATE, Connection, joints, message_class
 from fluxvla_core.testing.ros2_driver import Driver
-from tests.ros2.adversarial import ARM, CHUNKS, FILTERS, SCRIPTS, SETTINGS, Adversary, arm_of
+from tests.ros2.adversarial import (
+    ARM,
+    CHUNKS,
+    FILTERS,
+    SCRIPTS,
+    SETTINGS,
+    Adversary,
+    arm_of,
+    hold_against_limits,
+)
 
 TOPIC = "/arm/command"
 NAMES = list(ARM.joint_names)
@@ -77,28 +86,6 @@ class Heard:
         while not condition():
             assert time.monotonic() < until, what
             time.sleep(0.0005)
-
-
-def hold_against_limits(path: np.ndarray, start: np.ndarray, halts: bool) -> None:
-    """Positions, speeds and accelerations of ``(N, 3)`` commands, from rest at ``start`` to rest.
-
-    ``halts``: joints that do not obey may halt at once, which must not push them on.
-    """
-    if not len(path):
-        return
-    assert np.isfinite(path).all()
-    whole = np.vstack([start, start, path])
-    speed = np.diff(whole, axis=0) * ARM.rate_hz
-    push = np.diff(speed, axis=0) * ARM.rate_hz
-    for column, joint in enumerate(ARM.joints):
-        assert path[:, column].min() >= joint.lower, joint.name
-        assert path[:, column].max() <= joint.upper, joint.name
-        assert np.abs(speed[:, column]).max() <= joint.velocity, joint.name
-        beyond = np.flatnonzero(np.abs(push[:, column]) > joint.acceleration)
-        assert beyond.size <= halts, joint.name
-        for halt in beyond:
-            assert abs(speed[halt + 1, column]) <= joint.acceleration / ARM.rate_hz, joint.name
-        assert abs(speed[-1, column]) <= joint.acceleration / ARM.rate_hz, joint.name
 
 
 @pytest.fixture(scope="module")

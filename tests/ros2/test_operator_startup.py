@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, NotReady
-from fluxvla_core.ros2 import JOINT_STATE, StreamSpec, camera_stream
+from fluxvla_core.ros2 import JOINT_STATE, StreamSpec, camera_stream, qos
 from tests.ros2.arm import (
     CAM,
     COMMANDS,
@@ -98,6 +98,32 @@ def test_a_lossy_stream_is_a_warning(drivers, operators, caplog, monkeypatch):
 
     assert "arm (/arm/state): " in caplog.text
     assert "messages arrived in 0.5 s" in caplog.text
+
+
+def test_pictures_from_another_dds_are_a_warning(drivers, operators, caplog, monkeypatch):
+    monkeypatch.setattr(qos, "_vendor", lambda offer: b"\x01\x10")
+    drivers([STATE, PICTURES], [COMMANDS])
+    operators().connect()
+
+    (warning,) = [line for line in caplog.messages if "another DDS" in line]
+    assert "another DDS: cam (/cam/image) from " in warning
+    assert " (Cyclone DDS). When " in warning
+    assert "fastdds_large_frames.xml" in warning
+
+
+def test_pictures_from_the_same_dds_are_none(drivers, operators, caplog):
+    drivers([STATE, PICTURES], [COMMANDS])
+    operators().connect()
+
+    assert "another DDS" not in caplog.text
+
+
+def test_best_effort_pictures_from_another_dds_are_none(drivers, operators, caplog, monkeypatch):
+    monkeypatch.setattr(qos, "_vendor", lambda offer: b"\x01\x10")
+    drivers([STATE, {**PICTURES, "best_effort": True}], [COMMANDS])
+    operators().connect()
+
+    assert "another DDS" not in caplog.text
 
 
 def test_failing_leaves_nothing_behind(operators):

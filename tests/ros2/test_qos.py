@@ -59,6 +59,34 @@ def test_the_vendor_is_told_by_the_publishers_guid(ros_domain, vendors, fast):
     assert qos.from_fast_dds(given) is fast
 
 
+# As rclpy (Kilted) gave them: Fast DDS 3.2.3, and Cyclone DDS 11.0.1 from its wheel.
+FAST = bytes.fromhex("010f78fdb15c8c530100000000000603")
+CYCLONE = bytes.fromhex("01105eb2fadf5a541ebd6aa700000203")
+UNLISTED = b"\x01\x7f" + CYCLONE[2:]
+
+
+@pytest.mark.parametrize(
+    ("gids", "names"),
+    [
+        ([], []),
+        ([FAST], []),
+        ([CYCLONE], ["Cyclone DDS"]),
+        ([FAST, CYCLONE, CYCLONE], ["Cyclone DDS"]),
+        ([UNLISTED], ["another DDS (vendor 017f)"]),
+    ],
+)
+def test_publishers_on_another_dds_are_named(ros_domain, gids, names):
+    given = [SimpleNamespace(endpoint_gid=list(gid)) for gid in gids]
+
+    assert qos.other_vendors(given) == names
+
+
+def test_where_fast_dds_does_not_receive_there_is_nothing_to_name(ros_domain, monkeypatch):
+    monkeypatch.setattr(qos, "_uses_fast_dds", lambda: False)
+
+    assert qos.other_vendors([SimpleNamespace(endpoint_gid=list(CYCLONE))]) == []
+
+
 def test_profiles_say_what_was_chosen(ros_domain):
     profile = qos.profile(qos.RELIABLE, 3, latched=True)
     plain = qos.profile(qos.BEST_EFFORT, 1)

@@ -80,8 +80,8 @@ def test_all_differences_are_named_at_once():
         ({"velocity": 0.0}, "velocity and acceleration must be positive"),
         ({"upper": float("inf")}, "limits must be finite"),
         ({"kind": "gripper"}, "open and closed state its polarity"),
-        ({"kind": "hinge"}, "kind 'hinge' is none of"),
-        ({"unit": "deg"}, "unit 'deg' is none of"),
+        ({"kind": "hinge"}, "kind 'hinge' is not one of"),
+        ({"unit": "deg"}, "unit 'deg' is not one of"),
         ({"unit": "m/s"}, "joint elbow: unit 'm/s' is a speed's; a mobile base, or another joint"),
         ({"unit": "rad/s"}, "unit 'rad/s' is a speed's"),
         ({"unit": "rpm"}, "unit 'rpm' is a speed's"),
@@ -148,5 +148,5 @@ def test_wrong_types_are_named_by_their_field(changes, fact):
     data = {**EmbodimentSpec("arm", (joint,), (), 10.0).to_dict(), **changes}
     with pytest.raises(SpecMismatch) as caught:
         EmbodimentSpec.from_dict(data)
-    assert str(caught.value).startswith("this is no embodiment spec: ")
+    assert str(caught.value).startswith("this is not an embodiment spec: ")
     assert fact in str(caught.value)

@@ -74,7 +74,54 @@ SHAPED = (
 DEEP = GOOD.replace('"front": now}', '"front": now, "front depth": now}').replace(
     "SmallOperator", "DeepOperator"
 )
-RIGHT = {"specimen_right.py": GOOD, "specimen_shaped.py": SHAPED, "specimen_deep.py": DEEP}
+
+# One that can be divided: its operators share one arm, as two processes share a robot.
+DIVIDED = (
+    GOOD.replace("class TestSmall(", "class Small(").replace("SmallOperator", "BaseOperator")
+    + """
+class DividedOperator(BaseOperator):
+    arm, count = np.zeros(2), 0
+    part = "whole"
+    def without_cameras(self):
+        self.part = "control"
+        return self
+    def without_commands(self):
+        self.part = "cameras"
+        return self
+    def get_state(self):
+        if self._state is None:
+            raise NotReady("not connected")
+        return type(self).arm.copy()
+    def get_frame(self):
+        if self.part == "control":
+            raise NotReady("no cameras")
+        if self._state is not None:
+            self._state = type(self).arm + 0.0
+        return super().get_frame()
+    def send_action(self, action):
+        if self.part == "cameras":
+            raise Rejected("no commands")
+        super().send_action(action)
+        type(self).arm = np.array(action)
+        type(self).count += 1
+    def close(self):
+        super().close()
+
+OPERATORS.register_module()(DividedOperator)
+
+class TestSmall(OperatorConformance):
+    entry_point = "DividedOperator"
+    ready_within_s = 2.0
+    def commands_heard(self, operator):
+        return OPERATORS.get("DividedOperator").count
+"""
+)
+RIGHT = {
+    "specimen_right.py": GOOD,
+    "specimen_shaped.py": SHAPED,
+    "specimen_deep.py": DEEP,
+    "specimen_divided.py": DIVIDED,
+}
 
 BROKEN = {
     "test_is_complete": ('    api = "1.0"\n', ""),
@@ -118,6 +165,30 @@ BROKEN = {
     ),
 }
 
+READ, SEEN, SILENT = (
+    "test_both_parts_read_the_robot_at_the_same_time",
+    "test_a_command_of_one_part_is_seen_by_the_other",
+    "test_the_part_without_commands_sends_nothing",
+)
+# What is wrong -> the check that finds it, and the change of ``DIVIDED`` that makes it wrong.
+BADLY_DIVIDED = {
+    "half": (READ, 'self.part = "cameras"\n        return self', "return None"),
+    "frames without cameras": (READ, 'if self.part == "control"', "if False"),
+    "no state": (READ, "return type(self).arm.copy()", "return None"),
+    "another state": (
+        READ,
+        "return type(self).arm.copy()",
+        'return type(self).arm + 0.1 * (self.part == "cameras")',
+    ),
+    "another robot": (SEEN, "type(self).arm = np.array(action)", "pass"),
+    "commands": (SILENT, 'if self.part == "cameras"', "if False"),
+    "a last command": (
+        SILENT,
+        "super().close()",
+        'type(self).count += self.part == "cameras"; super().close()',
+    ),
+}
+
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
@@ -130,6 +201,14 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         assert old in GOOD
         name = f"specimen_{number}.py"
         source = GOOD.replace(old, new, 1).replace("SmallOperator", f"Small{number}Operator")
+        (folder / name).write_text(source)
+        wanted.append(f"{name}::TestSmall::{check}")
+    for number, (check, old, new) in enumerate(BADLY_DIVIDED.values()):
+        assert old in DIVIDED
+        name = f"divided_{number}.py"
+        source = DIVIDED.replace(old, new, 1)
+        for operator in ("BaseOperator", "DividedOperator"):
+            source = source.replace(operator, f"{operator[:-8]}{number}PartsOperator")
         (folder / name).write_text(source)
         wanted.append(f"{name}::TestSmall::{check}")
     options = ["-q", "-rA", "-p", "no:cacheprovider", "--tb=no"]
@@ -155,6 +234,14 @@ def test_a_right_operator_passes_every_check(outcomes, specimen):
 def test_a_wrong_operator_fails_its_own_check(outcomes, check):
     number = list(BROKEN).index(check)
     assert outcomes[f"specimen_{number}.py::{check}"] == "FAILED"
+
+
+@pytest.mark.parametrize("fault", BADLY_DIVIDED)
+def test_a_wrong_division_fails_its_own_check(outcomes, fault):
+    number, check = list(BADLY_DIVIDED).index(fault), BADLY_DIVIDED[fault][0]
+    # Half a division fails before the check, in the fixture that divides.
+    expected = "ERROR" if fault == "half" else "FAILED"
+    assert outcomes[f"divided_{number}.py::{check}"] == expected
 
 
 def test_commands_that_never_end_are_reported():

@@ -95,7 +95,7 @@ def test_a_command_beside_is_waited_for_and_shown_only_if_it_fails(
         sys.exit(int(sys.argv[1]))
     """)
     for status in (0, 3):
-        with shell.beside([sys.executable, "-c", program, str(status)], cwd=tmp_path):
+        with shell.alongside([sys.executable, "-c", program, str(status)], cwd=tmp_path):
             (tmp_path / "go").touch()
         (tmp_path / "done").unlink()
         (tmp_path / "go").unlink()
@@ -109,7 +109,7 @@ def test_a_command_beside_a_failing_one_is_ended(tmp_path: Path) -> None:
     other = shell.StepFailed(["other"], 1)
 
     def fails() -> None:
-        with shell.beside([sys.executable, "-c", program], cwd=tmp_path):
+        with shell.alongside([sys.executable, "-c", program], cwd=tmp_path):
             while not list(tmp_path.iterdir()):
                 time.sleep(0.01)
             raise other

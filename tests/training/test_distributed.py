@@ -95,7 +95,7 @@ def test_a_single_process_can_have_a_group():
 
 
 def test_devices_that_are_not_there_are_refused(monkeypatch):
-    with pytest.raises(ConfigError, match="device 'gpu' is none of 'auto', 'cpu', 'cuda'"):
+    with pytest.raises(ConfigError, match="device 'gpu' is not one of 'auto', 'cpu', 'cuda'"):
         start("gpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="device is 'cuda', but torch finds no GPU here"):

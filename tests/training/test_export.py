@@ -220,7 +220,7 @@ def test_only_files_that_the_manifest_vouches_for_are_copied(tmp_path, monkeypat
         ("policy.json", '{"action_rate_hz": -1, "horizon": 1}', "policy.json: action_rate_hz"),
         ("policy.json", '{"action_rate_hz": 5, "horizon": "4"}', "policy.json: horizon"),
         ("dataset_statistics.json", '{"private": 1}', "dataset_statistics.json: private"),
-        ("embodiment.json", '{"joints": 1}', "no embodiment spec"),
+        ("embodiment.json", '{"joints": 1}', "not an embodiment spec"),
     ],
 )
 def test_wrong_types_in_a_checkpoint_are_named(tmp_path, name, text, fact):

@@ -28,7 +28,7 @@ from fluxvla_core.testing.training import (
     unflushed,
 )
 from fluxvla_core.training.distributed import start
-from fluxvla_core.training.state import rank_seed
+from fluxvla_core.training.rng import rank_seed
 
 ROOT = Path(__file__).resolve().parents[2]
 NUMBERS = [

@@ -242,7 +242,8 @@ def test_a_setup_that_the_system_has_no_memory_for_is_told_of(tmp_path, monkeypa
     runner = make(tmp_path)
     monkeypatch.setattr(runner, "run_setup", lambda n_train_examples: refuse())
     config = {"runner": {}, "train_dataloader": {"dataset": {}}}
-    plan, context = SimpleNamespace(section="runner"), SimpleNamespace(config=config)
+    plan = SimpleNamespace(section="runner", config=SimpleNamespace(tree=config))
+    context = SimpleNamespace(config=config)
     with pytest.raises(RunFailed, match="this machine ran out of memory"):
         _run_section(plan, lambda cfg, context: runner, context)
 
@@ -256,7 +257,7 @@ def test_a_run_keeps_what_it_saved_and_goes_on(tmp_path, monkeypatch):
         return forward(self, **batch)
 
     runner = make(tmp_path)
-    runner._arguments = None
+    runner.forward_arguments = None
     with unflushed():
         runner.run_setup(37)
         monkeypatch.setattr(runner, "_training_step", lambda batch: growing(runner.vla, **batch)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.optim import ScheduledLR
+from fluxvla_core.training.lr_scheduler import ScheduledLR
 from fluxvla_core.training.schedule import TYPES, make_schedule
 
 

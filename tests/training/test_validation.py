@@ -348,7 +348,8 @@ def test_it_is_normalised_as_the_training_data_are():
     inner = Normalised()
     share_statistics(train_set, Mixed(inner, TinyDataset()))
     assert inner.statistics == train_set.statistics
-    with pytest.raises(ConfigError, match="statistic_name 'other' is none of the training data's"):
+    message = "statistic_name 'other' is not one of the training data's"
+    with pytest.raises(ConfigError, match=message):
         share_statistics(train_set, Normalised("other"))
 
 

@@ -1,4 +1,4 @@
-"""What of a demo is done: written after every stage, so that it goes on where it stopped."""
+"""A demo's finished stages: written after every stage, so that it goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Journal:
             self.entries = {}
 
     def forget_from(self, name: str) -> None:
-        """Drop a stage and those after it: they are done anew, and their time was another's."""
+        """Drop a stage and those after it: they are done again, and their time was another's."""
         names = list(self.entries)
         for later in names[names.index(name) :] if name in names else ():
             del self.entries[later]

@@ -1,4 +1,4 @@
-"""What to do with a demo's results: commands with its own paths, which CI runs in short forms."""
+"""Next steps with a demo's results: commands with its own paths, which CI runs in short forms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tools.envs import Env
 ROS2_CONFIG = CONFIG.with_name("aloha_sim_ros2.py")
 OTHER_TASK = "hand the cube over to the left arm"
 OTHER_SEED = 2000
-# The robot of the ROS 2 command, in a terminal beside it.
+# The robot of the ROS 2 command, in a second terminal.
 ROBOT = "fluxvla sim aloha --ros2 --cameras top --height 144 --width 192"
 
 
@@ -72,7 +72,7 @@ def told(steps: list[Next]) -> list[str]:
     for step in steps:
         lines.append(f"  {step.title:{width}}  {step.line}")
         if step.command[3:4] == (str(ROS2_CONFIG),):
-            lines.append(f"  {'':{width}}  beside it: {ROBOT}  (docs/ros2.md)")
+            lines.append(f"  {'':{width}}  at the same time: {ROBOT}  (docs/ros2.md)")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""What the demo's files say in the end: the measured speed, the success rates."""
+"""Results of the demo, read from its files: the measured speed, the success rates."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ class Demo:
     def _clear(self, stage: Stage) -> None:
         for path in stage.clears:
             if path.exists():
-                self._say(f"    {path} was made with other inputs: starting it anew")
+                self._say(f"    {path} was made with other inputs: starting again")
                 shutil.rmtree(path)
 
     def _write_stages(self) -> None:

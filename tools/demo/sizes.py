@@ -1,4 +1,4 @@
-"""How large each form of the demo is."""
+"""Sizes of the forms of the demo."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Size:
         minutes: what the whole demo may take, installation included; None: no limit. With a
             limit the steps are chosen by the speed that is measured first.
         episodes: to evaluate, for each task and each way of acting.
-        overrides: of the config, beside those above.
+        overrides: of the config, in addition to those above.
     """
 
     name: str

@@ -89,7 +89,7 @@ def evaluate(size: Size, places: Places) -> Stage:
     words = ["fluxvla", "run", "--config", str(CONFIG), "--section", "eval"]
     words += ["--work-dir", str(places.work), "--nproc", str(cores())]
     words += ["--set", f"eval.episodes={size.episodes}"]
-    title = f"evaluate {size.episodes} unseen seeds for each task and way of acting"
+    title = f"evaluate {size.episodes} evaluation seeds for each task and way of acting"
     return Stage("evaluate", title, tuple(words), (), (places.work / "eval",))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import numpy as np
@@ -216,7 +217,10 @@ class TestArmsThatNobodyNamed:
             operator.connect()
         assert caught.value.where == "robot.py:7: go.operator"
         assert "known are viperx300, arx_x5, piper" in caught.value.what
-        assert "set arms='arx_x5' or arms='piper'" in caught.value.next
+        assert (
+            "--set <AlohaOperator>.arms=arx_x5 or --set <AlohaOperator>.arms=piper"
+            in caught.value.next
+        )
 
     @pytest.mark.parametrize("named", [{"arms": "piper"}, {"embodiment": aloha_spec().to_dict()}])
     def test_once_they_are_named_it_goes_on(self, ros_domain, named):
@@ -358,11 +362,30 @@ class TestCobotMagic:
         with pytest.raises(NotReady, match="aloha is not connected"):
             operator.drive(0.1, 0.0)
 
+    def test_only_the_part_with_commands_drives_the_base(self, ros_domain, drivers):
+        driver = drivers(*robot(base=True))
+        with ExitStack() as stack:
+            made = [AlohaOperator(**{**QUICK, "use_robot_base": True}) for _ in range(2)]
+            control, cameras = made[0].without_cameras(), made[1].without_commands()
+            for part in (cameras, control):
+                stack.callback(part.close)
+                part.connect()
+            np.testing.assert_allclose(cameras.get_frame().base, [0.2, -0.1])
+            with pytest.raises(Rejected, match="this part of aloha sends no commands"):
+                cameras.drive(0.1, 0.0)
+            cameras.stop()
+            cameras.close()
+            time.sleep(TIMEOUT_S)
+            assert driver.on("/cmd_vel") == []
+
+            control.drive(0.1, 0.0)
+            wait_for(lambda: len(driver.on("/cmd_vel")) == 2)
+
     def test_without_a_base_there_is_no_driving(self):
         with pytest.raises(Rejected, match="the base is not used") as caught:
             AlohaOperator().drive(0.1, 0.0)
 
-        assert caught.value.next == "set use_robot_base=True"
+        assert caught.value.next == "--set <AlohaOperator>.use_robot_base=true"
 
 
 class TestInterbotix:

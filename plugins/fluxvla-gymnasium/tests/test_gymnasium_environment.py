@@ -17,7 +17,7 @@ from fluxvla_mujoco import divergence
 from fluxvla_core import build_environment_from_cfg, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
 from fluxvla_core.evaluation import RolloutSettings, run_episode
-from fluxvla_core.evaluation.statistics import summarise
+from fluxvla_core.evaluation.success_rates import summarise
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing import EnvironmentConformance
 
@@ -209,9 +209,13 @@ def test_what_does_not_fit_is_refused_before_the_first_step(arguments, error, me
     ("arguments", "message"),
     [
         ({"render": "nice"}, "render 'nice' is unknown; choose one of"),
-        ({"id": "gym_aloha:gym_aloha/X-v0"}, "set module = 'gym_aloha' and id = 'gym_aloha/X-v0'"),
-        ({"module": "os.path"}, "'os.path' is no name of an installed package"),
-        ({"success": "reward"}, "success 'reward' is none of info, terminated, truncated"),
+        (
+            {"id": "gym_aloha:gym_aloha/X-v0"},
+            "--set <GymnasiumEnvironment>.module=gym_aloha "
+            "--set <GymnasiumEnvironment>.id=gym_aloha/X-v0",
+        ),
+        ({"module": "os.path"}, "'os.path' is not the name of an installed package"),
+        ({"success": "reward"}, "success 'reward' is not one of info, terminated, truncated"),
         (
             {"success_reward": 1.0, "success_return": 9.0},
             "success_reward and success_return are two ways: give one of them",
@@ -235,7 +239,7 @@ def test_a_picture_that_is_not_there_is_named():
     made.reset(0, "CartPole-v1")
     with pytest.raises(SpecMismatch, match="has no picture 'top'; it has none") as caught:
         made.observe(made.spec.embodiment.cameras)
-    assert "set cameras = {'top': '<one of these, or render>'}" in str(caught.value)
+    assert "--set '<GymnasiumEnvironment>.cameras={top = \"NAME\"}'" in str(caught.value)
     made.close()
 
 
@@ -294,7 +298,23 @@ def test_who_never_says_whether_it_is_done_is_refused_before_the_first_episode()
     with pytest.raises(ConfigError, match="CartPole-v1 does not say whether its task is") as caught:
         made.reset(0, "CartPole-v1")
     assert "its info has nothing, and neither of is_success, success" in str(caught.value)
-    assert "set success = 'terminated' or 'truncated', success_reward" in str(caught.value)
+    assert "--set <GymnasiumEnvironment>.success=terminated (or truncated)" in str(caught.value)
+
+
+def test_in_a_run_the_hint_is_an_option_for_its_config(tmp_path):
+    table = {"type": "GymnasiumEnvironment", "id": "CartPole-v1", "embodiment": body(1, 4)}
+    section = {"type": "EvalRunner", "environment": table, "policy": "random", "episodes": 1}
+    (tmp_path / "c.py").write_text(f"eval = {section!r}\n")
+    words = ["run", "--config", "c.py", "--section", "eval", "--work-dir", "work"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "fluxvla_core", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert "next: --set eval.environment.success=terminated (or truncated)" in ended.stderr
 
 
 class Errand(gymnasium.Env):

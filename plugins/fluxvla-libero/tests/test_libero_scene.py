@@ -31,7 +31,7 @@ def shake(scene, seed, steps=12):
 
 
 def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
-    """After other episodes in the scene, and from a model that LIBERO built anew."""
+    """After other episodes in the scene, and from a model that LIBERO built again."""
     init = init_states("libero_object", 2)
     scene.reset(init[1])
     shake(scene, 1)

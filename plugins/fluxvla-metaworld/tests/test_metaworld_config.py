@@ -1,4 +1,4 @@
-"""What is known before anything is built, and what is said where it is impossible."""
+"""Config checks before anything is built, and their messages."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_sets_of_tasks_have_names():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"tasks": "MT25"}, "'MT25' is no set of tasks; there are MT10, MT50"),
+        ({"tasks": "MT25"}, "'MT25' is not a set of tasks; there are MT10, MT50"),
         ({"tasks": ["juggle-v3"]}, "Meta-World has no task 'juggle-v3'; it has assembly-v3, "),
         ({"tasks": []}, "tasks must name each task once"),
         ({"tasks": ["push-v3", "push-v3"]}, "tasks must name each task once"),

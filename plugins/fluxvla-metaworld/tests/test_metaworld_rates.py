@@ -7,6 +7,7 @@ Meta-World's own test (tests/metaworld/test_evaluation.py of Farama-Foundation/M
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from math import comb
 
 import numpy as np
@@ -40,6 +41,9 @@ def test_experts_succeed_and_chance_does_not(metaworld, tmp_path):
     lines = (tmp_path / "expert" / "eval" / "episodes.jsonl").read_text().splitlines()[1:]
     steps = [json.loads(line)["steps"] for line in lines]
     assert max(steps) < 150, "an episode ends with its first success"
+    written = json.loads((tmp_path / "expert" / "eval" / "results.json").read_text())
+    for name in ("fluxvla-core", "fluxvla-metaworld", "metaworld", "gymnasium", "mujoco"):
+        assert written["provenance"]["versions"][name] == version(name)
     random = evaluate(tmp_path / "random", "random", tasks, 3, max_steps=60)
     assert (random["all"]["successes"], random["all"]["errors"]) == (0, 0)
 

@@ -1,4 +1,4 @@
-"""What is read of a work dir, whole, in part and damaged."""
+"""Reading a work dir: whole, in part and damaged."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_damage_is_named_and_hurts_nothing_else(tmp_path: Path) -> None:
     assert facts.training.steps == [1.0, 3.0]
     assert math.isnan(facts.training.columns["loss"][0])
     problems = "\n".join(facts.problems)
-    assert "metrics.jsonl: 2 line(s) are no JSON objects and were left out" in problems
+    assert "metrics.jsonl: 2 line(s) are not JSON objects and were left out" in problems
     assert "config.resolved.json: invalid JSON" in problems
     assert "environment.json: input should be an object" in problems
     assert "stages.json: invalid JSON" in problems

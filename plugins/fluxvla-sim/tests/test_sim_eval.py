@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -216,6 +217,8 @@ def test_the_runner_evaluates_both_tasks_with_either_instruction(tmp_path):
     written = json.loads((tmp_path / "eval" / "results.json").read_text())
     assert written == json.loads(json.dumps(results))
     assert (written["policy"], written["environment"]) == ("SimExpert", "AlohaSimEnvironment")
+    for name in ("fluxvla-core", "fluxvla-sim", "gym-aloha", "dm-control", "mujoco"):
+        assert written["provenance"]["versions"][name] == version(name)
     assert written["settings"]["render"] == "cheap"
     assert written["settings"]["replan_every"] == 5
     assert list(results["groups"]["policy"]["tasks"]) == ["lift_hold", "transfer_cube"]

@@ -102,11 +102,11 @@ ROBOTS = {
     "aloha": lambda: AlohaOperator(arms="viperx300", camera_names=("top",), **PATIENT),
     "ur5e": lambda: UROperator(camera_names=("front",), **PATIENT),
 }
-JOINERS = ("synchronous", "latest_only", "temporal_ensemble", "rtc")
+JOINERS = ("synchronous", "latest_only", "temporal_ensemble", "overlap", "rtc")
 
 
 class Swinger(Follower):
-    """Answers anew about 30 times a second, which no stream's rate divides."""
+    """Answers about 30 times a second, which no stream's rate divides."""
 
     action_rate_hz = 30.0
 

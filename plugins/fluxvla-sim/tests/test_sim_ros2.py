@@ -21,7 +21,7 @@ from fluxvla_sim.ur.scene import HOME as UR_HOME
 from fluxvla_ur.operator import UROperator
 
 from fluxvla_core import BaseInferenceRunner, RunContext
-from fluxvla_core.errors import ConfigError, Faulted, NotReady
+from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
 from fluxvla_core.ros2 import Connection, Stale, message_class
 from fluxvla_core.testing.ros2 import ros_domain
 
@@ -371,6 +371,16 @@ class TestUR5e:
         operator.send_action(UR_HOME)
 
 
+def frames_of(operator):
+    """Frames; a moment in which there is none is forgiven."""
+    until = time.monotonic() + 20.0
+    while time.monotonic() < until:
+        try:
+            yield operator.get_frame()
+        except Stale:
+            time.sleep(0.02)
+
+
 @pytest.mark.realtime
 class TestInSimulation:
     """The operators that know that their robot is simulated."""
@@ -400,6 +410,27 @@ class TestInSimulation:
         np.testing.assert_allclose(operator.get_frame().state, HOME, atol=0.02)
         assert (operator.facts()["seed"], operator.facts()["steps"]) == (20, 0)
         assert operator.last_action is None, "or a stop would send the arm back there"
+
+    def test_a_new_episode_is_seen_by_the_part_that_does_not_begin_it(self, simulate, connect):
+        simulate("aloha", "--ros2", "--cameras", "top")
+        divided = {
+            divide: connect(lambda d=divide, **a: getattr(AlohaSimROSOperator(**a), d)(), **ALOHA)
+            for divide in ("without_commands", "without_cameras")
+        }
+        cameras, control = divided.values()
+        aside = HOME.copy()
+        aside[0] = 0.5
+        drive(control, aside, lambda state: np.allclose(state, aside, atol=0.06))
+        stale = cameras.get_frame()
+        control.begin_episode("pick up the cube with the right arm and hold it", 1)
+
+        # In between, it must not say what it still has of the episode before.
+        frame = next(frames_of(cameras))
+        np.testing.assert_allclose(frame.state, HOME, atol=0.02)
+        assert (frame.images["top"] != stale.images["top"]).any(), "the cube is elsewhere"
+        assert (control.facts()["seed"], control.task_success()) == (1, False)
+        with pytest.raises(Rejected, match="sends no commands"):
+            cameras.begin_episode("pick up the cube with the right arm and hold it", 2)
 
     def test_two_clocks_that_differ_are_refused(self, simulate, connect):
         simulate("aloha", "--ros2", "--cameras", "top")

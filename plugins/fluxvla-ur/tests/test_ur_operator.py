@@ -144,7 +144,7 @@ class TestConfig:
     def test_a_rate_at_which_the_robot_would_ignore_commands_is_refused(self, model, rate_hz):
         with pytest.raises(ConfigError, match=r"the robot ignores more than 0\.04 rad") as caught:
             UROperator(model=model, publish_rate=rate_hz)
-        assert "leave publish_rate out, or set it to" in caught.value.next
+        assert "leave publish_rate out, or --set <UROperator>.publish_rate=" in caught.value.next
         UROperator(model=model, publish_rate=rate_hz, controller=SCALED)
 
     def test_topics_models_and_cameras_are_those_of_the_config(self):

@@ -1,6 +1,6 @@
 """A checkpoint folder's name, and the list of its files with their sizes and SHA-256.
 
-A folder without a readable manifest is no checkpoint. The manifest carries a hash of itself, so
+A folder without a readable manifest is not a checkpoint. The manifest carries a hash of itself, so
 that a flipped bit in it is not taken for damage of the file that it describes.
 """
 

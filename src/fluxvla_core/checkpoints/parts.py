@@ -48,10 +48,10 @@ class Region:
 
     @classmethod
     def of(cls, tensor: Tensor) -> Region:
-        """What this rank holds of ``tensor``; all of it if it is not sharded.
+        """This rank's part of ``tensor``; all of it if it is not sharded.
 
         Raises:
-            CheckpointError: it is split in a way that is no block.
+            CheckpointError: it is split in a way that is not a block.
         """
         offsets, sizes = [0] * tensor.ndim, list(tensor.shape)
         if is_dtensor(tensor):
@@ -118,7 +118,7 @@ def own_parts(tensors: Mapping[str, Tensor], first: bool) -> dict[str, Tensor]:
 
 
 def describe_parts(tensors: Mapping[str, Tensor]) -> dict[str, str]:
-    """What the header of a file with this rank's parts of ``tensors`` says of them."""
+    """Description of this rank's parts of ``tensors``, for the header of their file."""
     places = {name: {"saved_offsets": Region.of(t).offsets} for name, t in tensors.items()}
     shapes = {name: list(t.shape) for name, t in tensors.items()}
     return {PLACES: json.dumps(places), "DCP_VERSION": "1.0", SHAPES: json.dumps(shapes)}
@@ -195,7 +195,7 @@ class StoredTensors(Mapping[str, Stored]):
 
         places = table(PLACES, dict[str, _Place])
         shapes = table(SHAPES, dict[str, tuple[Count, ...]])
-        for name in file.keys():  # noqa: SIM118 - it is no mapping
+        for name in file.keys():  # noqa: SIM118 - it is not a mapping
             sizes = tuple(file.get_slice(name).get_shape())
             if places and name not in places:
                 raise CheckpointError(f"{path.name} does not say where {name} belongs")

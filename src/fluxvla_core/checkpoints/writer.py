@@ -124,7 +124,7 @@ class CheckpointWriter:
         """A file with ``value`` as JSON.
 
         Raises:
-            RunFailed: something in ``value`` is no JSON value.
+            RunFailed: something in ``value`` is not a JSON value.
         """
         self.write_bytes(name, json_bytes(name, value))
 
@@ -151,7 +151,7 @@ class CheckpointWriter:
             )
 
     def report(self) -> str:
-        """What this rank has written, or its error, for :meth:`join` on the first rank."""
+        """This rank's files, or its error, for :meth:`join` on the first rank."""
         files = {name: [entry.size, entry.sha256] for name, entry in self.files.items()}
         error = self._error and [self._error.errno, self._error.strerror or str(self._error)]
         return json.dumps({"rank": self.rank, "files": files, "error": error})
@@ -257,7 +257,7 @@ def json_bytes(name: str, value: Mapping[str, Any]) -> bytes:
     """``value`` as JSON; floats keep every bit, NaN is refused.
 
     Raises:
-        RunFailed: something in ``value`` is no JSON value.
+        RunFailed: something in ``value`` is not a JSON value.
     """
     try:
         return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()

@@ -82,7 +82,7 @@ class Stats:
         )
         from fluxvla_core.data.statistics import as_lists
 
-        # The statistics are what comes out; how far they are is said beside them.
+        # The statistics are what comes out; how far they are is said on stderr.
         with _reporter(args.log_format, sys.stderr) as reporter:
             meta, stats = dataset_statistics(Path(args.dataset), args.pixels, reporter)
             if args.write:
@@ -170,7 +170,7 @@ def _log_format(parser: Parser) -> None:
 
 @contextmanager
 def _reporter(log_format: str, stream: TextIO) -> Iterator[Any]:
-    from fluxvla_core.cli.reporters import make_reporter
+    from fluxvla_core.cli.choose_reporter import make_reporter
 
     reporter = make_reporter(log_format, stream)
     try:
@@ -235,6 +235,7 @@ class Collect:
         )
 
     def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.config.hints import whole_options
         from fluxvla_core.evaluation.collect import Collection
         from fluxvla_core.plugins.files import load_plugin_files
 
@@ -251,13 +252,16 @@ class Collect:
             width=args.width,
             failures=args.failures,
         )
-        collect_demonstrations(collection, args)
+        named = {side: tables[table] for side, table in _SIDES.items()}
+        with whole_options(named):
+            collect_demonstrations(collection, args)
         return 0
 
 
 def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> None:
     """Collect demonstrations as ``args`` says (out, workers, resume, log_format), with progress."""
-    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
+    from fluxvla_core.cli.choose_reporter import make_reporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter
     from fluxvla_core.evaluation.collect import collect
 
     reporter = KeepAliveReporter(make_reporter(args.log_format))

@@ -26,7 +26,8 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         The signal that asked to stop it when it was done, or 0.
     """
     from fluxvla_core.build import RunContext, build_runner_from_cfg
-    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
+    from fluxvla_core.cli.choose_reporter import make_reporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter
     from fluxvla_core.config.tree import freeze
     from fluxvla_core.contracts.reporter import SilentReporter
 
@@ -92,6 +93,13 @@ def _run_section(
     Returns:
         What the section gave, and the signal that asked to stop it when it was done, or 0.
     """
+    from fluxvla_core.config.hints import whole_options
+
+    with whole_options(plan.config.tree, plan.section):
+        return _driven(plan, build, context, own_records)
+
+
+def _driven(plan: Plan, build: Any, context: Any, own_records: bool) -> tuple[Any, int]:
     from fluxvla_core.contracts import Runner, TrainRunner
     from fluxvla_core.contracts.check import is_train_runner
 
@@ -127,16 +135,12 @@ def _leave_records(plan: Plan) -> bool:
 
 
 def _write_records(plan: Plan, folder: Path) -> None:
-    from fluxvla_core.config.snapshot import (
-        ENVIRONMENT_FILE,
-        environment,
-        write_json,
-        write_resolved,
-    )
+    from fluxvla_core import atomic
+    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE, environment, write_resolved
 
     folder.mkdir(parents=True, exist_ok=True)
     write_resolved(folder / CONFIG_FILE, plan.config)
-    write_json(folder / ENVIRONMENT_FILE, environment())
+    atomic.write_json(folder / ENVIRONMENT_FILE, environment())
 
 
 def folders_to_make(plan: Plan) -> list[Path]:

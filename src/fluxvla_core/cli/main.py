@@ -215,7 +215,7 @@ def _unknown(word: str, names: list[str]) -> UsageError:
 
 
 def overview() -> str:
-    """What ``fluxvla --help`` prints; of plugins' commands it reads the source, without import."""
+    """The text of ``fluxvla --help``; plugins' commands are read from source, not imported."""
     from fluxvla_core.config.signature import read_help
     from fluxvla_core.plugins._metadata import index
 

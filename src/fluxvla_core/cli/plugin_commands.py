@@ -12,7 +12,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fluxvla_core.cli.main import COMMANDS, STRICT
 from fluxvla_core.cli.parser import Parser, positive
@@ -40,7 +40,7 @@ class List:
         found = index()
         plugins = [p for _, many in sorted(found.plugins.items()) for p in many]
         if args.json:
-            say(json.dumps([_record(p) for p in plugins], indent=1))
+            say(json.dumps([p.to_dict() for p in plugins], indent=1))
         else:
             say("\n".join(_table(plugins)) or "nothing is installed")
         if found.broken:
@@ -48,16 +48,6 @@ class List:
             text = f"{count} distribution(s) could not be read; run: fluxvla plugins doctor"
             say(text, sys.stderr)
         return 0
-
-
-def _record(plugin: Plugin) -> dict[str, Any]:
-    return {
-        "group": plugin.group,
-        "name": plugin.name,
-        "distribution": plugin.dist,
-        "version": plugin.version,
-        "value": plugin.value,
-    }
 
 
 def _table(plugins: list[Plugin]) -> list[str]:
@@ -115,7 +105,7 @@ def providers(name: str) -> list[Plugin]:
 
 
 def describe(plugin: Plugin) -> str:
-    """What is known of a plugin without importing it."""
+    """Description of a plugin without importing it."""
     from fluxvla_core.config.resolve import installed
 
     lines = [f"{plugin.group} {plugin.name}", f"  provided by  {plugin.origin} ({plugin.value})"]
@@ -130,7 +120,24 @@ def describe(plugin: Plugin) -> str:
         lines.append(f"  contract     {plugin.group.removeprefix(PREFIX)} {signature.api}")
     if signature.doc:
         lines.append(f"  about        {signature.doc}")
+    if plugin.group == PREFIX + "operators":
+        lines.append(f"  process      {_process(plugin)}")
     return "\n".join([*lines, *_keys(signature)])
+
+
+def _process(plugin: Plugin) -> str:
+    """What sends an operator's commands (docs/control.md, Control process)."""
+    from fluxvla_core.config.signature import implements
+
+    divided = implements(plugin, "fluxvla_core.contracts.robot", "without_cameras")
+    if divided is None:
+        return "not known: its source, or that of a base class, cannot be read"
+    if divided:
+        return "can be divided: commands are sent from a process of its own"
+    return (
+        "runs in one process with the policy: a policy that keeps the interpreter's lock delays "
+        "commands"
+    )
 
 
 def _keys(signature: Signature) -> list[str]:

@@ -34,18 +34,18 @@ def rank() -> int:
 
 
 def world_size() -> int | None:
-    """How many ranks there are (``WORLD_SIZE``); None when nobody launched ranks."""
+    """The number of ranks (``WORLD_SIZE``); None when nobody launched ranks."""
     text = os.environ.get("WORLD_SIZE")
     return int(text) if text else None
 
 
 def attempt() -> int:
-    """How often this job's processes were started again before (torchrun counts them)."""
+    """The number of earlier restarts of this job's processes (torchrun counts them)."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
 def resume_from(asked: str | None, work_dir: Path) -> str | None:
-    """What a training resumes from: ``--resume``, and after a restart what there is by then.
+    """The checkpoint to resume from: ``--resume``, and after a restart what there is by then.
 
     That only where this job had begun: an attempt that was refused is refused again, and does not
     continue with what others left.
@@ -111,7 +111,7 @@ def _job() -> dict[str, str]:
 
 
 def restart_notice() -> list[str]:
-    """What to report first after a restart: which one it is, and why there was need for one."""
+    """Messages to report first after a restart: which one it is, and why it was needed."""
     if attempt() == 0:
         return []
     why = "a process ended without an error message"
@@ -154,7 +154,7 @@ def has_agent() -> bool:
 
 @dataclass(frozen=True)
 class Failure:
-    """How one rank ended.
+    """The end of one rank.
 
     Args:
         time: monotonic seconds, which all processes of a machine share.
@@ -203,7 +203,7 @@ def record_finished(late: int) -> None:
 
 
 def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
-    """What ranks recorded, by rank, in the ``which``-th attempt; in the last one by default."""
+    """Recorded failures by rank, in the ``which``-th attempt; in the last one by default."""
     found = [Failure(**said) for said in _read_records(folder, "rank", which)]
     return {failure.rank: failure for failure in sorted(found, key=lambda f: f.rank)}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -30,19 +29,6 @@ class RunReporter(Reporter):
 
     def close(self) -> None:
         """Leave the terminal as it was found."""
-
-
-def make_reporter(log_format: str, stream: TextIO | None = None) -> RunReporter:
-    """The reporter for ``--log-format``: ``json``, or ``text`` (bars where ``stream`` has a
-    terminal behind it)."""
-    out = sys.stdout if stream is None else stream
-    if log_format == "json":
-        return JsonReporter(out)
-    if out.isatty():
-        from fluxvla_core.cli.rich_reporter import RichReporter
-
-        return RichReporter(out)
-    return LineReporter(out)
 
 
 class KeepAliveReporter(RunReporter):
@@ -150,7 +136,7 @@ class LineReporter(RunReporter):
     def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
         if self._throttle.due(name, done, total):
             head = f"{name} {_count(done, total)}"
-            self._line("  ".join(filter(None, [head, shown(fields)])))
+            self._line("  ".join(filter(None, [head, format_fields(fields)])))
 
     def artifact(self, kind: str, path: Path) -> None:
         self._line(f"{kind}: {path}")
@@ -164,13 +150,13 @@ class JsonReporter(RunReporter):
 
     def __init__(self, stream: TextIO, every: float = EVERY_S) -> None:
         self._out = stream
-        # A byte that another encoding puts in would be no JSON; its own escapes are.
+        # A byte that another encoding puts in would not be JSON; its own escapes are.
         self._ascii = (stream.encoding or "utf-8").lower().replace("-", "") != "utf8"
         self._throttle = Throttle(every)
 
     def _record(self, kind: str, fields: Mapping[str, object]) -> None:
         record = {"time": round(time.time(), 3), "kind": kind, **fields}
-        say(json.dumps(plain(record), ensure_ascii=self._ascii, allow_nan=False), self._out)
+        say(json.dumps(json_values(record), ensure_ascii=self._ascii, allow_nan=False), self._out)
 
     def info(self, text: str) -> None:
         self._record("info", {"text": text})
@@ -203,8 +189,8 @@ def _count(done: int, total: int | None) -> str:
     return str(done) if total is None else f"{done}/{total}"
 
 
-def shown(fields: Mapping[str, object]) -> str:
-    """``loss 0.1234  rate 1e-05``: what people read beside a progress."""
+def format_fields(fields: Mapping[str, object]) -> str:
+    """``loss 0.1234  rate 1e-05``: a progress line's fields for people."""
     return "  ".join(
         f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
         for name, value in fields.items()
@@ -212,16 +198,16 @@ def shown(fields: Mapping[str, object]) -> str:
     )
 
 
-def plain(value: Any) -> Any:
+def json_values(value: Any) -> Any:
     """``value`` as JSON has it: numbers that JSON lacks become None, the rest its text."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): json_values(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
+        return [json_values(v) for v in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if hasattr(value, "tolist"):  # numpy scalars and arrays, tensors
-        return plain(value.tolist())
+        return json_values(value.tolist())
     return str(value)

@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-from fluxvla_core.cli.reporters import RunReporter, clock, shown
+from fluxvla_core.cli.reporters import RunReporter, clock, format_fields
 from fluxvla_core.errors import printable
 
 NARROW = 100
@@ -51,7 +51,7 @@ class Count(MofNCompleteColumn):
 class RichReporter(RunReporter):
     """A bar for each named progress, lines above them.
 
-    Name, count, bar and time left are always there; what is shown beside them has the rest of
+    Name, count, bar and time left are always there; the other fields have the rest of
     the line.
     """
 
@@ -63,7 +63,7 @@ class RichReporter(RunReporter):
             Count(table_column=whole.copy()),
             BarColumn(bar_width=12 if self._console.width < NARROW else 24),
             Left(table_column=whole.copy()),
-            TextColumn("[dim]{task.fields[beside]}", table_column=rest),
+            TextColumn("[dim]{task.fields[details]}", table_column=rest),
             console=self._console,
             refresh_per_second=4,
             expand=True,
@@ -80,17 +80,17 @@ class RichReporter(RunReporter):
     def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
         if name not in self._tasks:
             self._bars.start()
-            self._tasks[name] = self._bars.add_task(escape(name), total=total, beside="")
+            self._tasks[name] = self._bars.add_task(escape(name), total=total, details="")
         self._bars.update(
-            self._tasks[name], completed=done, total=total, beside=escape(shown(fields))
+            self._tasks[name], completed=done, total=total, details=escape(format_fields(fields))
         )
 
     def still_working(self, what: str, seconds: float) -> None:
         """Nothing was said for ``seconds`` since ``what``, and the work continues."""
         if self._silence is None:
             self._bars.start()
-            self._silence = self._bars.add_task("working", total=None, beside="")
-        self._bars.update(self._silence, beside=escape(f"since: {what}"))
+            self._silence = self._bars.add_task("working", total=None, details="")
+        self._bars.update(self._silence, details=escape(f"since: {what}"))
 
     def end_silence(self) -> None:
         """The silence is over."""

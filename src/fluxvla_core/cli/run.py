@@ -129,8 +129,8 @@ class Run:
                 configured = plan.config.tree[plan.section].get("resume_from")
                 refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
+            from fluxvla_core.cli.choose_reporter import make_reporter
             from fluxvla_core.cli.launch import launch
-            from fluxvla_core.cli.reporters import make_reporter
 
             grace = args.grace or ranks.GRACE_S
             reporter = make_reporter(args.log_format)
@@ -229,7 +229,7 @@ def _command_line(args: argparse.Namespace) -> list[str]:
 
 
 def _outline(plan: Plan, log_format: str) -> str:
-    """What ``--dry-run`` prints."""
+    """The output of ``--dry-run``."""
     from fluxvla_core.cli.config_commands import listing, used
 
     if log_format == "json":

@@ -18,7 +18,7 @@ from fluxvla_core.config.resolve import (
     Found,
     resolve,
 )
-from fluxvla_core.config.signature import Signature
+from fluxvla_core.config.signature import Parameter, Signature, table_of
 from fluxvla_core.config.tree import Config, all_keys, join_key
 from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem, nearest
 from fluxvla_core.plugins._metadata import canonical, version
@@ -42,7 +42,7 @@ class Use:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found.
+    """Result of a check.
 
     Args:
         sections: names of the runnable sections (tables whose ``type`` is a runner).
@@ -234,6 +234,8 @@ class _Walk:
                 self.add(inner, f"{name!r} is filled in when the run starts and cannot be set")
             elif name not in signature.names and not signature.open:
                 self.add(inner, self._unknown(key, name, signature, table))
+        for parameter in signature.parameters:
+            self.inside(join_key(key, parameter.name), table.get(parameter.name), parameter)
         lacking = [
             p.name
             for p in signature.parameters
@@ -246,6 +248,19 @@ class _Walk:
                 f"(defined at {signature.place})",
             )
 
+    def inside(self, key: str, value: Any, parameter: Parameter) -> None:
+        """Keys of a table without a type, where the annotation of its parameter names them."""
+        if not isinstance(value, dict) or "type" in value:
+            return
+        table = table_of(parameter)
+        if table is None:
+            return
+        for name in value:
+            if name not in table.names:
+                self.add(join_key(key, name), self._unknown(key, name, table, value))
+        for field in table.parameters:
+            self.inside(join_key(key, field.name), value.get(field.name), field)
+
     def _unknown(self, key: str, name: str, signature: Signature, table: dict[str, Any]) -> str:
         places = {p.name: p.place for p in signature.parameters if p.name not in INJECTED}
         near = nearest(name, places)
@@ -253,7 +268,7 @@ class _Walk:
         if not near:
             text += f" (defined at {signature.place})"
         elif near in table:
-            # Inherited, more often than not, so that a misspelt key stands beside the right one.
+            # Inherited, more often than not, so that a misspelt key stands next to the right one.
             set_at = self.config.where(join_key(key, near))
             text += f"; did you mean {near!r}? (set at {set_at})"
         else:

@@ -215,7 +215,7 @@ def _from_python(text: str, name: str, path: Path) -> Config:
 
 
 def _is_data(name: str, value: Any) -> bool:
-    """Helpers that a config defines for itself (imports, functions, paths) are no keys."""
+    """Helpers that a config defines for itself (imports, functions, paths) are not keys."""
     if name.startswith("_") or isinstance(value, types.ModuleType):
         return False
     return value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))

@@ -84,11 +84,11 @@ def parse_value(text: str) -> Any:
         value = tomli.loads(f"value = {text}")["value"]
     except tomli.TOMLDecodeError as error:
         if text[:1] in {"[", "{", '"', "'"}:
-            raise _BadOverride(f"{text!r} is no TOML value: {error.msg}") from error
+            raise _BadOverride(f"{text!r} is not a TOML value: {error.msg}") from error
         number = _number(text)
         if number is not None:
             raise _BadOverride(
-                f"{text!r} is no TOML number; write it as {number}, or '\"{text}\"' for text"
+                f"{text!r} is not a TOML number; write it as {number}, or '\"{text}\"' for text"
             ) from error
         return text
     except (ValueError, RecursionError) as error:

@@ -66,7 +66,7 @@ SEARCHED = tuple(name for name in BY_NAME if name != "commands")
 
 @dataclass(frozen=True)
 class Found:
-    """What a ``type`` means. ``signature`` is None where no source could be read."""
+    """The class behind a ``type``; ``signature`` is None where no source could be read."""
 
     registry: str
     name: str
@@ -98,7 +98,7 @@ def resolve(name: str, registry: str | None = None) -> Found:
             )
     here = BY_NAME[registry].registered(name)
     if here is not None:
-        from fluxvla_core.config.inspection import inspect_signature
+        from fluxvla_core.config.runtime_signature import inspect_signature
 
         signature = inspect_signature(here)
         return Found(registry, name, "registered in this process", None, signature)
@@ -107,7 +107,7 @@ def resolve(name: str, registry: str | None = None) -> Found:
 
 
 def table_signature(path: Sequence[str], table: Mapping[str, Any]) -> Signature | None:
-    """What the table at ``path`` of a config takes; None where that is not known."""
+    """The signature for the table at ``path`` of a config; None where that is not known."""
     if len(path) == 1 and path[0] in LOADERS:
         takes = tuple(Parameter(name, False, "") for name in LOADER_KEYS)
         return Signature(path[0], "", takes, open=True)

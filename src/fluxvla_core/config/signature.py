@@ -8,13 +8,12 @@ docstrings.
 from __future__ import annotations
 
 import ast
-import inspect
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
+from fluxvla_core.config.docstrings import argument_texts, field_texts
 from fluxvla_core.config.source import (
     Module,
     Opaque,
@@ -27,12 +26,10 @@ from fluxvla_core.config.source import (
 )
 from fluxvla_core.plugins._metadata import Plugin
 
-_SECTION = re.compile(r"^(\s*)Args:\s*$", re.MULTILINE)
-_ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: \([^)]*\))?:\s*(.*)$")
-
 OPTIONS = "Options"
 """The class attribute that names the dataclass of a constructor's ``**options``."""
 OPTIONS_KEYWORDS = "options"
+_ANY_TABLE = frozenset({"None", "Mapping", "dict", "Dict"})
 
 
 @dataclass(frozen=True)
@@ -41,12 +38,14 @@ class Parameter:
 
     Args:
         stated: its annotation and default, as written or as nodes of its source.
+        module: the module of that source.
     """
 
     name: str
     required: bool
     place: str
     stated: str | tuple[ast.expr | None, ast.expr | None] = ""
+    module: str = ""
 
     @property
     def text(self) -> str:
@@ -60,7 +59,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Forward:
-    """How an ``__init__`` hands its ``**kwargs`` to the next one."""
+    """The call by which an ``__init__`` hands its ``**kwargs`` to the next one."""
 
     positional: int = 0
     named: frozenset[str] = frozenset()
@@ -87,7 +86,7 @@ class Init:
 
 @dataclass(frozen=True)
 class Signature:
-    """What a config may say for a class.
+    """The keys that a config may set for a class.
 
     ``open`` means that further keys cannot be ruled out (``**kwargs`` that go nowhere known);
     ``documented`` reads what docstrings say of parameters, those of the class before its bases'.
@@ -104,7 +103,7 @@ class Signature:
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """What each parameter means, where a docstring says so."""
+        """Each parameter's description, where a docstring has one."""
         return self.documented()
 
     @property
@@ -152,10 +151,52 @@ def read_signature(plugin: Plugin) -> Signature | None:
     )
 
 
+def table_of(parameter: Parameter) -> Signature | None:
+    """The keys of a table whose parameter is annotated with a dataclass or a TypedDict.
+
+    Alone, or with None and ``Mapping``: ``LoraOptions | Mapping[str, Any] | None``. None for every
+    other annotation, and for classes whose source cannot be read.
+    """
+    annotation = None if isinstance(parameter.stated, str) else parameter.stated[0]
+    if annotation is None or not parameter.module:
+        return None
+    named = [n for n in _alternatives(annotation) if n.rpartition(".")[2] not in _ANY_TABLE]
+    source = find(parameter.module, named[0]) if len(named) == 1 and named[0] else None
+    if not isinstance(source, Source) or not isinstance(source.node, ast.ClassDef):
+        return None
+    order = linearize(source)
+    typed = any(_is_typed_dict(base) for base in order)
+    known = all(isinstance(base, Source) or base.plain for base in order)
+    if not typed and (not known or not _is_dataclass_source(source) or _init_of(source.node)):
+        return None
+    fields = _fields(order, _is_typed_dict if typed else _is_dataclass_source)
+    return Signature(source.node.name, source.place, fields)
+
+
 def read_help(plugin: Plugin) -> str:
     """The ``help`` of a command's class as its source has it; empty where it cannot be read."""
     source = find(plugin.module, plugin.attribute)
     return "" if isinstance(source, Opaque) else _literal(linearize(source), "help") or ""
+
+
+def implements(plugin: Plugin, contract: str, method: str) -> bool | None:
+    """Whether an installed class, or a base of it, has ``method`` itself.
+
+    Args:
+        contract: the module of its contract, whose default does not count.
+
+    Returns:
+        None where that cannot be read from sources.
+    """
+    source = find(plugin.module, plugin.attribute)
+    if isinstance(source, Opaque) or isinstance(source.node, ast.FunctionDef):
+        return None
+    order = linearize(source)
+    bodies = [b.node.body for b in order if isinstance(b, Source) and b.module.name != contract]
+    if any(isinstance(n, ast.FunctionDef) and n.name == method for body in bodies for n in body):
+        return True
+    unread = any(isinstance(base, Opaque) and not base.plain for base in order)
+    return None if unread else False
 
 
 def combine(
@@ -222,7 +263,8 @@ def _init(node: ast.FunctionDef, module: Module, drop_self: bool = True) -> Init
     defaults = [*[None] * (len(plain) - len(spec.defaults)), *spec.defaults, *spec.kw_defaults]
     pairs = zip([*plain, *spec.kwonlyargs], defaults, strict=True)
     parameters = tuple(
-        Parameter(a.arg, d is None, module.place(a.lineno), (a.annotation, d)) for a, d in pairs
+        Parameter(a.arg, d is None, module.place(a.lineno), (a.annotation, d), module.name)
+        for a, d in pairs
     )
     if spec.kwarg is None:
         return Init(parameters)
@@ -288,11 +330,41 @@ def _is_dataclass(node: ast.ClassDef | ast.FunctionDef) -> bool:
     )
 
 
-def _fields(order: list[Any]) -> tuple[Parameter, ...]:
-    """Fields of a dataclass and of the dataclasses that it inherits from, bases first."""
+def _alternatives(node: ast.expr) -> list[str]:
+    """The names in a union: ``X | None``, ``Optional[X]``, ``"X"``; "" for what is not a name."""
+    if isinstance(node, ast.BinOp):
+        return [*_alternatives(node.left), *_alternatives(node.right)]
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        with suppress(SyntaxError):
+            return _alternatives(ast.parse(node.value, mode="eval").body)
+    if isinstance(node, ast.Constant) and node.value is None:
+        return ["None"]
+    name = dotted_name(node) or ""
+    if isinstance(node, ast.Subscript) and name.rpartition(".")[2] in ("Optional", "Union"):
+        inner = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        return ["None", *(one for each in inner for one in _alternatives(each))]
+    return [name]
+
+
+def _is_typed_dict(base: Any) -> bool:
+    """Whether it is a TypedDict, or one that inherits from another."""
+    if not isinstance(base, Source) or not isinstance(base.node, ast.ClassDef):
+        return False
+    names = [dotted_name(b) or "" for b in base.node.bases]
+    if any(name.rpartition(".")[2] == "TypedDict" for name in names):
+        return True
+    return any(_is_typed_dict(find(base.module.name, name)) for name in names if name)
+
+
+def _fields(order: list[Any], counts: Callable[[Any], bool] | None = None) -> tuple[Parameter, ...]:
+    """Fields of a dataclass and of the dataclasses that it inherits from, bases first.
+
+    Args:
+        counts: which classes have fields; dataclasses by default.
+    """
     found: dict[str, Parameter] = {}
     for base in reversed(order):
-        if not _is_dataclass_source(base):
+        if not (counts or _is_dataclass_source)(base):
             continue
         for node in base.node.body:
             if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
@@ -305,6 +377,7 @@ def _fields(order: list[Any]) -> tuple[Parameter, ...]:
                 not _has_default(node.value),
                 base.module.place(node.lineno),
                 (node.annotation, _default(node.value)),
+                base.module.name,
             )
     return tuple(found.values())
 
@@ -357,7 +430,7 @@ def _doc(node: ast.ClassDef | ast.FunctionDef) -> str:
 
 
 def _meanings(order: list[Any]) -> dict[str, str]:
-    """What the docstrings of these classes say of parameters; the first to say it counts."""
+    """Descriptions of parameters from the docstrings of these classes; the first one counts."""
     found: dict[str, str] = {}
     for base in order:
         if isinstance(base, Source):
@@ -371,21 +444,6 @@ def _argument_texts_of(node: ast.ClassDef | ast.FunctionDef) -> dict[str, str]:
     found = argument_texts(ast.get_docstring(init)) if init else {}
     found |= argument_texts(ast.get_docstring(node))
     return found | (field_texts(node) if isinstance(node, ast.ClassDef) else {})
-
-
-def field_texts(node: ast.ClassDef) -> dict[str, str]:
-    """Attribute docstrings: the string below ``name: type = default``."""
-    found = {}
-    for stated, below in pairwise(node.body):
-        if (
-            isinstance(stated, ast.AnnAssign)
-            and isinstance(stated.target, ast.Name)
-            and isinstance(below, ast.Expr)
-            and isinstance(below.value, ast.Constant)
-            and isinstance(below.value.value, str)
-        ):
-            found[stated.target.id] = " ".join(below.value.value.split())
-    return found
 
 
 def _literal(order: list[Any], name: str) -> str | None:
@@ -405,36 +463,3 @@ def _trains(order: list[Any]) -> bool:
                 spec = node.args
                 return any(a.arg == "n_train_examples" for a in (*spec.args, *spec.kwonlyargs))
     return False
-
-
-# -- from docstrings ----------------------------------------------------------------------------
-
-
-def argument_texts(docstring: str | None) -> dict[str, str]:
-    """Parameter -> its description, on one line; empty where there is no such section.
-
-    ``height, width: of the pictures`` is said of both.
-    """
-    text = inspect.cleandoc(docstring or "")
-    section = _SECTION.search(text)
-    if section is None:
-        return {}
-    margin = len(section[1])
-    found: dict[str, str] = {}
-    names: list[str] = []
-    inner: int | None = None
-    for line in text[section.end() :].splitlines():
-        if not line.strip():
-            continue
-        indent = len(line) - len(line.lstrip())
-        if indent <= margin:  # the next section, or what is said after it
-            break
-        inner = indent if inner is None else inner
-        entry = _ENTRY.match(line.strip()) if indent == inner else None
-        if entry:
-            names = [name.strip("* ") for name in entry[1].split(",")]
-            found.update(dict.fromkeys(names, entry[2].strip()))
-        else:
-            for name in names:
-                found[name] = f"{found[name]} {line.strip()}".strip()
-    return found

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ def write_resolved(path: Path, config: Config) -> None:
     Raises:
         OSError: as opening, writing and renaming do; an older file stays as it was.
     """
-    write_json(
+    atomic.write_json(
         path,
         {"format": FORMAT, "config": config.tree, "origins": dict(sorted(config.origins.items()))},
     )
@@ -37,15 +35,7 @@ def environment() -> dict[str, Any]:
     import platform
 
     plugins = [
-        {
-            "group": plugin.group,
-            "name": plugin.name,
-            "distribution": plugin.dist,
-            "version": plugin.version,
-            "value": plugin.value,
-        }
-        for _, providers in sorted(index().plugins.items())
-        for plugin in providers
+        plugin.to_dict() for _, providers in sorted(index().plugins.items()) for plugin in providers
     ]
     return {
         "format": "fluxvla-environment-1",
@@ -55,11 +45,6 @@ def environment() -> dict[str, Any]:
         "packages": {name: have for name in _PACKAGES if (have := version(name))},
         "plugins": plugins,
     }
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON for machines and people, in one step."""
-    atomic.write_text(path, json.dumps(data, indent=1, ensure_ascii=False) + "\n")
 
 
 def work_dirs_below(folder: Path, depth: int = 3) -> list[Path]:

@@ -75,7 +75,7 @@ Base = Source | Opaque
 
 
 def flaw(dotted: str) -> str | None:
-    """``file:line`` and why it is no Python, of a module on the way to ``dotted``; else None."""
+    """``file:line`` and why it is not Python, of a module on the way to ``dotted``; else None."""
     parts = dotted.split(".")
     for end in range(len(parts), 0, -1):
         name = ".".join(parts[:end])
@@ -173,7 +173,7 @@ def _absolute(node: ast.ImportFrom, module: str, path: Path) -> str:
 
 
 def find(module: str, dotted: str, seen: frozenset[tuple[str, str]] = frozenset()) -> Base:
-    """What ``dotted`` means in ``module``, following imports, aliases and lazy ``_EXPORTS``."""
+    """Resolve ``dotted`` in ``module``, following imports, aliases and lazy ``_EXPORTS``."""
     whole = f"{module}.{dotted}" if module else dotted
     parsed = parse(module)
     if parsed is None or (module, dotted) in seen:
@@ -208,7 +208,7 @@ def _inside(parsed: Module, node: ast.ClassDef, rest: str, whole: str) -> Base:
 
 
 def member(cls: Source, name: str) -> Base | None:
-    """What the class attribute ``name`` in the body of ``cls`` is; None if it states none.
+    """The class attribute ``name`` in the body of ``cls``; None if it has none.
 
     It is a nested class, or names a class: ``Name = module.Class``.
     """

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from fluxvla_core.errors import ConfigError, Problem
 
 DELETE = "_delete_"
-NO_TEXT = "half of a surrogate pair is no text, no file can hold it"
+NO_TEXT = "half of a surrogate pair is not text, no file can hold it"
 _DOT = re.compile(r"(?<!\\)\.")
 
 
@@ -62,7 +62,7 @@ def shown(path: Path) -> str:
 def plain(value: Any, key: str, problems: list[tuple[str, str]]) -> Any:
     """A copy of ``value`` in plain data: tuples become lists, paths strings.
 
-    What is no data is left out and appended to ``problems`` as (key, finding).
+    What is not data is left out and appended to ``problems`` as (key, finding).
     """
     if isinstance(value, str):
         return _text(value, key, problems)
@@ -101,7 +101,7 @@ def _text(text: str, key: str, problems: list[tuple[str, str]]) -> str:
 
 def is_text(text: str) -> bool:
     """Whether it can be written to a file: halves of surrogate pairs, of JSON's escapes or of a
-    command line that is no UTF-8, cannot."""
+    command line that is not UTF-8, cannot."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
@@ -174,7 +174,7 @@ def merge(base: Config, over: Config) -> Config:
     one (that is how an option is switched off and on).
 
     Raises:
-        ConfigError: a table meets a scalar or a list, or ``_delete_`` is no boolean; all at once.
+        ConfigError: a table meets a scalar or a list, or ``_delete_`` is not boolean; all at once.
     """
     tree, origins, left_over = copy.deepcopy(base.tree), dict(base.origins), set(base.left_over)
     problems: list[Problem] = []
@@ -228,7 +228,7 @@ def merge(base: Config, over: Config) -> Config:
 def join_bases(bases: list[Config]) -> Config:
     """Several bases side by side; the order must not matter, so no key may be in two.
 
-    A key that both inherit from one common base (same place) is no conflict.
+    A key that both inherit from one common base (same place) is not a conflict.
 
     Raises:
         ConfigError: two bases define a key.

@@ -2,6 +2,7 @@
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
+from fluxvla_core.contracts.part import Part
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.contracts.robot import ActionFilter, Clock, Operator
@@ -37,6 +38,7 @@ __all__ = [
     "Observation",
     "Operator",
     "Optimizer",
+    "Part",
     "Policy",
     "RandomTransform",
     "Reporter",

@@ -1,9 +1,9 @@
 """Explicit contract checks, made when a class is loaded.
 
-``isinstance`` accepts a method with the wrong arguments and an attribute that is no method at all;
-here every method of the contract's base class must be there, be callable, and take what the core
-will pass. That follows from the base class itself: its abstract and its optional methods, and their
-signatures.
+``isinstance`` accepts a method with the wrong arguments and an attribute that is not a method at
+all; here every method of the contract's base class must be there, be callable, and take what the
+core will pass. That follows from the base class itself: its abstract and its optional methods, and
+their signatures.
 """
 
 from __future__ import annotations
@@ -91,18 +91,33 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
         )
     check_api(registry, name, getattr(cls, "api", None), origin)
     contract = _contract_for(registry, cls)
-    problems = [] if registry != "vlas" or _is_module(cls) else ["it is no torch.nn.Module"]
+    problems = [] if registry != "vlas" or _is_module(cls) else ["it is not a torch.nn.Module"]
     problems += _problems(contract, cls, needs(contract, cls))
     named = {m: n for m, n in methods(contract).items() if not m.startswith("__")}
     problems += _wrong(
         contract, cls, {m: n for m, n in named.items() if _lookup(contract, cls, m) is not None}
     )
+    problems += _halves(contract, cls)
     if problems:
         raise LoadFailed(
             f"{origin}: {name} does not fulfil the contract of fluxvla.{registry}: "
             + "; ".join(dict.fromkeys(problems)),
             next="see docs/writing-a-plugin.md for what each contract asks for",
         )
+
+
+def _halves(contract: type[Contract], cls: type) -> list[str]:
+    """Groups of methods of which ``cls`` has some, and not all."""
+    problems = []
+    for group in contract._together:
+        there = [f"{m}()" for m in group if _lookup(contract, cls, m) is not None]
+        lacks = [f"{m}()" for m in group if f"{m}()" not in there]
+        if there and lacks:
+            problems.append(
+                f"it has {' and '.join(there)} but no {' and '.join(lacks)}; "
+                "these are needed together, or not at all"
+            )
+    return problems
 
 
 def _contract_for(registry: str, cls: type) -> type[Contract]:
@@ -145,7 +160,7 @@ def is_train_runner(cls: type) -> bool:
 
 
 def missing_operator_methods(operator: object) -> list[str]:
-    """What an operator of the specification's shape lacks of the full contract."""
+    """Methods of the full contract that an operator of the specification's shape lacks."""
     cls = type(operator)
     full = {m: n for m, n in methods(Operator).items() if m in abstract_methods(Operator)}
     lacks = [f"{m}()" for m, n in full.items() if _method_problem(Operator, cls, m, n)]
@@ -179,7 +194,7 @@ def check_policy(policy: Any) -> None:
 
     Raises:
         LoadFailed: it has no ``embodiment``, ``action_rate_hz`` or ``horizon``, or one that cannot
-            be; or its ``cameras`` are no names.
+            be; or its ``cameras`` are not names.
     """
     said = [n for n in ON_A_ROBOT if hasattr(policy, n) and implements(policy, Actor, n)]
     lacks = [name for name in ON_A_ROBOT if name not in said]

@@ -63,6 +63,8 @@ class Contract(metaclass=ABCMeta):
     api: ClassVar[str]
     _besides: ClassVar[Mapping[str, int]] = {}
     """Methods that some classes have instead, and how many arguments they are given."""
+    _together: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Groups of optional methods of which a class brings all or none."""
     _any_arguments: ClassVar[bool] = False
     """Whether a class chooses which of the arguments its methods take."""
 

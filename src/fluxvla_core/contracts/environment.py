@@ -41,7 +41,7 @@ class TaskSpec:
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """What is known of an environment before anything is built.
+    """Description of an environment: tasks, cameras, embodiment; known before anything is built.
 
     Args:
         name: for people and reports.
@@ -78,7 +78,7 @@ class EnvironmentSpec:
         """The tasks called ``names``, in their order; all of them for None.
 
         Raises:
-            ConfigError: there is none of that name, or one is named twice.
+            ConfigError: there is not one of that name, or one is named twice.
         """
         if names is None:
             return self.tasks
@@ -156,7 +156,7 @@ class Environment(Contract):
         return None
 
     def drawn_by(self) -> str:
-        """What renders its pictures, for results: OpenGL backend and renderer; "" if unknown."""
+        """OpenGL backend and renderer of its pictures, for results; "" if unknown."""
         return ""
 
     @attribute

@@ -15,7 +15,7 @@ STATE = "state"
 
 @dataclass(frozen=True)
 class Frame:
-    """What ``Operator.get_frame`` returns; all arrays are fresh and belong to the caller.
+    """The result of ``Operator.get_frame``; all arrays are fresh and belong to the caller.
 
     Args:
         state: ``(state_dim,)`` float64 in the embodiment's units and order.
@@ -30,7 +30,7 @@ class Frame:
 
 
 class Observation(TypedDict):
-    """What a policy is asked with.
+    """Input of a policy.
 
     ``qpos`` is ``(state_dim,)`` float32 in physical units, ``images`` maps camera name to
     ``(height, width, 3)`` uint8 RGB, ``task_description`` is the instruction in plain words.

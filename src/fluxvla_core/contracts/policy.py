@@ -38,7 +38,7 @@ class Continuation:
 
 
 class Actor(Contract):
-    """What acts in an environment: a policy, an expert, a demonstrator."""
+    """Acts in an environment: a policy, an expert, a demonstrator."""
 
     @abstractmethod
     def reset(self, seed: int) -> None:
@@ -52,7 +52,7 @@ class Actor(Contract):
 
     @attribute
     def embodiment(self) -> EmbodimentSpec | None:
-        """What its numbers mean, which is checked; None: whatever the environment's mean."""
+        """The embodiment of its numbers, which is checked; None: that of the environment."""
         return None
 
     @attribute
@@ -105,7 +105,7 @@ class Policy(Actor):
 
     @required
     def embodiment(self) -> EmbodimentSpec:
-        """What its numbers mean; must fit the robot's."""
+        """The embodiment of its numbers; must fit the robot's."""
 
     @required
     def action_rate_hz(self) -> float:

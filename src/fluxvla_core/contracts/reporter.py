@@ -18,7 +18,7 @@ class Reporter:
         """One line that somebody should read."""
 
     def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
-        """``done`` of ``total`` units of ``name``; ``fields`` are shown beside it."""
+        """``done`` of ``total`` units of ``name``; ``fields`` are shown next to it."""
 
     def event(self, kind: str, **fields: object) -> None:
         """One record for programs; ``fields`` are JSON values."""

@@ -160,6 +160,33 @@ class Operator(Contract):
         """
         return (), 0
 
+    # -- one robot in two processes --------------------------------------------------------------
+
+    def without_cameras(self) -> Operator | None:
+        """The state and the commands of this robot, for the process that commands it.
+
+        None (the default) says that this robot cannot be divided. Called before ``connect``, on an
+        operator that is not used itself afterwards: it may return itself. Another process has the
+        other part, at the same time. ``embodiment`` is still that of the whole robot, with its
+        cameras. Everything is asked but ``pictures_after`` and ``get_frame``, which raises
+        NotReady; ``get_state`` and ``state_stamp`` are needed then.
+        """
+        return None
+
+    def without_commands(self) -> Operator | None:
+        """The cameras and the state of this robot, read only, for the process that asks the policy.
+
+        None (the default) says that this robot cannot be divided. Called as ``without_cameras`` is.
+        The part has a connection of its own, and is asked ``connect``, ``get_frame``,
+        ``get_state``, ``state_stamp``, ``pictures_after``, ``close``, ``domain_id``, ``clock`` and
+        ``embodiment`` only. It sends the robot nothing, also not in ``close``; it neither holds the
+        arm nor looks for others who command it. ``send_action`` raises Rejected, ``stop`` does
+        nothing.
+        """
+        return None
+
+    _together = (("without_cameras", "without_commands"),)
+
     @classmethod
     def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
         if getattr(candidate, "send_action", None) is not None:

@@ -32,7 +32,7 @@ class Runner(Contract):
 
     @attribute
     def keeps_config(self) -> bool:
-        """Whether it keeps the config beside its results; the command line does it otherwise."""
+        """Whether it keeps the config with its results; the command line does it otherwise."""
         return False
 
 

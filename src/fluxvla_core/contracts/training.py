@@ -89,7 +89,7 @@ class Dataset(Contract):
 
     @abstractmethod
     def __len__(self) -> int:
-        """How many samples there are."""
+        """The number of samples."""
 
     @abstractmethod
     def get_sample(self, index: int, epoch: int) -> Sample:
@@ -111,7 +111,7 @@ class Dataset(Contract):
         """Draw by the run's seed from now on, unless the config gave one."""
 
     def warnings(self) -> list[str]:
-        """What is questionable in the data; reported before training begins."""
+        """Warnings about the data, reported before training begins."""
         return []
 
     def use_statistics(self, entry: Mapping[str, Any]) -> None:
@@ -183,7 +183,7 @@ class InferenceDataset(Contract):
 
 
 class _AnyTransform(Contract):
-    """What ``Transform`` and ``RandomTransform``, whose calls differ, have in common."""
+    """Common base of ``Transform`` and ``RandomTransform``, whose calls differ."""
 
     needs_rng: ClassVar[bool] = False
     """Whether ``__call__`` takes a random number generator, too."""
@@ -198,7 +198,7 @@ class _AnyTransform(Contract):
     def warnings(
         self, stats: Mapping[str, Any], states: Sequence[str], actions: Sequence[str]
     ) -> list[str]:
-        """What is questionable in the statistics; ``states`` and ``actions`` are their names."""
+        """Warnings about the statistics; ``states`` and ``actions`` are their names."""
         return []
 
     def denormalizer(self, norm_stats: Mapping[str, Any], statistic_name: str) -> Any:

@@ -22,7 +22,7 @@ from fluxvla_core.data.files import (
     check_absent,
     parquet,
     read_table,
-    write_json,
+    write_metadata,
 )
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.statistics import (
@@ -95,8 +95,8 @@ def assemble(episodes: Sequence[Episode], out: Path, settings: DatasetSettings) 
         write_videos(key, clips, groups, rows, out, settings.fps)
     write_meta(out, rows, list(tasks), columns, [e.histograms for e in episodes])
     _write_extras(episodes, out)
-    write_json(out / lerobot.EMBODIMENT, settings.embodiment.to_dict())
-    write_json(
+    write_metadata(out / lerobot.EMBODIMENT, settings.embodiment.to_dict())
+    write_metadata(
         out / lerobot.INFO,
         {
             "codebase_version": lerobot.VERSION,
@@ -242,7 +242,7 @@ def write_meta(
     whole = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     totals = {key: np.sum([h[key] for h in histograms], axis=0) for key in histograms[0]}
     stats = _statistics(totals, whole)
-    write_json(out / lerobot.STATS, {key: as_lists(entry) for key, entry in stats.items()})
+    write_metadata(out / lerobot.STATS, {key: as_lists(entry) for key, entry in stats.items()})
 
 
 def _statistics(

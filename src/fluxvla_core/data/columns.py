@@ -249,7 +249,7 @@ def check_compatible(datasets: Sequence[LoadedDataset]) -> None:
                 raise DataError(
                     f"{one.root} and {two.root} do not go together: {what}: the same names in "
                     f"another order: {', '.join(here)} / {', '.join(there)}",
-                    next="write one of them anew with its columns in the order of the other",
+                    next="write one of them again with its columns in the order of the other",
                 )
 
 

@@ -26,7 +26,7 @@ from fluxvla_core.data.assemble import (
     write_videos,
 )
 from fluxvla_core.data.columns import has_width, read_columns
-from fluxvla_core.data.files import arrow, built_aside, parquet, read_table, write_json
+from fluxvla_core.data.files import arrow, built_aside, parquet, read_table, write_metadata
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.statistics import LEVELS, image_histogram
 from fluxvla_core.data.video_decode import ImageColumn, Source, read_frames
@@ -101,7 +101,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, reporter: Reporte
         "data_path": lerobot.DATA,
         "video_path": lerobot.VIDEO if episodes.videos else None,
     }
-    write_json(out / lerobot.INFO, info)
+    write_metadata(out / lerobot.INFO, info)
 
 
 def _copy_rows(meta: Metadata, rows: Sequence[dict[str, Any]], out: Path) -> list[Columns]:

@@ -57,7 +57,7 @@ class ParquetDataset(Dataset):
         window_start_idx: frames from the present one to the window's first action.
         use_delta: actions are differences to the frame before.
         relative_actions: normalisation counts actions from the present state: True for every
-            joint that is no gripper, or one truth value a joint. The statistics then say so
+            joint that is not a gripper, or one truth value a joint. The statistics then say so
             (``relative``), which is what ``NormalizeStatesAndActions`` and its inverse go by.
         per_step_statistics: the action's statistics are ``(T, D)``, one row a step.
         statistic_name: the key of :attr:`statistics`.

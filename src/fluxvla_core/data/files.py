@@ -7,7 +7,6 @@ complete. Errors name the file.
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -103,7 +102,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, rows: int | Non
             if found > _MOST_ROWS:
                 raise DataError(f"{path}: {found} rows, {_MOST_ROWS} are the most that are read")
             return file.read(columns=list(columns) if columns else None, use_threads=False)
-    # ValueError: text that is no UTF-8 in a damaged schema.
+    # ValueError: text that is not UTF-8 in a damaged schema.
     except (pa.ArrowException, OSError, ValueError) as error:
         raise DataError(
             f"{path}: cannot be read as parquet ({first_line(error)})",
@@ -167,10 +166,13 @@ def read_json_lines(path: Path, kind: type[T]) -> list[T]:
     ]
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as indented JSON, atomically: a kill leaves what was there before."""
+def write_metadata(path: Path, value: Any) -> None:
+    """Write a JSON file of a dataset, indented as LeRobot's are; its folder is made if need be.
+
+    Atomically: a kill leaves what was there before.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic.write_text(path, json.dumps(value, indent=4, ensure_ascii=False) + "\n")
+    atomic.write_json(path, value, indent=4)
 
 
 def staging_of(root: Path) -> Path:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.data import lerobot
 from fluxvla_core.data.columns import Track, check_tasks, make_track, read_columns
-from fluxvla_core.data.files import read_json, read_table, write_json
+from fluxvla_core.data.files import read_json, read_table, write_metadata
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.statistics import (
     LEVELS,
@@ -164,7 +164,7 @@ def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
     path = meta.root / lerobot.STATS
     before = read_json(path) if path.is_file() else {}
     after = {**before, **{key: as_lists(entry) for key, entry in stats.items()}}
-    write_json(path, after)
+    write_metadata(path, after)
     return path
 
 
@@ -342,7 +342,7 @@ def _wrong_statistics(
             try:
                 value = np.asarray(entry.get(name, true[name]), np.float64)
             except (TypeError, ValueError):  # text, or rows of different lengths
-                found.append(f"{key}: {name} is no list of numbers")
+                found.append(f"{key}: {name} is not a list of numbers")
                 continue
             if value.shape != true[name].shape or (abs(value - true[name]) > 0.01 * scale).any():
                 found.append(f"{key}: {name} is not that of the data")

@@ -135,7 +135,9 @@ class Metadata:
             if key in self.features:
                 dtype = self.features[key]["dtype"]
                 if key not in self.cameras:
-                    raise DataError(f"{self.root}: {key!r} is stored as {dtype!r}, it is no camera")
+                    raise DataError(
+                        f"{self.root}: {key!r} is stored as {dtype!r}, it is not a camera"
+                    )
                 shape = tuple(self.features[key]["shape"])
                 if dtype == "image" and 3 not in (shape[0], shape[-1]):
                     raise DataError(f"{self.root}: {key!r} is of shape {shape}, not in colour")
@@ -151,7 +153,7 @@ class Metadata:
         """The width of the vector feature ``name``.
 
         Raises:
-            DataError: there is none, or it is no vector of numbers.
+            DataError: there is none, or it is not a vector of numbers.
         """
         numbers = [
             k
@@ -221,7 +223,7 @@ def read_metadata(root: Path) -> Metadata:
 def _read_info(root: Path) -> dict[str, Any]:
     if not root.exists():
         raise DataError(
-            f"{root}: there is no dataset here: the folder does not exist",
+            f"{root}: there is not dataset here: the folder does not exist",
             cause=_unfinished(root),
             next="check data_root_path, which is relative to the folder that the command runs in: "
             "--set train_dataloader.dataset.data_root_path=DIR",
@@ -230,7 +232,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not path.is_file():
         what = "is a file" if root.is_file() else f"has no {lerobot.INFO}"
         raise DataError(
-            f"{root}: this is no LeRobot dataset: it {what}",
+            f"{root}: this is not a LeRobot dataset: it {what}",
             cause=_inner_dataset(root),
         )
     info = read_json(path)

@@ -124,7 +124,7 @@ def joined_statistics(
 
 
 def image_histogram(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
-    """How often each of 256 values occurs, ``(3, 256)``, in an ``(H, W, 3)`` uint8 image."""
+    """Histogram of the 256 values, ``(3, 256)``, of an ``(H, W, 3)`` uint8 image."""
     planes = [np.ascontiguousarray(image[..., c]).ravel() for c in range(3)]
     return np.stack([np.bincount(plane, minlength=LEVELS) for plane in planes]).astype(np.int64)
 
@@ -226,7 +226,7 @@ def check_norm_type(norm_type: str, who: str) -> None:
     near = nearest(str(norm_type), NORM_TYPES)
     hint = f"; did you mean {near!r}?" if near else ""
     raise ConfigError(
-        f"{who}: norm_type {norm_type!r} is none of {', '.join(NORM_TYPES)}{hint}",
+        f"{who}: norm_type {norm_type!r} is not one of {', '.join(NORM_TYPES)}{hint}",
         cause="state_key and action_key select the statistics, norm_type the formula",
     )
 
@@ -364,7 +364,7 @@ def _numbers(value: Any, name: str, who: str) -> Floats:
     plain = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
     if not plain or array.ndim not in (1, 2) or not array.size or not np.isfinite(array).all():
         raise ConfigError(
-            f"{who}: {name!r} of the statistics is no list of finite numbers, one a dimension, "
+            f"{who}: {name!r} of the statistics is not a list of finite numbers, one a dimension, "
             "nor of such lists, one a step"
         )
     return array.astype(np.float64)

@@ -303,7 +303,7 @@ class FrameReader:
 
 @dataclass(frozen=True)
 class ExpectedVideo:
-    """What a video file must hold: at least so many frames, of this size and rate."""
+    """Requirements for a video file: at least so many frames, of this size and rate."""
 
     frames: int
     height: int

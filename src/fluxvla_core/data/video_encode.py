@@ -70,7 +70,7 @@ def find_codec(name: str) -> Codec:
 
     codec = CODECS.get(name)
     if codec is None:
-        raise ConfigError(f"video_codec {name!r} is none of {', '.join(CODECS)}")
+        raise ConfigError(f"video_codec {name!r} is not one of {', '.join(CODECS)}")
     if codec.encoder not in av.codecs_available:
         have = [n for n, c in CODECS.items() if c.encoder in av.codecs_available]
         raise ConfigError(

@@ -29,7 +29,7 @@ from fluxvla_core.data.files import (
     publish,
     read_json,
     staging_of,
-    write_json,
+    write_metadata,
 )
 from fluxvla_core.data.statistics import LEVELS, image_histogram
 from fluxvla_core.data.video_encode import Clip, Codec, EpisodeEncoder, find_codec
@@ -146,7 +146,7 @@ class LeRobotWriter:
         number = len(self._saved)
         final = self._staging / f"episode-{number:06d}"
         try:
-            write_json(self._staging / _RECORDING, {"sizes": self._sizes, **self._settings()})
+            write_metadata(self._staging / _RECORDING, {"sizes": self._sizes, **self._settings()})
             self._buffer.save(final, key)
         except OSError as error:
             raise self._disk(error) from error
@@ -172,7 +172,7 @@ class LeRobotWriter:
                 next="call save_episode() or discard_episode() first",
             )
         if not self._saved:
-            raise DataError(f"{self.root}: no episode was saved, so there is no dataset to write")
+            raise DataError(f"{self.root}: no episode was saved, so there is not dataset to write")
         built = self._staging / "dataset"
         shutil.rmtree(built, ignore_errors=True)
         try:
@@ -214,7 +214,7 @@ class LeRobotWriter:
         self._saved = saved
 
     def _settings(self) -> dict[str, Any]:
-        """What all episodes of a recording share, as JSON values."""
+        """Settings shared by all episodes of a recording, as JSON values."""
         about = self._recording
         settings = {
             "fps": about.fps,
@@ -326,7 +326,7 @@ class EpisodeBuffer:
         np.savez(self.folder / "columns.npz", **columns)
         counts: dict[str, Any] = dict(self.histograms)
         np.savez(self.folder / "histograms.npz", **counts)
-        write_json(self.folder / "episode.json", {"task": self.task, "key": key})
+        write_metadata(self.folder / "episode.json", {"task": self.task, "key": key})
         os.replace(self.folder, final)
 
     def discard(self) -> None:

@@ -304,7 +304,7 @@ def collect_episodes(
         factory: makes, in a worker process, a function from an episode's number to the episode.
         settings: what the dataset follows from, as JSON values; continuing with other ones is
             refused.
-        workers: processes that act, beside this one, which writes.
+        workers: processes that act; this one writes.
         resume: continue a collection into ``out`` that was interrupted.
 
     Returns:
@@ -316,7 +316,7 @@ def collect_episodes(
         UsageError: there is an interrupted collection, or it had other settings.
         RunFailed: an episode fails, workers cannot be started, or the disk is full.
     """
-    from fluxvla_core.data.files import explain_disk, staging_of, write_json
+    from fluxvla_core.data.files import explain_disk, staging_of, write_metadata
     from fluxvla_core.data.writer import LeRobotWriter
 
     note = staging_of(out) / SETTINGS
@@ -330,7 +330,7 @@ def collect_episodes(
     began, retried, frames = time.monotonic(), 0, 0
     with LeRobotWriter(out, fps, embodiment, recover=resume, go_on=_GO_ON) as writer:
         try:
-            write_json(note, dict(settings))
+            write_metadata(note, dict(settings))
         except OSError as error:
             next = f"make room, then {_GO_ON}"
             raise explain_disk(error, out, "no episode was lost", next) from error
@@ -349,7 +349,7 @@ def collect_episodes(
                 pace = (number + 1 - kept) / (time.monotonic() - began)
                 reporter.progress("demonstrations", number + 1, episodes, per_s=round(pace, 2))
     # It stays with the dataset, so that an evaluation knows the seeds of the training data.
-    write_json(out / META / SETTINGS, dict(settings))
+    write_metadata(out / META / SETTINGS, dict(settings))
     seconds = time.monotonic() - began
     result = {
         "episodes": episodes,

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, whole_lines
-from fluxvla_core.evaluation.statistics import all_of, mcnemar_test, rate, verdict
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, flat, whole_lines
+from fluxvla_core.evaluation.success_rates import all_of, mcnemar_test, rate, verdict
 
 NAMED = 5
 """How many episodes a message names."""
@@ -22,7 +22,7 @@ class Evaluated:
     Args:
         folder: the folder of its results.
         group: which of its groups.
-        about: what was evaluated, from the episode log's first line.
+        about: what was evaluated, from the evaluation log's first line.
         records: finished episodes.
     """
 
@@ -123,8 +123,8 @@ def compare(a: Evaluated, b: Evaluated, common: bool = False) -> dict[str, Any]:
 
 
 def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
-    """What was not the same, beside policy and checkpoint: the episodes may not be comparable."""
-    one, two = _flat(a), _flat(b)
+    """Settings that differ, apart from policy and checkpoint: episodes may not be comparable."""
+    one, two = flat(a), flat(b)
     names = [n for n in dict.fromkeys([*one, *two]) if not n.startswith(("policy", "checkpoint"))]
     return [f"{n}: {one.get(n)} / {two.get(n)}" for n in names if one.get(n) != two.get(n)]
 
@@ -168,7 +168,7 @@ def _by_episode(side: Evaluated) -> dict[tuple[str, int], Mapping[str, Any]]:
 
 
 def _folder(place: Path) -> tuple[Path, Path | None]:
-    """Where the episode logs are, and the checkpoint if one was named."""
+    """Where the evaluation logs are, and the checkpoint if one was named."""
     if (place / "manifest.json").is_file():
         return place.parent.parent / "eval", place
     if place.is_file():
@@ -186,13 +186,3 @@ def _hash(checkpoint: Path) -> str:
     from fluxvla_core.checkpoints.manifest import NAME, hash_file
 
     return hash_file(checkpoint / NAME)
-
-
-def _flat(table: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{before}{name}.")
-        else:
-            flat[before + name] = value
-    return flat

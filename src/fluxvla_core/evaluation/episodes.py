@@ -4,16 +4,17 @@ What an episode needs (a simulator, a policy) is made by a factory in each worke
 result must follow from the episode's key alone; then neither the number of workers nor an
 interruption changes anything but the time it takes.
 
-The episode log has one JSON object a line, on disk as soon as an episode has ended. Its first line,
-the header, says what was evaluated and which code ran it. Starting the same evaluation again
-continues where it ended, however it ended; another evaluation never counts what it finds there.
+The evaluation log (``EvalLog``) has one JSON object a line, on disk as soon as an episode has
+ended. Its first line, the header, says what was evaluated and which code ran it. Starting the same
+evaluation again continues where it ended, however it ended; another evaluation never counts what it
+finds there.
 Episodes of other code are counted only if ``reuse`` says so; another header then stands before
 those that follow.
 
 An evaluation may be split into shards, one a process. torchrun sets ``RANK`` and ``WORLD_SIZE``, a
 SLURM array ``SLURM_ARRAY_TASK_ID`` (with ``_MIN``, ``_COUNT``), ``srun`` ``SLURM_PROCID`` and
 ``SLURM_NTASKS``; an array of srun steps has both. No process waits for another: each shard has an
-episode log of its own in the same folder, and whichever finds all episodes finished writes the
+evaluation log of its own in the same folder, and whichever finds all episodes finished writes the
 results.
 """
 
@@ -79,7 +80,7 @@ def episode_keys(
 
 
 def run_in_pool(
-    pool: WorkerPool, keys: Sequence[EpisodeKey], log: EpisodeLog, reporter: Reporter
+    pool: WorkerPool, keys: Sequence[EpisodeKey], log: EvalLog, reporter: Reporter
 ) -> list[dict[str, Any]]:
     """Run the episodes of ``keys`` that ``log`` does not have yet.
 
@@ -137,13 +138,13 @@ def _error_line(record: dict[str, Any]) -> str:
 
 
 def reason(text: str) -> str:
-    """One line of an error message or a traceback: the last that is no advice."""
+    """One line of an error message or a traceback: the last that is not advice."""
     lines = text.strip().splitlines()
     said = [line for line in lines if not line.startswith(("  likely cause: ", "  next: "))]
     return (said or lines)[-1].strip()
 
 
-class EpisodeLog:
+class EvalLog:
     """Finished episodes in ``path``.
 
     Args:
@@ -285,7 +286,7 @@ class EpisodeLog:
                 where=str(path),
                 cause="a library, a plugin or FluxVLA itself was changed since",
                 next="another --work-dir, or delete the file, to run all of them again; "
-                "--set eval.reuse=true to count them beside the new ones",
+                "--set eval.reuse=true to count them together with the new ones",
             )
         return code
 
@@ -312,17 +313,17 @@ class EpisodeLog:
             os.fsync(file.fileno())
 
 
-def open_episode_log(
+def open_eval_log(
     path: Path,
     identity: Mapping[str, Any],
     reporter: Reporter,
     other_logs: str | None = None,
     code: Mapping[str, Any] | None = None,
     reuse: bool = False,
-) -> EpisodeLog:
-    """Open the episode log of an evaluation; reports if that of another evaluation was
-    set aside, or if episodes of other code are counted."""
-    log = EpisodeLog(path, identity, other_logs, code, reuse)
+) -> EvalLog:
+    """Open the log of an evaluation; reports if that of another evaluation was set aside,
+    or if episodes of other code are counted."""
+    log = EvalLog(path, identity, other_logs, code, reuse)
     if log.reused:
         reporter.warn(
             f"{len(log.reused)} episodes that other code ran are counted, as reuse says: "
@@ -350,7 +351,7 @@ def _parsed(line: str) -> dict[str, Any] | None:
 
 
 def code_differences(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> list[str]:
-    """What differs in ``now``, in words; both as ``provenance.Code.to_dict`` gives them."""
+    """Differences of ``now``, in words; both as ``provenance.Code.to_dict`` gives them."""
     if before is None:
         return ["the code is not known: a former version of FluxVLA kept these episodes"]
     old, new = before.get("versions", {}), now["versions"]
@@ -362,6 +363,17 @@ def code_differences(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -
     if before.get("hash") != now["hash"]:
         lines.append(f"source code {before.get('hash')} -> {now['hash']}")
     return lines
+
+
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"operator": {"type": …}}`` as ``{"operator.type": …}``: rows for people."""
+    rows: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            rows |= flat(value, f"{prefix}{key}.")
+        else:
+            rows[f"{prefix}{key}"] = value
+    return rows
 
 
 @dataclass(frozen=True)
@@ -377,7 +389,7 @@ class Shard:
 
     @property
     def log_name(self) -> str:
-        """The file name of this part's episode log."""
+        """The file name of this part's evaluation log."""
         if self.count == 1:
             return "episodes.jsonl"
         return f"episodes-{self.index:04d}-of-{self.count:04d}.jsonl"

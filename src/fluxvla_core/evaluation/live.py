@@ -47,7 +47,7 @@ drives a robot."""
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """How live episodes are run.
+    """Settings of live episodes.
 
     Args:
         options: arguments of ``BaseInferenceRunner``, of those in ``LIVE_OPTIONS``.

@@ -198,7 +198,7 @@ def _with_statistics(source: PolicySource) -> tuple[Any, Any]:
             f"the checkpoint has no statistics {key!r}; it has {', '.join(sorted(have))}",
             where=str(checkpoint.path),
             cause="it was trained on another dataset, or under another statistic_name",
-            next="set norm_stats_key to one of these, or leave it out",
+            next="give one of these: --set <section>.norm_stats_key=NAME, or leave it out",
         )
     dataset, denormalize = source.dataset, source.denormalize_action
     if dataset is None:

@@ -1,8 +1,8 @@
 """Provenance of results: code, versions, machine, commit, date, and seeds that were trained on.
 
 An episode's outcome follows from its key, the evaluation's settings, the code that ran it and the
-libraries below. The last two are a ``Code``: every episode log holds the one that its episodes are
-from.
+libraries below. The last two are a ``Code``: every evaluation log holds the one that its episodes
+are from.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def code_of(tables: Iterable[Any], simulators: Iterable[str], computes: Iterable
 
     Args:
         tables: of a config, or of a checkpoint's.
-        simulators: distributions that are used beside what the plugins require.
+        simulators: distributions that are used in addition to what the plugins require.
         computes: the same, without what these require.
     """
     names = {name for table in tables for name in _types(table)}
@@ -157,7 +157,7 @@ def _collection(root: Path) -> dict[str, Any] | None:
 
 
 def rendering(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How pictures of ``records`` were rendered: ``sizes`` (camera -> height, width), and ``by``
+    """Rendering of the pictures of ``records``: ``sizes`` (camera -> height, width), and ``by``
     (GL backend and renderer), which has several entries where machines differ."""
     pictures = [record["pictures"] for record in records if record.get("pictures")]
     return {

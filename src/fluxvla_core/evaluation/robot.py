@@ -8,7 +8,6 @@ episodes are kept, so an evaluation that was interrupted can continue.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -18,20 +17,20 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
-from fluxvla_core.evaluation import results
+from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.episodes import (
     DONE,
     ERROR,
     EpisodeKey,
-    EpisodeLog,
-    open_episode_log,
+    EvalLog,
+    flat,
+    open_eval_log,
 )
 from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
-from fluxvla_core.evaluation.provenance import Code, code_of, provenance
-from fluxvla_core.evaluation.statistics import problems, summarise
+from fluxvla_core.evaluation.provenance import Code, code_of
+from fluxvla_core.evaluation.videos import choose_episodes, recorded_videos
 
 FOLDER = "eval_robot"
 GROUP = "policy"
@@ -100,7 +99,7 @@ class RobotEvalRunner(Runner):
             if task not in known:
                 there = ", ".join(known) or "none"
                 raise self.config_error(
-                    "tasks", f"{task!r} is no task of {section}; there are {there}"
+                    "tasks", f"{task!r} is not a task of {section}; there are {there}"
                 )
         if not self.tasks:
             raise self.config_error("tasks", f"{section} has no task_descriptions to evaluate")
@@ -133,7 +132,7 @@ class RobotEvalRunner(Runner):
         reporter, keys, about = self.context.reporter, self._keys(), self._about()
         code = self._code()
         path = self.folder / "episodes.jsonl"
-        log = open_episode_log(path, about, reporter, code=code.to_dict(), reuse=self.reuse)
+        log = open_eval_log(path, about, reporter, code=code.to_dict(), reuse=self.reuse)
         missing = [key for key in keys if key not in log]
         errors: dict[EpisodeKey, dict[str, Any]] = {}
         began = time.monotonic()
@@ -148,27 +147,22 @@ class RobotEvalRunner(Runner):
             done = len(log.records(keys)) + len(errors)
             reporter.progress("episodes", done, len(keys), successes=succeeded)
         records = [errors[key] if key in errors else log.records([key])[0] for key in keys]
-        shown = results.choose_episodes(records, self.record_videos)
+        shown = choose_episodes(records, self.record_videos)
         recordings = [(r, Path(self.context.work_dir) / r["folder"]) for r in shown]
-        results.check_any_done(records, log.path)
-        found = {
-            "format": results.FORMAT,
-            "policy": "checkpoint" if self._checkpoint else type(self._policy).__name__,
-            "mode": "robot",
-            "groups": summarise(records),
-            "problems": problems(records),
-            "checkpoint": self._checkpoint,
-            "settings": {**about["settings"], **_kept_time(records)},
-            "provenance": {
-                **provenance(code),
-                "seeds": results.seeds(records),
-                "reused": {"episodes": len(log.reused), "changed": log.changed},
-            },
-            "videos": results.recorded_videos(recordings, self.folder),
-            "timing": results.timing(records, len(missing), time.monotonic() - began, 1),
-        }
-        results.save_results(self.folder, found, self.context)
-        results.check_all_done(records, log.path)
+        results_file.check_any_done(records, log.path)
+        found = results_file.assemble(
+            records,
+            log,
+            policy="checkpoint" if self._checkpoint else type(self._policy).__name__,
+            mode="robot",
+            checkpoint=self._checkpoint,
+            settings={**about["settings"], **_kept_time(records)},
+            code=code,
+            videos=recorded_videos(recordings, self.folder),
+            timing=results_file.timing(records, len(missing), time.monotonic() - began, 1),
+        )
+        results_file.save_results(self.folder, found, self.context)
+        results_file.check_all_done(records, log.path)
         return found
 
     def _keys(self) -> list[EpisodeKey]:
@@ -176,9 +170,9 @@ class RobotEvalRunner(Runner):
         return [EpisodeKey(GROUP, name, seed) for seed in seeds for name in self.tasks]
 
     def _about(self) -> dict[str, Any]:
-        """What outcomes follow from, as far as a config says."""
+        """Everything in the config that outcomes follow from."""
         table = {k: v for k, v in self._table.items() if k not in ("seed", "ckpt_path")}
-        settings = {"section": self.section, **_flat(json.loads(json.dumps(table, default=str)))}
+        settings = {"section": self.section, **flat(results_file.as_json(table))}
         return {
             "checkpoint": None if self._checkpoint is None else self._checkpoint["sha256"],
             "settings": settings,
@@ -202,7 +196,7 @@ class RobotEvalRunner(Runner):
         runner.run_setup()
         return runner
 
-    def _episode(self, key: EpisodeKey, log: EpisodeLog) -> dict[str, Any]:
+    def _episode(self, key: EpisodeKey, log: EvalLog) -> dict[str, Any]:
         runner = self._runner(key)
         simulated = runner.robot.simulated
         if not simulated:
@@ -225,7 +219,7 @@ class RobotEvalRunner(Runner):
             **_counted(summary, time.monotonic() - began),
             "folder": Path(folder).as_posix(),
         }
-        record |= Operator.adapt(runner.ros_operator).episode_facts()
+        record |= runner.episode_facts()
         rules = [trip["rule"] for trip in summary["trips"]]
         if failure is None and record["success"] is None:
             record["success"] = self._ask_success(key)
@@ -292,14 +286,3 @@ def _kept_time(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The lowest real-time factor that simulators report, if any does."""
     kept = [r["real_time_kept"] for r in records if r.get("real_time_kept") is not None]
     return {"least_real_time_kept": min(kept)} if kept else {}
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``{"operator": {"type": …}}`` as ``{"operator.type": …}``: rows for people."""
-    rows: dict[str, Any] = {}
-    for key, value in table.items():
-        if isinstance(value, Mapping) and value:
-            rows |= _flat(value, f"{prefix}{key}.")
-        else:
-            rows[f"{prefix}{key}"] = value
-    return rows

@@ -32,7 +32,7 @@ OnStep = Callable[[Environment, int], None]
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How an episode is run, besides its environment, policy, task and seed.
+    """Settings of an episode, besides its environment, policy, task and seed.
 
     Args:
         cameras: the pictures that the policy gets.
@@ -201,7 +201,7 @@ def shaped(chunk: Any, dim: int) -> Array:
     try:
         array = np.asarray(chunk, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise SpecMismatch(f"the policy's chunk is no array of numbers: {error}") from error
+        raise SpecMismatch(f"the policy's chunk is not an array of numbers: {error}") from error
     if array.ndim != 2 or array.shape[1] != dim or not len(array):
         raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
     return array

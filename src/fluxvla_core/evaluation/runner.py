@@ -6,7 +6,6 @@ processes, nor the machines, nor an interruption changes anything but the time.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,15 +19,15 @@ from fluxvla_core.build import RunContext, build_environment_from_cfg
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluation import results
+from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.episodes import (
     POLICY,
     SWAPPED,
     EpisodeKey,
-    EpisodeLog,
+    EvalLog,
     Shard,
     episode_keys,
-    open_episode_log,
+    open_eval_log,
     run_in_pool,
     shard_of,
 )
@@ -45,27 +44,17 @@ from fluxvla_core.evaluation.policies import (
 )
 from fluxvla_core.evaluation.policy_server import PolicyServer
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.provenance import Code, code_of, provenance, rendering, unseen_seeds
-from fluxvla_core.evaluation.results import (
+from fluxvla_core.evaluation.provenance import Code, code_of, rendering, unseen_seeds
+from fluxvla_core.evaluation.rollout import RolloutSettings
+from fluxvla_core.evaluation.success_rates import count_behaviours, count_obeyed, instruction_test
+from fluxvla_core.evaluation.videos import (
+    VideoSettings,
     choose_episodes,
     record_videos,
     recorded_videos,
     with_others,
 )
-from fluxvla_core.evaluation.rollout import RolloutSettings
-from fluxvla_core.evaluation.statistics import (
-    count_behaviours,
-    count_obeyed,
-    instruction_test,
-    problems,
-    summarise,
-)
-from fluxvla_core.evaluation.worker import (
-    EpisodeWorker,
-    Job,
-    Settings,
-    Video,
-)
+from fluxvla_core.evaluation.worker import EpisodeWorker, Job, Settings
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"
@@ -106,7 +95,7 @@ class EvalRunner(Runner):
             do; they do not follow from how many of the rows were in use.
         serve_policy: one model in this process answers all workers, in batches; otherwise each
             worker has its own. Changes nothing but time and memory; by default True where
-            ``batch_size`` is above 1 or the device is no CPU.
+            ``batch_size`` is above 1 or the device is not a CPU.
         record_videos: how many episodes to show: failures first, then successes.
         video_cameras: side by side; the environment's first by default.
         video_height, video_width: of each camera's picture; the environment's own by default.
@@ -126,7 +115,7 @@ class EvalRunner(Runner):
 
     api: ClassVar[str] = "1.0"
     keeps_config: ClassVar[bool] = True
-    """The resolved config is kept beside the results, in their folder."""
+    """The resolved config is kept with the results, in their folder."""
 
     def __init__(
         self,
@@ -168,7 +157,7 @@ class EvalRunner(Runner):
         # Under torchrun, nproc is the number of its processes, not of each one's workers.
         nproc = None if "WORLD_SIZE" in os.environ else self.context.nproc
         try:
-            self._live: dict[str, Any] | None = as_json(live_options(live))
+            self._live: dict[str, Any] | None = results_file.as_json(live_options(live))
         except ConfigError as error:
             raise self.config_error("live", error.what) from error
         usual = 2 if self._live is None else 1
@@ -207,11 +196,12 @@ class EvalRunner(Runner):
             raise ConfigError(
                 f"{type(self).__name__} has no environment: where is the policy to act?",
                 where=self.context.where(self.context.section),
-                next="set environment = dict(type='...') in this section",
+                next=f"--set '{self.context.section}.environment={{type = \"CLASS\"}}'; "
+                "fluxvla plugins list shows the environments",
             )
-        self._environment = as_json(environment)
+        self._environment = results_file.as_json(environment)
         self._video = (video_cameras, video_height, video_width, video_fps)
-        self._policy = policy if isinstance(policy, str) else as_json(policy)
+        self._policy = policy if isinstance(policy, str) else results_file.as_json(policy)
         self._source = PolicySource(
             policy=CHECKPOINT,
             dataset=dataset,
@@ -245,7 +235,7 @@ class EvalRunner(Runner):
         environment.close()
         names, height, width, fps = self._video
         try:
-            video = Video.of(self._spec, names, height, width, fps)
+            video = VideoSettings.of(self._spec, names, height, width, fps)
         except ConfigError as error:
             raise self.config_error("video_cameras", error.what) from error
         self._tasks = self._spec.select_tasks(self.task_names)
@@ -288,7 +278,7 @@ class EvalRunner(Runner):
         """
         reporter, keys = self.context.reporter, self.keys()
         identity = self.identity()
-        log = open_episode_log(
+        log = open_eval_log(
             self.folder / self.shard.log_name,
             identity,
             reporter,
@@ -307,7 +297,7 @@ class EvalRunner(Runner):
             records = log.settled(keys)
             if records is None:
                 return self._leave_to_others(keys, log)
-            results.check_any_done(records, log.path)
+            results_file.check_any_done(records, log.path)
             shown = with_others(choose_episodes(records, self.record_videos), records)
             if self._live is None:
                 videos = record_videos(pool, shown, self.folder / "videos", Job, reporter)
@@ -315,33 +305,29 @@ class EvalRunner(Runner):
                 recordings = [(r, self.folder / RECORDS / r["record"]) for r in shown]
                 videos = recorded_videos(recordings, self.folder)
         policy = identity["policy"]
-        found = {
-            "format": results.FORMAT,
-            "policy": policy if isinstance(policy, str) else policy["type"],
+        found = results_file.assemble(
+            records,
+            log,
+            policy=policy if isinstance(policy, str) else policy["type"],
+            mode="stepped" if self._live is None else "live",
+            checkpoint=self._checkpoint,
+            settings=identity["settings"],
+            code=self._code,
+            videos=videos,
+            timing=results_file.timing(records, new, seconds, self.workers),
+        )
+        found |= {
             "environment": identity["environment"]["type"],
-            "mode": "stepped" if self._live is None else "live",
-            "groups": summarise(records),
-            "problems": problems(records),
             "instruction_test": instruction_test(records),
             "behaviours": count_behaviours(records),
             "obeyed": count_obeyed(records),
-            "checkpoint": self._checkpoint,
-            "settings": identity["settings"],
-            "provenance": {
-                **provenance(self._code),
-                "seeds": results.seeds(records),
-                "unseen_seeds": self._unseen,
-                "pictures": rendering(records),
-                "reused": {"episodes": len(log.reused), "changed": log.changed},
-            },
-            "videos": videos,
-            "timing": results.timing(records, new, seconds, self.workers),
         }
+        found["provenance"] |= {"unseen_seeds": self._unseen, "pictures": rendering(records)}
         if self._live is not None:
-            found["live"] = results.ticks(records)
-        results.save_results(self.folder, found, self.context)
+            found["live"] = results_file.ticks(records)
+        results_file.save_results(self.folder, found, self.context)
         if new:  # what others have to try again is theirs: failing here would end them, too
-            results.check_all_done(records, log.path)
+            results_file.check_all_done(records, log.path)
         return found
 
     def keys(self) -> list[EpisodeKey]:
@@ -353,7 +339,7 @@ class EvalRunner(Runner):
         return episode_keys(groups, tasks, self.episodes, self._ready()[0].keep_together)
 
     def identity(self) -> dict[str, Any]:
-        """What outcomes follow from, besides each episode's key, as JSON values."""
+        """Everything that outcomes follow from, besides each episode's key, as JSON values."""
         spec, settings = self._ready()
         source = asdict(settings.sources[POLICY])
         policy = source.pop("policy")
@@ -365,7 +351,7 @@ class EvalRunner(Runner):
             values["live"] = self._live
         if self.instruction_swap:
             values["wrong_instructions_of"] = settings.tasks
-        about: dict[str, Any] = as_json(
+        about: dict[str, Any] = results_file.as_json(
             {
                 "policy": policy,
                 "environment": self._environment,
@@ -399,7 +385,7 @@ class EvalRunner(Runner):
             with WorkerPool(factory, self.workers, timeout_s=timeout, link=server.link) as pool:
                 yield pool
 
-    def _leave_to_others(self, keys: Sequence[EpisodeKey], log: EpisodeLog) -> dict[str, Any]:
+    def _leave_to_others(self, keys: Sequence[EpisodeKey], log: EvalLog) -> dict[str, Any]:
         left = sum(log.settled([key]) is None for key in keys)
         part: Shard = self.shard
         self.context.reporter.info(
@@ -427,12 +413,3 @@ class EvalRunner(Runner):
         assert self._spec is not None, "run_setup() comes first"
         assert self._settings is not None
         return self._spec, self._settings
-
-
-def as_json(table: Any) -> Any:
-    """A config's table as plain JSON values, which can be sent to other processes."""
-    return json.loads(json.dumps(table, default=_as_json_value))
-
-
-def _as_json_value(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.build import build_environment_from_cfg
-from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
+from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
@@ -18,47 +18,8 @@ from fluxvla_core.evaluation.live import LiveSettings, run_live
 from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
 from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
 from fluxvla_core.spec.embodiment import Camera
-
-
-@dataclass(frozen=True)
-class Video:
-    """How videos of episodes look.
-
-    Args:
-        cameras: side by side; sizes as far as the environment can draw them.
-        fps: frames a second of simulated time.
-    """
-
-    cameras: tuple[Camera, ...] = ()
-    fps: float = 10.0
-
-    @classmethod
-    def of(
-        cls,
-        spec: EnvironmentSpec,
-        names: Sequence[str] | None,
-        height: int | None,
-        width: int | None,
-        fps: float,
-    ) -> Video:
-        """Videos of the cameras ``names``, the first one by default, in their own size by default.
-
-        Raises:
-            ConfigError: there is no such camera.
-        """
-        known = {camera.name: camera for camera in spec.embodiment.cameras}
-        for name in names or ():
-            if name not in known:
-                raise ConfigError(
-                    f"{name!r} is unknown; choose one of {', '.join(known) or 'none'}"
-                )
-        chosen = list(known.values())[:1] if names is None else [known[name] for name in names]
-        sized = (
-            replace(camera, height=height or camera.height, width=width or camera.width)
-            for camera in chosen
-        )
-        return cls(tuple(sized), fps)
 
 
 @dataclass(frozen=True)
@@ -89,7 +50,7 @@ class Settings:
     sources: Mapping[str, PolicySource]
     rollout: RolloutSettings
     size: tuple[int, int] | None = None
-    video: Video = field(default_factory=Video)
+    video: VideoSettings = field(default_factory=VideoSettings)
     served: Mapping[str, PolicyFacts] = field(default_factory=dict)
     live: LiveSettings | None = None
 
@@ -114,7 +75,7 @@ class EpisodeWorker:
         self.environment = Environment.adapt(build_environment_from_cfg(settings.environment))
         self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
         # Before the first episode: one that does not fit is refused before a scene is built, and
-        # loading it is no part of an episode's time.
+        # loading it is not part of an episode's time.
         self.actor(POLICY)
 
     def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
@@ -186,37 +147,6 @@ class EpisodeWorker:
             cameras = match_policy(actor, self.environment.spec, self._settings.size)
             self._actors[name] = actor, cameras
         return self._actors[name]
-
-
-class VideoRecorder:
-    """Records a video of an episode: call it at every step, then close it."""
-
-    def __init__(self, path: Path, video: Video) -> None:
-        self._path = path
-        self._video = video
-        self._writer: Any = None
-
-    def __call__(self, environment: Environment, steps: int) -> None:
-        import numpy as np
-
-        from fluxvla_core.robot.recording.video import VideoWriter
-
-        rate = environment.spec.embodiment.rate_hz
-        stride = max(1, round(rate / self._video.fps))
-        if steps % stride or not self._video.cameras:
-            return
-        images = environment.observe(self._video.cameras)["images"]
-        pictures = [images[camera.name] for camera in self._video.cameras]
-        lowest = min(picture.shape[0] for picture in pictures)
-        frame = np.hstack([picture[:lowest] for picture in pictures])
-        if self._writer is None:
-            self._writer = VideoWriter(self._path, rate / stride, *frame.shape[:2])
-        self._writer.add(frame)
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._writer is not None:
-            self._writer.close()
 
 
 def swapped_task(environment: Environment, task: str, evaluated: Sequence[str]) -> str:

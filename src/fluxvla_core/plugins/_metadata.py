@@ -3,7 +3,7 @@
 ``.dist-info`` folders are read here: to import ``importlib.metadata``, which brings ``email``,
 takes as long as all the rest of ``fluxvla plugins list``. It reads what else there may be (an
 ``.egg-info`` with plugins, an archive, what a finder of another library finds). No other module
-imports it: the backport beside the standard library's disables the latter's finder, so one place
+imports it: the backport next to the standard library's disables the latter's finder, so one place
 must choose.
 """
 
@@ -48,6 +48,16 @@ class Plugin:
     def origin(self) -> str:
         """``fluxvla-ur 0.3.0``: how messages name the distribution."""
         return f"{self.dist} {self.version}"
+
+    def to_dict(self) -> dict[str, str]:
+        """JSON values for ``plugins list --json`` and ``environment.json``."""
+        return {
+            "group": self.group,
+            "name": self.name,
+            "distribution": self.dist,
+            "version": self.version,
+            "value": self.value,
+        }
 
     @property
     def module(self) -> str:
@@ -206,7 +216,7 @@ class _Folder:
             if stat.S_ISDIR(found.st_mode):
                 return None
             if not stat.S_ISREG(found.st_mode):
-                raise ValueError(f"{name} is no regular file")
+                raise ValueError(f"{name} is not a regular file")
             if found.st_size > _AT_MOST[name]:
                 raise ValueError(
                     f"{name} holds {found.st_size} bytes, {_AT_MOST[name]} are the most"

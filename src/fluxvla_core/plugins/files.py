@@ -21,7 +21,7 @@ def load_plugin_files(files: Iterable[str | Path]) -> None:
     """Execute each file as a module of its own.
 
     Raises:
-        UsageError: it is not there, or is no Python file.
+        UsageError: it is not there, or is not a Python file.
         LoadFailed: it raises, or registers a class that breaks a contract.
     """
     for name in files:

@@ -64,7 +64,7 @@ def problems(
 
 
 def in_one_line(error: PluginError) -> str:
-    """What is wrong, and how to fix it."""
+    """The problem and its fix, in one line."""
     return error.what + (f"; {error.next}" if error.next else "")
 
 
@@ -117,8 +117,8 @@ class _Importer:
         self._process.join()
         module = self._left[0].module
         cause = _cause(self._process.exitcode)
-        mend = f"; python -X faulthandler -c 'import {module}' shows where"
-        yield from self._lost(f"ended the interpreter ({cause}){mend}")
+        hint = f"; python -X faulthandler -c 'import {module}' shows where"
+        yield from self._lost(f"ended the interpreter ({cause}){hint}")
         self.rest = tuple(p for p in self._left if p.module != module)
         self._left = ()
 

@@ -41,7 +41,7 @@ def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
     """The one installed plugin called ``name``, or ``distribution:name``.
 
     Args:
-        also: names registered in this process, offered beside the installed ones.
+        also: names registered in this process, offered with the installed ones.
 
     Raises:
         MissingPlugin: with a did-you-mean, or the pip command when a first-party plugin has it.

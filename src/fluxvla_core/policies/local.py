@@ -261,7 +261,7 @@ class Scaling:
 def scaling_of(
     denormalize: Callable[[Mapping[str, Any]], Array], shape: tuple[int, int], states: Array
 ) -> Scaling | None:
-    """What ``denormalize`` does to a chunk of ``shape`` ``(T, width)`` in ``states`` ``(S,)``.
+    """The scaling by ``denormalize`` of a chunk of ``shape`` ``(T, width)`` in ``states`` ``(S,)``.
 
     None if it does not scale and shift element by element: it rounds, clips or mixes.
     """

@@ -14,7 +14,6 @@ while its last answer is being played (the joiners that are ``streamed``).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import NoReturn
@@ -27,9 +26,7 @@ from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
 from fluxvla_core.robot.control.sender import CommandSender
-from fluxvla_core.robot.events import ChunkAccepted, Event, Reading, Refused
-from fluxvla_core.robot.observation import ObservationReader
-from fluxvla_core.robot.policy_calls import Answer, PolicyCaller, PolicyEnded, PolicyThread
+from fluxvla_core.robot.control.source import Answer, ChunkSource, PolicyEnded
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.supervisor import EpisodeOver, Supervisor
 
@@ -59,16 +56,13 @@ class ControlLoop:
 
     Args:
         robot: the connected robot; its clock counts.
-        reader: reads the robot's observations.
-        policy: answers observations with chunks.
+        source: observes the robot and asks the policy.
         joiner: joins the chunks to one motion.
         sender: sends every command; started at the arm's pose.
         supervisor: the episode's supervisor; is notified of every accepted chunk.
         safety: ``starvation_s``, ``first_chunk_s`` and the limits of a chunk's beginning.
-        thread: the thread in which the policy computes.
         interrupts: signals; checked while waiting, and by the supervisor at every tick.
-        emit: takes the events ``ChunkAccepted`` and ``Refused``.
-        keyframe_hz, horizon: keyframes a second, and in each answer of the policy.
+        keyframe_hz: keyframes a second in the policy's chunks.
         keyframes: how many of a chunk's keyframes are played; None plays all.
         latency_s: how long, in lockstep, an answer takes.
         holds: send the last command again at every tick while the first answer is awaited: the arm
@@ -76,17 +70,13 @@ class ControlLoop:
     """
 
     robot: Robot
-    reader: ObservationReader
-    policy: PolicyCaller
+    source: ChunkSource
     joiner: ChunkJoiner
     sender: CommandSender
     supervisor: Supervisor
     safety: SafetySettings
-    thread: PolicyThread
     interrupts: Interrupts
-    emit: Callable[[Event], None]
     keyframe_hz: float
-    horizon: int
     keyframes: int | None = None
     latency_s: float = 0.0
     holds: bool = False
@@ -160,20 +150,13 @@ class ControlLoop:
         return np.array(rows)
 
     def _ask(self) -> PendingQuery:
-        last, ahead = self.sender.limiter.last, self.joiner.ahead()
-
-        def think(reading: Reading) -> Answer:
-            rest = None if ahead is None else ahead.seen_at(reading.at, self.horizon)
-            return self.policy.ask(reading, rest)
-
+        last = self.sender.limiter.last
         due = self.robot.clock.now() + self.latency_s
-        if self.robot.lockstep:
-            until = time.monotonic() + self.safety.first_chunk_s
-            reading = self.reader.read()
-            if time.monotonic() > until:
-                raise self._no_chunk(until)
-            return PendingQuery(self.thread.submit(lambda: think(reading)), last, due)
-        return PendingQuery(self.thread.submit(lambda: think(self.reader.read())), last, due)
+        until = time.monotonic() + self.safety.first_chunk_s
+        future = self.source.ask(self.joiner.ahead())
+        if self.robot.lockstep and time.monotonic() > until:
+            raise self._no_chunk(until)
+        return PendingQuery(future, last, due)
 
     def _first(self) -> tuple[Answer, Array]:
         """The first answer: nothing moves, and the policy may have to warm up.
@@ -186,7 +169,7 @@ class ControlLoop:
         query = self._ask()
         answer = self._wait_for(query, until)
         for _ in range(0 if self.robot.lockstep else 2):
-            self.policy.reset()
+            self.source.reset()
             began = time.monotonic()
             query = self._ask()
             answer = self._wait_for(query, until)
@@ -227,27 +210,27 @@ class ControlLoop:
 
     def _receive(self, answer: Answer, anchor: Array) -> None:
         accepted = self._accepted(answer)
-        chunk = Chunk(accepted, self.keyframe_hz, answer.reading.at, anchor)
+        chunk = Chunk(accepted, self.keyframe_hz, answer.observed, anchor)
         self.joiner.add(chunk, self.robot.clock.now())
 
     def _accepted(self, answer: Answer) -> Array:
         """The ``(T, D)`` keyframes of an answer that are played, as it arrives."""
-        robot, keyframes = self.robot, answer.keyframes
+        keyframes, last = answer.keyframes, self.sender.limiter.last
         try:
             if isinstance(keyframes, BadChunk):
                 raise keyframes
-            last = self.sender.limiter.last
-            check_beginning(keyframes, robot.embodiment, last, self.keyframe_hz, self.safety)
+            embodiment = self.robot.embodiment
+            check_beginning(keyframes, embodiment, last, self.keyframe_hz, self.safety)
         except BadChunk:
-            self.emit(Refused(robot.clock.now(), "chunk", {"answer": answer.chunk}))
+            self.source.refused(answer)
             raise
         self.supervisor.chunk_accepted()
-        self.emit(ChunkAccepted(robot.clock.now(), answer.reading, keyframes, answer.stages))
+        self.source.accepted(answer)
         return keyframes[: self.keyframes]
 
     def _no_chunk(self, until: float) -> Starved:
         most = self.safety.first_chunk_s
-        late, seconds = self.robot.delays.longest(until - most)
+        late, seconds = self.source.late(until - most)
         return Starved(
             f"there was no chunk within {most:g} s: {late.name} took {seconds:.2f} s of that",
             cause=late.cause,
@@ -256,7 +239,7 @@ class ControlLoop:
 
     def _check_starved(self, seconds: float) -> None:
         if seconds > self.safety.starvation_s:
-            late, share = self.robot.delays.longest(time.monotonic() - seconds)
+            late, share = self.source.late(time.monotonic() - seconds)
             raise Starved(
                 f"the robot waits for a chunk for {seconds:.2f} s, "
                 f"safety.starvation_s is {self.safety.starvation_s:g}: "

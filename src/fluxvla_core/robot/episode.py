@@ -7,13 +7,12 @@ obeys, and the operator's own ``stop`` is called where something went wrong.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.errors import FluxError, RunFailed
@@ -24,6 +23,7 @@ from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
 from fluxvla_core.robot.control.sender import CommandSender, Execute, Sent, come_to_rest, ramp
+from fluxvla_core.robot.control.source import ChunkSource
 from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
 from fluxvla_core.robot.control_loop import ControlLoop
 from fluxvla_core.robot.events import (
@@ -36,8 +36,6 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.observation import ObservationReader, Observe
-from fluxvla_core.robot.policy_calls import PolicyCaller, PolicyThread
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.supervisor import Supervisor
 from fluxvla_core.robot.tasks import Task
@@ -51,29 +49,34 @@ _RECENT = 2.0
 _NOT_BRAKED = (Rule.OPERATOR, Rule.EXECUTE)
 
 
+SourceMaker = Callable[[Task, int, TrackingWatch, Callable[[Event], None]], ChunkSource]
+"""Makes the source of an episode's chunks.
+
+Arguments: the task, the seed of the policy, the episode's watch, and what takes its events.
+"""
+
+
 @dataclass(frozen=True)
 class EpisodeSettings:
     """How an episode is driven.
 
     Args:
-        cameras: names of the cameras that the policy looks at.
         rate_hz: commands a second.
         safety: thresholds of the safety rules.
         start_pose: ``(D,)``, where the arm goes first; None stays.
         keyframes: how many of a chunk's keyframes are played; None plays all.
         latency_s: how long, in a simulation whose time stands still, an answer takes.
         max_steps: commands after which the episode ends.
-        ready_s: how long the robot may take to give its first reading.
+        keyframe_hz: keyframes a second in the policy's chunks.
     """
 
-    cameras: tuple[str, ...]
     rate_hz: float
     safety: SafetySettings
     start_pose: Sequence[float] | None
     keyframes: int | None
     latency_s: float
     max_steps: int
-    ready_s: float
+    keyframe_hz: float
 
 
 @dataclass(frozen=True)
@@ -81,37 +84,35 @@ class EpisodeParts:
     """What a run drives a robot with, in all of its episodes.
 
     Args:
-        robot, policy: connected, loaded, and fitting each other.
-        observe: makes an observation of the robot's newest frame.
+        robot: connected.
+        source: makes the source of an episode's chunks.
         filters: the config's ``action_filters``.
         joiner: joins the chunks to one motion.
         execute: sends commands: ``(N, D)`` and the rate.
         latch: an episode does not begin while it is tripped.
         interrupts: signals that ask the run to end.
-        thread: the thread in which the policy computes.
         reporter: shows progress and warnings.
-        observers: receive every event.
+        one_by_one: as ``CommandSender`` has it.
     """
 
     robot: Robot
-    policy: Policy
-    observe: Observe
+    source: SourceMaker
     filters: Sequence[ActionFilter]
     joiner: ChunkJoiner
     execute: Execute
     latch: Latch
     interrupts: Interrupts
-    thread: PolicyThread
     reporter: Reporter
-    observers: Sequence[EpisodeObserver]
+    one_by_one: bool = False
 
 
 class Episode:
     """Runs once; its observers see what happens.
 
     Args:
-        parts: robot, policy and what else the run's episodes share.
+        parts: the robot and what else the run's episodes share.
         settings: how the episode is driven.
+        observers: receive every event.
         task: the task to do.
         number: how many episodes the run had before.
         seed: the seed of the policy.
@@ -127,6 +128,7 @@ class Episode:
         self,
         parts: EpisodeParts,
         settings: EpisodeSettings,
+        observers: Sequence[EpisodeObserver],
         task: Task,
         number: int,
         seed: int,
@@ -134,7 +136,7 @@ class Episode:
         held: bool = False,
     ) -> None:
         robot, safety = parts.robot, settings.safety
-        self._parts, self._settings = parts, settings
+        self._parts, self._settings, self._observers = parts, settings, observers
         self._robot, self._latch, self._interrupts = robot, parts.latch, parts.interrupts
         self._task, self._number = task, number
         self._before, self._held = before, held
@@ -145,18 +147,14 @@ class Episode:
         )
         self._sender = CommandSender(
             self._execute, self._rate, self._limiter, parts.latch, parts.filters,
-            self._after_tick, robot.speed,
+            self._after_tick, robot.speed, parts.one_by_one,
         )  # fmt: skip
         self._tracking = TrackingWatch(robot.embodiment, safety)
         self._supervisor = Supervisor(
             robot, self._tracking, parts.interrupts, settings.max_steps, parts.reporter,
             self._emit,
         )  # fmt: skip
-        self._reader = ObservationReader(
-            robot, parts.observe, task.instruction, settings.cameras, safety, settings.ready_s,
-            self._tracking, parts.thread, parts.interrupts, self._emit,
-        )  # fmt: skip
-        self._policy = PolicyCaller(parts.policy, robot.embodiment, safety, robot.delays, seed)
+        self._source = parts.source(task, seed, self._tracking, self._emit)
         self._columns = action_columns(robot.embodiment)
         self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
         self._trips = len(parts.latch.trips)
@@ -234,9 +232,8 @@ class Episode:
         """Read where the arm is, and bring it to the start pose."""
         settings = self._settings
         self._robot.begin(self._task.instruction, self._number)
-        reading = self._reader.first()
-        self._limiter.start(self._where(reading.state))
-        self._policy.reset()
+        self._limiter.start(self._where(self._source.first_state()))
+        self._source.reset()
         if settings.start_pose is not None:
             self._supervisor.phase = Phase.RAMP
             most = settings.safety.ramp_scale
@@ -251,20 +248,16 @@ class Episode:
         self._supervisor.phase = Phase.READY
 
     def _control_loop(self) -> ControlLoop:
-        parts, settings, policy = self._parts, self._settings, self._parts.policy
+        parts, settings = self._parts, self._settings
         return ControlLoop(
             robot=self._robot,
-            reader=self._reader,
-            policy=self._policy,
+            source=self._source,
             joiner=parts.joiner,
             sender=self._sender,
             supervisor=self._supervisor,
             safety=settings.safety,
-            thread=parts.thread,
             interrupts=self._interrupts,
-            emit=self._emit,
-            keyframe_hz=policy.action_rate_hz,
-            horizon=policy.horizon,
+            keyframe_hz=settings.keyframe_hz,
             keyframes=settings.keyframes,
             latency_s=settings.latency_s,
             holds=(settings.start_pose is not None or self._held) and not self._robot.lockstep,
@@ -299,7 +292,7 @@ class Episode:
         self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
 
     def _emit(self, event: Event) -> None:
-        for observer in self._parts.observers:
+        for observer in self._observers:
             observer.on_event(event)
 
     def _note_stall(self, error: BaseException) -> None:

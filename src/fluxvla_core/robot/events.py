@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,10 @@ from fluxvla_core.robot.tasks import Task
 Array = npt.NDArray[np.float64]
 
 
-class Phase(StrEnum):
+class Phase(str, Enum):
     """Where an episode is, as its record has it."""
+
+    __str__ = str.__str__  # its value, also in Python 3.10, which has no StrEnum
 
     START = "start"
     RAMP = "ramp"
@@ -34,6 +36,16 @@ class Phase(StrEnum):
     HOLD = "hold"
     STOP = "stop"
     OVER = "over"
+
+    @property
+    def moving(self) -> bool:
+        """Whether the arm moves by a plan: to the start pose, or as the policy says."""
+        return self in (Phase.RAMP, Phase.RUN)
+
+    @property
+    def stoppable(self) -> bool:
+        """Whether what goes wrong with the robot still has to stop it."""
+        return self.moving or self is Phase.READY
 
 
 @dataclass(frozen=True)
@@ -116,6 +128,15 @@ class CommandSent(Event):
     state: Array | None
     send_s: float | None
     late_s: float
+
+
+@dataclass(frozen=True)
+class FilterLeftOut(Event):
+    """The action filter called ``name`` was late, and is left out of the command that comes next.
+
+    After too many in a row there is none: the arm is stopped."""
+
+    name: str
 
 
 @dataclass(frozen=True)

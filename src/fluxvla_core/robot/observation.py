@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.contracts.frame import STATE, Frame
-from fluxvla_core.errors import FluxError, NotReady, SpecMismatch
+from fluxvla_core.contracts.policy import Policy
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import ConfigError, FluxError, NotReady, SpecMismatch
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import Event, Observed, Reading, Refused
 from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.robot import Robot, as_state, is_number
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 _READ_TIMEOUT_S = 0.5  # the least time that the first reading is given
 _LONG_S = 0.1  # a reading that takes longer makes its own streams old
@@ -298,6 +300,40 @@ def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]
                 f"the embodiment says {sizes.get(name)} uint8",
                 cause="the camera's mode was changed, or the spec is of another camera",
             )
+
+
+def fit_cameras(
+    policy: Policy,
+    embodiment: EmbodimentSpec,
+    chosen: tuple[str, ...] | None,
+    error: Callable[[str, str], ConfigError],
+    reporter: Reporter,
+) -> tuple[str, ...]:
+    """Check that a policy is for a robot; the names of the cameras to observe.
+
+    Args:
+        policy: loaded.
+        embodiment: the robot's.
+        chosen: the config's ``camera_names``; None for those that the policy looks at.
+        error: makes an error about a key of the config.
+        reporter: warns of pictures that are scaled.
+
+    Raises:
+        SpecMismatch: the policy is for another robot, or for other views.
+        ConfigError: ``camera_names`` does not fit.
+    """
+    looks_at = tuple(policy.cameras)
+    cameras = chosen or looks_at
+    check_match(policy.embodiment, embodiment, "the policy", "the robot", looks_at)
+    known = embodiment.camera_names
+    for name in (*cameras, *looks_at):
+        if name not in known:
+            raise error("camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}")
+        if name not in cameras:
+            raise error("camera_names", f"the policy looks at {name!r} too")
+    for warning in scaled_views(policy.embodiment, embodiment, looks_at):
+        reporter.warn(warning)
+    return cameras
 
 
 def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:

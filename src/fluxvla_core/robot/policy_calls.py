@@ -6,18 +6,19 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.policy import Continuation, Policy
-from fluxvla_core.errors import FluxError, RunFailed
+from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import check_chunk
 from fluxvla_core.robot.control.delays import POLICY, DelayMonitor
-from fluxvla_core.robot.control.safety import BadChunk, Rule, SafetySettings
+from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
+from fluxvla_core.robot.control.source import Answer, PolicyFailed
 from fluxvla_core.robot.events import Reading
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -25,32 +26,18 @@ Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 
-class PolicyFailed(RunFailed):
-    """A policy raised something."""
-
-    rule: ClassVar[str] = Rule.POLICY
-
-
-class PolicyEnded(RunFailed):
-    """A policy has no further answer: the episode ends well when the last one has been played."""
-
-    outcome = "policy_ended"
-
-
 @dataclass(frozen=True)
-class Answer:
-    """A policy's answer to a reading.
+class PolicyAnswer(Answer):
+    """A policy's answer to a reading, as it came.
 
     Args:
         reading: that it was asked with.
         chunk: as it came.
-        keyframes: ``(T, D)`` of it, read-only, or why they are refused.
         stages: seconds, by stage; ``policy`` is all of it.
     """
 
     reading: Reading
     chunk: Any
-    keyframes: Array | BadChunk
     stages: Mapping[str, float]
 
 
@@ -95,7 +82,7 @@ class PolicyCaller:
                 f"the policy raised {type(error).__name__} in reset(): {error}"
             ) from error
 
-    def ask(self, reading: Reading, rest: Continuation | None) -> Answer:
+    def ask(self, reading: Reading, rest: Continuation | None) -> PolicyAnswer:
         """The policy's answer; ``rest`` of a chunk is what it has to continue.
 
         Raises:
@@ -117,10 +104,12 @@ class PolicyCaller:
         stages = {"policy": time.perf_counter() - began, **policy.stages}
         # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread
         # that sends would have to get it again.
+        keyframes: Array | BadChunk
         try:
-            return Answer(reading, chunk, self._keyframes(chunk), stages)
+            keyframes = self._keyframes(chunk)
         except BadChunk as problem:
-            return Answer(reading, chunk, problem, stages)
+            keyframes = problem
+        return PolicyAnswer(reading.at, keyframes, reading, chunk, stages)
 
     def _keyframes(self, chunk: Any) -> Array:
         policy = self.policy
@@ -149,10 +138,9 @@ class PolicyThread:
         self._thread: threading.Thread | None = None
         self._newest: Future[Any] | None = None
 
-    @property
-    def busy(self) -> bool:
-        """Whether a job runs or waits."""
-        return self._newest is not None and not self._newest.done()
+    def idle_within(self, seconds: float) -> bool:
+        """Whether no job runs or waits any more after so many seconds at most."""
+        return self._newest is None or bool(wait((self._newest,), seconds).done)
 
     def submit(self, job: Callable[[], T]) -> Future[T]:
         """Have ``job`` run; its result, or what it raised, is in the future."""

@@ -22,7 +22,7 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.robot.control.clock import clock_of, in_lockstep
+from fluxvla_core.robot.control.clock import Rate, clock_of, in_lockstep
 from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
 from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
@@ -111,6 +111,17 @@ class Robot:
             self._call("send_action", self._operator.send_action, action)
         self.sent_s = time.perf_counter() - began
 
+    def play(self, actions: npt.NDArray[np.float64], rate: Rate) -> None:
+        """Send ``(N, D)`` commands, one at each tick of ``rate``.
+
+        Raises:
+            OperatorError: as :meth:`send`.
+        """
+        for action in actions:
+            rate.wait()
+            self.send(action)
+            rate.sleep()
+
     def frame(self) -> Frame:
         """The newest frame of an operator that has frames.
 
@@ -186,6 +197,10 @@ class Robot:
         """Whether the task is done as of now, where the operator can tell (``task_success``)."""
         found = self._operator.task_success()
         return None if found is None else bool(found)
+
+    def facts(self) -> Mapping[str, Any]:
+        """What the operator says of the last episode (``episode_facts``)."""
+        return self._operator.episode_facts()
 
     def done(self) -> bool:
         """Whether the episode can end here, where the operator can tell (``task_done``).

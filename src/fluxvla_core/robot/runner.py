@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,23 +30,25 @@ from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
 from fluxvla_core.robot.control.sender import check_pose
-from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
+from fluxvla_core.robot.division import Tables, divide
+from fluxvla_core.robot.engine import Engine, RunHistory
+from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
-from fluxvla_core.robot.observation import scaled_views
+from fluxvla_core.robot.make_engine import RunParts, make_engine
+from fluxvla_core.robot.observation import fit_cameras
 from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.session import RobotSession, RunHistory
+from fluxvla_core.robot.session import RobotSession
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 FOLDER = "inference"
@@ -98,6 +99,9 @@ class BaseInferenceRunner(Runner):
         record_fps: frames a second of the recorded videos, and of a simulation's recorded
             pictures; None records none.
         ready_timeout: seconds that the robot may take to give its first reading.
+        control_process: let a process of its own command the robot, so that nothing that the
+            policy, a camera or a hook does keeps the arm from being held. By default wherever the
+            operator can be divided (``Operator.without_cameras``) and is named by the config.
 
     Raises:
         ConfigError, PluginError: the operator cannot be built, or the values do not fit it.
@@ -137,6 +141,7 @@ class BaseInferenceRunner(Runner):
         record_fps: float | None = 10.0,
         ready_timeout: float = 10.0,
         free_tasks: bool = False,
+        control_process: bool | None = None,
     ) -> None:
         self.cfg = cfg
         self.context = context or RunContext(config=cfg or {})
@@ -167,20 +172,26 @@ class BaseInferenceRunner(Runner):
             raise ConfigError(
                 f"{type(self).__name__} has no operator: which robot is it to drive?",
                 where=self.context.where(self.context.section),
-                next="set operator = dict(type='...') in this section",
+                next=f"--set '{self.context.section}.operator={{type = \"CLASS\"}}'; "
+                "fluxvla plugins list shows the operators",
             )
-        counts = {
-            "action_chunk": action_chunk,
-            "execute_horizon": execute_horizon,
-            "max_publish_step": max_publish_step,
-        }
-        for name, value in counts.items():
+        for name in ("action_chunk", "execute_horizon", "max_publish_step"):
+            value = getattr(self, name)
             if value is not None and value < 1:
                 raise self.config_error(name, f"must be at least 1, got {value}")
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
         scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
         self.ros_operator = build_operator_from_cfg(operator, context, **scene)
         own_sending = type(self)._execute_actions is not BaseInferenceRunner._execute_actions
+        table = {**scene, **operator} if isinstance(operator, Mapping) else operator
+        tables = Tables(table, list(action_filters), gripper_threshold)
+        obstacle = "control_process is False" if control_process is False else None
+        if own_sending:
+            obstacle = f"{type(self).__name__} has an _execute_actions of its own"
+        self._division = divide(self.ros_operator, tables, self.context.config, obstacle)
+        if control_process and self._division.obstacle is not None:
+            raise self.config_error("control_process", f"is True, and {self._division.obstacle}")
+        self.ros_operator = self._division.operator
         self.robot = Robot(self.ros_operator, embodiment, sends=own_sending)
         self.embodiment = self.robot.embodiment
         self.publish_rate = self._checked_rate(publish_rate)
@@ -191,13 +202,11 @@ class BaseInferenceRunner(Runner):
                 f"{self.embodiment.state_dim} state values",
             )
         if not 0.0 <= simulated_latency < math.inf:
-            raise self.config_error(
-                "simulated_latency", f"must be 0 or more, got {simulated_latency}"
-            )
+            wrong = f"must be 0 or more, got {simulated_latency}"
+            raise self.config_error("simulated_latency", wrong)
         if simulated_latency and not self.robot.lockstep:
-            raise self.config_error(
-                "simulated_latency", "is for simulations; this robot has its own"
-            )
+            wrong = "is for simulations; this robot has its own"
+            raise self.config_error("simulated_latency", wrong)
         built = [build_action_filter_from_cfg(each, context) for each in action_filters]
         self.action_filters = [ActionFilter.adapt(each) for each in built]
         if gripper_threshold is not None:
@@ -230,12 +239,9 @@ class BaseInferenceRunner(Runner):
             place = find_checkpoint(self.ckpt_path, self.context.work_dir)
             self.context.reporter.info(f"policy: {place}")
             self.policy = load_policy(
-                place,
-                self.device,
-                self.dataset,
-                self.denormalize_action,
+                place, self.device, self.dataset, self.denormalize_action,
                 self.mixed_precision_dtype,
-            )
+            )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
         if self._joiner().continues and not self.policy.continues:
@@ -244,23 +250,12 @@ class BaseInferenceRunner(Runner):
                 f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
                 "chunk: neither it nor its model takes what is left of the last one",
             )
-        looks_at = tuple(self.policy.cameras)
-        self._cameras = self.camera_names or looks_at
-        check_match(self.policy.embodiment, self.embodiment, "the policy", "the robot", looks_at)
-        known = self.embodiment.camera_names
-        for name in (*self._cameras, *looks_at):
-            if name not in known:
-                raise self.config_error(
-                    "camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}"
-                )
-            if name not in self._cameras:
-                raise self.config_error("camera_names", f"the policy looks at {name!r} too")
-        for warning in scaled_views(self.policy.embodiment, self.embodiment, looks_at):
-            self.context.reporter.warn(warning)
+        chosen, error, reporter = self.camera_names, self.config_error, self.context.reporter
+        self._cameras = fit_cameras(self.policy, self.embodiment, chosen, error, reporter)
         if self.prepare_pose is not None:
             check_pose(self.prepare_pose, self.embodiment)
         if not self.robot.can_stop:
-            self.context.reporter.warn(
+            reporter.warn(
                 f"{self.robot.name} has no stop(): it is stopped by commands that brake, and held "
                 "by the last of them; a robot that does not hold its last command needs a stop()"
             )
@@ -283,21 +278,18 @@ class BaseInferenceRunner(Runner):
         watched = self.robot.delays.watched(self.context.reporter.warn, self.safety.starvation_s)
         with Interrupts() as interrupts, watched:
             self._observers = (HookObserver(hooks),)
+            engine = self._engine(interrupts, thread)
+            if not (self.divided or self.robot.lockstep):
+                self.context.reporter.info(f"no control process: {self._division.obstacle}")
             self._session = session = RobotSession(
-                source,
-                self.task_descriptions,
-                self.free_tasks,
-                self.seed,
-                self._history,
-                self.latch,
-                interrupts,
-                thread,
-            )
+                source, self.task_descriptions, self.free_tasks, self.seed, self._history,
+                engine, self.latch, interrupts, thread,
+            )  # fmt: skip
             try:
                 hooks.call("run_started")
                 source.open()
-                self.robot.connect()
-                with nullcontext() if self.robot.lockstep else realtime.real_time():
+                engine.connect()
+                with engine.commanding():
                     result = session.run(self._run_episode)
                 ended = "ok"
             except Interrupted as signal:
@@ -309,6 +301,15 @@ class BaseInferenceRunner(Runner):
                 source.close()
                 hooks.call("run_finished", outcome=ended)
         return result
+
+    def episode_facts(self) -> Mapping[str, Any]:
+        """JSON values that the operator tells of the last episode."""
+        return self._session.engine.episode_facts()
+
+    @property
+    def divided(self) -> bool:
+        """Whether a process of its own commands the robot."""
+        return self._division.tables is not None
 
     def get_ros_observation(self) -> tuple[Any, ...]:
         """The newest reading: one picture for each of ``camera_names``, then the state.
@@ -334,50 +335,52 @@ class BaseInferenceRunner(Runner):
 
     def _execute_actions(self, actions: Array, rate: Any) -> None:
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
-        for action in actions:
-            rate.wait()
-            self.robot.send(action)
-            rate.sleep()
+        self.robot.play(actions, rate)
 
     def _run_episode(self, task: Task) -> dict[str, Any]:
         """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""
         assert self.policy is not None, "run_setup() comes before run()"
-        reporter, session, joiner = self.context.reporter, self._session, self._joiner()
+        reporter = self.context.reporter
         root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
         self.recorder = EpisodeRecorder(
             next_folder(root, task.name), self.robot, self.policy, self._cameras, self.record_fps,
             self.record is not None, reporter,
         )  # fmt: skip
         reporter.info(f"task: {task.instruction}")
+        self._session.play(task, (self.recorder, *self._observers), self.recorder.folder)
+        return self.recorder.summary
+
+    def _engine(self, interrupts: Interrupts, thread: PolicyThread) -> Engine:
+        """What commands the robot in one run."""
+        policy = self.policy
+        assert policy is not None, "run_setup() comes before run()"
         # Played in motion, a chunk is left when the next is there, not before.
-        horizon = None if joiner.streamed else self.execute_horizon
-        used = () if self.policy.whole_motion else (self.action_chunk, horizon)
-        horizons = [n for n in used if n is not None]
+        horizon = None if self._joiner().streamed else self.execute_horizon
+        used = () if policy.whole_motion else (self.action_chunk, horizon)
         settings = EpisodeSettings(
-            cameras=self._cameras,
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
-            keyframes=min(horizons) if horizons else None,
+            keyframes=min((n for n in used if n is not None), default=None),
             latency_s=self.simulated_latency,
             max_steps=self.max_publish_step,
-            ready_s=self.ready_timeout,
+            keyframe_hz=policy.action_rate_hz,
         )
-        parts = EpisodeParts(
+        parts = RunParts(
             robot=self.robot,
-            policy=self.policy,
+            policy=policy,
             observe=self._observe,
+            cameras=self._cameras,
+            ready_s=self.ready_timeout,
             filters=self.action_filters,
-            joiner=joiner,
+            joining=self._joining(),
             execute=self._execute_actions,
+            settings=settings,
             latch=self.latch,
-            interrupts=session.interrupts,
-            thread=session.thread,
-            reporter=reporter,
-            observers=(self.recorder, *self._observers),
+            context=self.context,
+            history=self._history,
         )
-        session.play(parts, settings, task)
-        return self.recorder.summary
+        return make_engine(parts, self._division.tables, interrupts, thread)
 
     def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
@@ -386,9 +389,10 @@ class BaseInferenceRunner(Runner):
 
     def _shut_down(self, session: RobotSession) -> None:
         reporter = self.context.reporter
-        for problem in (self.robot.stop(), self.robot.close()):
+        engine = session.engine
+        for problem in (engine.stop(), engine.close()):
             # A stop that failed at the episode's end fails here again.
-            if problem and problem != session.stop_failure:
+            if problem and problem != engine.stop_failure:
                 reporter.warn(problem)
         if not session.thread.close(1.0):
             hung = " and ".join(self.robot.delays.under_way()) or "the policy's thread"
@@ -412,10 +416,13 @@ class BaseInferenceRunner(Runner):
         return value
 
     def _joiner(self) -> ChunkJoiner:
-        """A fresh one, that asks as often as ``execute_horizon`` says."""
+        return make_joiner(*self._joining())
+
+    def _joining(self) -> tuple[Any, float]:
+        """The method, and how far apart observations are at least, from ``execute_horizon``."""
         assert self.policy is not None, "run_setup() comes before run()"
         least = self.execute_horizon or (1 if self.robot.lockstep else 0)
-        return make_joiner(self.chunk_joining, least / self.policy.action_rate_hz)
+        return self.chunk_joining, least / self.policy.action_rate_hz
 
     def _checked_rate(self, publish_rate: float | None) -> float:
         most = self.embodiment.rate_hz

@@ -8,35 +8,23 @@ nothing is sent and no task is taken until the task source says ``rearm``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
-
-import numpy as np
-import numpy.typing as npt
 
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.episode import Episode, EpisodeParts, EpisodeSettings
-from fluxvla_core.robot.policy_calls import PolicyFailed, PolicyThread
+from fluxvla_core.robot.control.source import PolicyFailed
+from fluxvla_core.robot.engine import Engine, RunHistory
+from fluxvla_core.robot.events import EpisodeObserver
+from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
 _POLL_S = 0.02
+# How long a policy's answer may take that nobody waits for any more.
+_PATIENCE_S = 1.0
 _KEPT = ("task", "outcome", "success", "steps")
-
-
-@dataclass
-class RunHistory:
-    """What a runner keeps from one ``run()`` to the next.
-
-    Args:
-        episodes: number of episodes so far.
-        commanded: ``(D,)`` the last command; None before any.
-    """
-
-    episodes: int = 0
-    commanded: npt.NDArray[np.float64] | None = None
 
 
 class RobotSession:
@@ -48,9 +36,8 @@ class RobotSession:
         free: whether instructions that are not in ``known`` are allowed.
         seed: the seed of the first episode's policy; each later episode adds 1.
         history: earlier episodes of the runner; the session continues it.
+        engine: commands the robot.
         latch, interrupts, thread: shared by all episodes of the run.
-
-    ``stop_failure`` is what went wrong with the last stop.
     """
 
     def __init__(
@@ -60,20 +47,18 @@ class RobotSession:
         free: bool,
         seed: int,
         history: RunHistory,
+        engine: Engine,
         latch: Latch,
         interrupts: Interrupts,
         thread: PolicyThread,
     ) -> None:
         self.latch, self.interrupts, self.thread = latch, interrupts, thread
-        self.stop_failure: str | None = None
+        self.engine = engine
         self._source = source
         self._known = known
         self._free = free
         self._seed = seed
         self._history = history
-        # The one that ended last keeps the arm where it is; None where nothing but the arm's own
-        # controller does.
-        self._holding: Episode | None = None
         self._failure: FluxError | None = None
 
     def run(self, run_episode: Callable[[Task], Mapping[str, Any]]) -> dict[str, Any]:
@@ -113,29 +98,21 @@ class RobotSession:
             )
         return result
 
-    def play(self, parts: EpisodeParts, settings: EpisodeSettings, task: Task) -> None:
-        """Run the next episode.
+    def play(self, task: Task, observers: Sequence[EpisodeObserver], folder: Path) -> None:
+        """Run the next episode; ``folder`` is its record's.
 
         Raises:
             Exception: what ended it before its time; the robot is stopped by then.
         """
-        number, before = self._history.episodes, self._history.commanded
-        held = self._holding is not None
-        episode = Episode(parts, settings, task, number, self._seed + number, before, held)
-        try:
-            episode.run()
-        finally:
-            self._history.commanded = episode.commanded
-            self.stop_failure = episode.stop_failure
+        number = self._history.episodes
+        self.engine.play(task, number, self._seed + number, observers, folder)
         self._history.episodes += 1
-        if not parts.robot.lockstep:
-            self._holding = episode
 
     def _stopped(self, error: FluxError) -> None:
         """Continue without motion where somebody can say ``rearm``; else raise ``error``."""
-        self._holding = None
-        # A policy that still thinks cannot be asked again.
-        if not self._source.waits or self.thread.busy:
+        self.engine.release()
+        # A policy that hangs cannot be asked again.
+        if not self._source.waits or not self.thread.idle_within(_PATIENCE_S):
             self._source.report(str(error))
             raise error
         self._failure = error
@@ -145,11 +122,11 @@ class RobotSession:
     def _idle(self) -> None:
         self.interrupts.deferred = True
         self.interrupts.check()
-        if self._holding is None:
+        if not self.engine.holding:
             time.sleep(_POLL_S)
             return
         try:
-            self._holding.hold()
+            self.engine.hold()
         except (SafetyStop, NotReady) as error:
             self._stopped(error)
 
@@ -164,7 +141,7 @@ class RobotSession:
                     f"look at the robot, remove the cause, then say {REARM!r}"
                 )
             return trip is not None
-        self.latch.rearm()
+        self.engine.rearm()
         self._source.announce("nothing was stopped" if trip is None else "motion is allowed again")
         return True
 

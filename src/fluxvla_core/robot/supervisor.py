@@ -82,7 +82,7 @@ class Supervisor:
             state = None if measured is None else measured.state
             self._emit(CommandSent(robot.clock.now(), sent, phase, state, robot.sent_s, late_s))
         # Between two episodes, too: an arm that is held may be switched off, or moved.
-        if phase not in (Phase.RAMP, Phase.READY, Phase.RUN, Phase.OVER):
+        if not (phase.stoppable or phase is Phase.OVER):
             return
         if problem is not None:
             raise problem

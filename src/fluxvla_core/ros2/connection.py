@@ -17,7 +17,9 @@ import re
 import secrets
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -29,6 +31,10 @@ from fluxvla_core.ros2.streams import Stream
 WATCH_S = 0.25
 """How often the graph is looked at: publishers that come, go or change what they offer."""
 _JOIN_S = 5.0
+LARGE_FRAMES = Path(__file__).with_name("fastdds_large_frames.xml")
+_LOOPBACK = Path(__file__).with_name("fastdds_loopback.xml")
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_TRANSPORTS, _PROFILES = "FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE"
 _MAX_DOMAIN = 232
 # Python that each distribution's packages are built for (REP 2000).
 _PYTHONS: Mapping[str, str] = {
@@ -66,19 +72,44 @@ def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
     return rclpy
 
 
+@contextmanager
+def _udp_alone() -> Iterator[None]:
+    """Let the participant that is created meanwhile have UDP alone of Fast DDS's transports.
+
+    https://fast-dds.docs.eprosima.com, ``FASTDDS_BUILTIN_TRANSPORTS``. What a user says in this
+    variable, or of transports in a profiles file, counts; ours for large frames is for pictures.
+    """
+    before = {name: os.environ.get(name) for name in (_TRANSPORTS, _PROFILES, _RANGE)}
+    os.environ.setdefault(_TRANSPORTS, "UDPv4")
+    if before[_RANGE] == "LOCALHOST":
+        os.environ |= {_RANGE: "SUBNET", _PROFILES: str(_LOOPBACK)}
+    elif before[_PROFILES] == str(LARGE_FRAMES):
+        del os.environ[_PROFILES]
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
 class Connection:
     """Opens a node at once; ``close`` gives everything back.
 
     Args:
         name: begins the node's name; process id and a random part make it unique.
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID`` (0 without it).
+        shared_memory: whether Fast DDS may exchange messages with other processes of this machine
+            through shared memory. Its locks are shared too: a process that is stopped while it has
+            one stops whoever sends to it. Without it, messages go through the loopback interface.
 
     Raises:
         LoadFailed: there is no rclpy here.
         ConfigError: the domain is no number from 0 to 232.
     """
 
-    def __init__(self, name: str, domain_id: int | None = None) -> None:
+    def __init__(self, name: str, domain_id: int | None = None, shared_memory: bool = True) -> None:
         rclpy = require_rclpy()
         _check_domain(domain_id)
         keep_large_blocks()
@@ -94,19 +125,27 @@ class Connection:
         self._closing = threading.Event()
         self._lock = threading.Lock()
         self._context = Context()
-        rclpy.init(
-            args=[],
-            context=self._context,
-            domain_id=domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        try:
-            self.node = rclpy.create_node(
-                self.name,
+        transports = ExitStack()
+        if not shared_memory:
+            transports.enter_context(_udp_alone())
+        with transports:
+            rclpy.init(
+                args=[],
                 context=self._context,
-                enable_rosout=False,
-                start_parameter_services=False,
+                domain_id=domain_id,
+                signal_handler_options=SignalHandlerOptions.NO,
             )
+            try:
+                self.node = rclpy.create_node(
+                    self.name,
+                    context=self._context,
+                    enable_rosout=False,
+                    start_parameter_services=False,
+                )
+            except BaseException:
+                self._context.try_shutdown()
+                raise
+        try:
             self.domain: int = self._context.get_domain_id()
             self._wake = self.node.create_guard_condition(lambda: None)
             self.every(WATCH_S, self._watch)

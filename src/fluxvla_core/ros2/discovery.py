@@ -125,7 +125,8 @@ def other_publishers(infos: Iterable[Any], own_node: str) -> list[str]:
         if info.node_name == own_node:
             continue
         namespace = info.node_namespace.rstrip("/")
-        known = "UNKNOWN" not in info.node_name
+        # The second is what rmw calls programs that use a DDS without ROS.
+        known = not any(mark in info.node_name for mark in ("UNKNOWN", "BARE_DDS_APP"))
         names.append(f"{namespace}/{info.node_name}" if known else "a node without a name yet")
     return sorted(names)
 

@@ -3,7 +3,8 @@
 A subclass has ``embodiment``, lists its ``streams()`` and ``commands()``, makes a state vector of
 messages in ``read_state`` and messages of an action in ``publish_action``. Everything else is here:
 connecting and its checks, matching pictures and state in time, refusing bad actions before any I/O,
-holding on ``stop``, and noticing a driver that falls silent or another node that commands the arm.
+holding on ``stop``, and noticing a driver that falls silent or another node that commands the arm;
+and dividing the robot between two processes, with a node in each.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
+from fluxvla_core.contracts.part import Part
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
@@ -29,7 +31,15 @@ from fluxvla_core.ros2.messages import message_class
 from fluxvla_core.ros2.readings import POLL_S, Readings
 from fluxvla_core.ros2.startup import Startup
 from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action
-from fluxvla_core.ros2.streams import STATE, CommandSpec, Received, StreamSpec
+from fluxvla_core.ros2.streams import (
+    CAMERA,
+    DEPTH,
+    STATE,
+    CommandSpec,
+    Received,
+    Stream,
+    StreamSpec,
+)
 from fluxvla_core.ros2.sync import Stale
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -38,6 +48,8 @@ log = logging.getLogger("fluxvla.ros2")
 
 # How long a last command may take to be acknowledged before the connection is given up.
 _FLUSH_S = 0.2
+# Ends the names of the nodes, so that people who look at the graph know which is which.
+_NODE = {Part.WHOLE: "", Part.WITHOUT_CAMERAS: "_control", Part.WITHOUT_COMMANDS: "_cameras"}
 
 
 class RosOperator(Operator):
@@ -85,6 +97,7 @@ class RosOperator(Operator):
         self._lock = threading.RLock()
         self._opening = threading.Lock()
         self._connection: Connection | None = None
+        self._part = Part.WHOLE
         self._specs: tuple[StreamSpec, ...] = ()
         self._publishers: dict[str, Any] = {}
         # What holds the arm, and whether it was sent by ``send_action`` since the last stop.
@@ -97,11 +110,11 @@ class RosOperator(Operator):
 
     @abstractmethod
     def streams(self) -> Sequence[StreamSpec]:
-        """Everything that is subscribed to."""
+        """Everything of the whole robot that is subscribed to; a part leaves out what it lacks."""
 
     @abstractmethod
     def commands(self) -> Sequence[CommandSpec]:
-        """Everything that is published."""
+        """Everything of the whole robot that is published; a part leaves out what it lacks."""
 
     @abstractmethod
     def read_state(self, messages: Mapping[str, Any]) -> Array:
@@ -120,7 +133,7 @@ class RosOperator(Operator):
         return None
 
     def on_connected(self, connection: Connection) -> None:
-        """Called at the end of ``connect``."""
+        """Called at the end of ``connect``; in the part without commands it is not."""
         return
 
     def on_stop(self) -> None:
@@ -134,8 +147,26 @@ class RosOperator(Operator):
 
     # The contract.
 
+    def without_cameras(self) -> RosOperator | None:
+        """This operator, to be connected without a subscription to any camera.
+
+        Raises:
+            Rejected: it is connected, or was made the other part.
+        """
+        return self._divided(Part.WITHOUT_CAMERAS)
+
+    def without_commands(self) -> RosOperator | None:
+        """This operator, to be connected without any publisher, and without ``on_connected``.
+
+        Raises:
+            Rejected: it is connected, or was made the other part.
+        """
+        return self._divided(Part.WITHOUT_COMMANDS)
+
     def connect(self) -> None:
         """Open the connection and wait until the robot is there; nothing if it is open.
+
+        A part of the robot waits for what it has itself.
 
         Raises:
             LoadFailed: no ROS 2, or a message package is missing.
@@ -149,12 +180,16 @@ class RosOperator(Operator):
             if self._connection is not None:
                 return
             self._fault, self._last, self._moving = None, None, False
-            connection = Connection(f"fluxvla_{self.embodiment.name}", self.domain_id)
+            name = f"fluxvla_{self.embodiment.name}{_NODE[self._part]}"
+            # A process that commands an arm is not to wait for another one's locks.
+            connection = Connection(name, self.domain_id, shared_memory=self._part.cameras)
             try:
                 self._subscribe_all(connection)
                 self._connection = connection
-                self._first_frame()
-                self.on_connected(connection)
+                self._first_reading()
+                # It may send something, a command that switches the motors on for one.
+                if self._part.commands:
+                    self.on_connected(connection)
             except BaseException:
                 self._connection = None
                 connection.close()
@@ -166,12 +201,13 @@ class RosOperator(Operator):
         Waits up to ``max_age_s`` for messages that belong together; as a rule they are there.
 
         Raises:
-            NotReady: not connected.
+            NotReady: not connected, or the part without cameras.
             Stale: a stream is silent or late, or they are too far apart in time.
             BadMessage: a message is not what the embodiment describes.
             Faulted: the connection broke.
         """
         readings = self._readings
+        self._part.check_cameras(self.embodiment.name)
         matched = readings.matched()
         states = {spec.name: matched[spec.name] for spec in self._specs if spec.kind == STATE}
         state, stamp = self._state_of(states)
@@ -230,10 +266,12 @@ class RosOperator(Operator):
         """Publish one ``(dim,)`` command.
 
         Raises:
-            Rejected: wrong shape, not finite, or outside the limits; before anything is sent.
+            Rejected: wrong shape, not finite, or outside the limits; before anything is sent. Or
+                this is the part without commands.
             NotReady: not connected.
             Faulted: the connection broke, another node commands the arm, or the robot cannot move.
         """
+        self._part.check_commands(self.embodiment.name)
         checked = checked_action(self.embodiment, action)
         with self._lock:
             self._connected().check()
@@ -249,11 +287,12 @@ class RosOperator(Operator):
 
         All within the limits; an arm at rest that follows is sent its last command again. Any
         state, any thread, any number of times. An arm that was not commanded since the last stop,
-        or that another node commands, is left alone: it may be elsewhere by now. What fails is
-        logged, not raised: the caller is ending a motion for another reason.
+        or that another node commands, is left alone: it may be elsewhere by now. So is every arm by
+        the part without commands. What fails is logged, not raised: the caller is ending a motion
+        for another reason.
         """
         with self._lock:
-            if self._connection is None:
+            if self._connection is None or not self._part.commands:
                 return
             commands, self._moving = self._stop_commands(), False
             if commands:
@@ -287,8 +326,10 @@ class RosOperator(Operator):
         """Send a message on one of the ``commands()`` topics; stamps its header if it has one.
 
         Raises:
+            Rejected: this is the part without commands.
             Faulted: the middleware does not take it.
         """
+        self._part.check_commands(self.embodiment.name)
         connection = self._connected()
         if hasattr(message, "header"):
             message.header.stamp = connection.node.get_clock().now().to_msg()
@@ -303,20 +344,37 @@ class RosOperator(Operator):
         return None if self._last is None else self._last.copy()
 
     def kept(self, name: str) -> tuple[Received, ...]:
-        """The messages of a stream that are kept, newest last; none without a connection."""
-        connection = self._connection
-        return connection.streams[name].ring.items() if connection is not None else ()
+        """The messages of a stream that are kept, newest last; none without a connection, and of a
+        camera in the part without cameras."""
+        stream = self._stream(name)
+        return stream.ring.items() if stream is not None else ()
 
     def newest(self, name: str) -> Received | None:
-        """The newest message of a stream, None before the first or without a connection."""
-        connection = self._connection
-        return connection.streams[name].newest() if connection is not None else None
+        """The newest message of a stream, None before the first, without a connection, and of a
+        camera in the part without cameras."""
+        stream = self._stream(name)
+        return stream.newest() if stream is not None else None
 
-    # Parts.
+    # Pieces of the above.
+
+    def _divided(self, part: Part) -> RosOperator:
+        # Itself, not a copy: what a subclass made in its constructor may refer to this object.
+        connected = self._connection is not None
+        self._part = self._part.divided(part, connected, self.embodiment.name)
+        return self
+
+    def _stream(self, name: str) -> Stream | None:
+        connection = self._connection
+        if connection is None:
+            return None
+        # Only a part may lack a stream; any other name that is not there is a mistake.
+        streams = connection.streams
+        return streams[name] if self._part is Part.WHOLE else streams.get(name)
 
     def _subscribe_all(self, connection: Connection) -> None:
-        self._specs = tuple(self.streams())
-        commands = tuple(self.commands())
+        cameras = () if self._part.cameras else (CAMERA, DEPTH)
+        self._specs = tuple(spec for spec in self.streams() if spec.kind not in cameras)
+        commands = tuple(self.commands()) if self._part.commands else ()
         for spec in self._specs:
             message = message_class(spec.message)
             connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
@@ -328,15 +386,21 @@ class RosOperator(Operator):
         startup.wait(self.connect_timeout_s)
         for warning in [*startup.count(self.rate_window_s), *startup.missing_optional()]:
             log.warning("%s", warning)
+        if not self._part.commands:
+            return
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
 
-    def _first_frame(self) -> None:
-        """See that frames can be made; drivers that only now get going are given time."""
+    def _first_reading(self) -> None:
+        """See that frames can be made, or states in the part without cameras.
+
+        Drivers that only now get going are given time.
+        """
+        read = self.get_frame if self._part.cameras else self.get_state
         until = time.monotonic() + self.connect_timeout_s
         while True:
             try:
-                self.get_frame()
+                read()
             except Stale:
                 if time.monotonic() >= until:
                     raise

@@ -8,6 +8,8 @@ from typing import Any
 RELIABLE = "reliable"
 BEST_EFFORT = "best_effort"
 _FAST_DDS = b"\x01\x0f"
+# The first two bytes of a GUID are the vendor of the publisher's DDS (dds-foundation.org).
+_VENDORS = {b"\x01\x01": "RTI Connext", b"\x01\x10": "Cyclone DDS"}
 
 
 def reliability(offers: Iterable[Any]) -> str:
@@ -26,12 +28,26 @@ def reliability(offers: Iterable[Any]) -> str:
 def from_fast_dds(offers: Iterable[Any]) -> bool:
     """Whether every publisher is one of Fast DDS, by the vendor in its GUID (RTPS 9.3.1.5), and
     this process uses Fast DDS, too: only then do they share memory."""
+    vendors = [_vendor(offer) for offer in offers]
+    return bool(vendors) and _uses_fast_dds() and all(vendor == _FAST_DDS for vendor in vendors)
+
+
+def other_vendors(offers: Iterable[Any]) -> list[str]:
+    """Names of the DDS of the publishers that do not use Fast DDS, if this process does."""
+    others = {_vendor(offer) for offer in offers} - {_FAST_DDS}
+    if not others or not _uses_fast_dds():
+        return []
+    return sorted(_VENDORS.get(vendor, f"another DDS (vendor {vendor.hex()})") for vendor in others)
+
+
+def _vendor(offer: Any) -> bytes:
+    return bytes(offer.endpoint_gid[:2])
+
+
+def _uses_fast_dds() -> bool:
     from rclpy.utilities import get_rmw_implementation_identifier
 
-    if "fastrtps" not in get_rmw_implementation_identifier():
-        return False
-    vendors = [bytes(offer.endpoint_gid[:2]) for offer in offers]
-    return bool(vendors) and all(vendor == _FAST_DDS for vendor in vendors)
+    return "fastrtps" in get_rmw_implementation_identifier()
 
 
 def keeps_last(offers: Iterable[Any]) -> bool:

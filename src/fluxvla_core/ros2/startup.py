@@ -12,19 +12,20 @@ RELIABLE.)
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from fluxvla_core.errors import FluxError, NotReady
 from fluxvla_core.ros2 import discovery
-from fluxvla_core.ros2.connection import Connection
+from fluxvla_core.ros2.connection import LARGE_FRAMES, Connection
 from fluxvla_core.ros2.messages import type_name
-from fluxvla_core.ros2.qos import BEST_EFFORT
-from fluxvla_core.ros2.streams import CommandSpec, Stream, StreamSpec
+from fluxvla_core.ros2.qos import BEST_EFFORT, RELIABLE
+from fluxvla_core.ros2.streams import CAMERA, DEPTH, CommandSpec, Stream, StreamSpec
 
+log = logging.getLogger("fluxvla.ros2")
 _POLL_S = 0.02
 # So many lost messages, and none received, are not chance.
 _HOPELESS = 30
@@ -58,6 +59,7 @@ class Startup:
         self._optional = [spec for spec in specs if not spec.required]
         self._exclusive = [command.topic for command in commands if command.exclusive]
         self._publishers = publishers
+        self._warned: set[str] = set()
         self._since = time.monotonic()
 
     def wait(self, timeout_s: float) -> None:
@@ -70,6 +72,8 @@ class Startup:
         until = self._since + timeout_s
         while True:
             self._connection.check()
+            # Before anything else: the process may be frozen by the first lost piece.
+            self._warn_of_vendors()
             self._check_losses()
             late = time.monotonic() >= until
             problem = self._problem(explain=late)
@@ -126,6 +130,20 @@ class Startup:
         lost = [s for s in streams if s.lost >= _HOPELESS and not s.newest()]
         if lost:
             raise self._losses_error(lost)
+
+    def _warn_of_vendors(self) -> None:
+        """Log once which pictures may freeze this process (docs/ros2.md has the measurements)."""
+        pictures = [spec for spec in self._specs if spec.kind in (CAMERA, DEPTH)]
+        streams = [s for s in map(self._stream, pictures) if s.name not in self._warned]
+        found = [s for s in streams if s.other_vendors and s.reliability == RELIABLE]
+        if found:
+            self._warned.update(stream.name for stream in found)
+            log.warning("%s", vendor_warning([self._origin(stream) for stream in found]))
+
+    def _origin(self, stream: Stream) -> str:
+        offers = self._node.get_publishers_info_by_topic(stream.topic)
+        nodes = discovery.other_publishers(offers, self._connection.name)
+        return f"{stream.label} from {', '.join(nodes)} ({', '.join(stream.other_vendors)})"
 
     def _losses_error(self, lost: Sequence[Stream]) -> NotReady:
         span = time.monotonic() - self._since
@@ -261,14 +279,26 @@ def losses_error(bad: list[Reception]) -> NotReady:
             cause="the publisher offers best effort, so that a large message is lost with any "
             "piece of it; publisher and subscriber do not share Fast DDS's memory, so the network "
             "or its buffers drop the pieces",
-            next="let the publisher offer RELIABLE, or make the receive buffers of this machine "
-            "larger (net.core.rmem_max) and the pictures smaller or compressed",
+            # Not RELIABLE: see vendor_warning.
+            next="make the receive buffers of this machine larger (net.core.rmem_max; 'Robots on "
+            "another DDS' in docs/ros2.md says how), or the pictures smaller or compressed",
         )
     return NotReady(
         what,
         cause="the driver is slower than expected, or the network or this machine is overloaded",
         next="set the rate that the driver really has, or lighten the load; "
         "ros2 topic hz TOPIC shows what another subscriber gets",
+    )
+
+
+def vendor_warning(origins: Sequence[str]) -> str:
+    """The warning for reliable pictures from another DDS; ``origins`` says who publishes them."""
+    return (
+        f"reliable pictures come from another DDS: {'; '.join(origins)}. When pieces of a large "
+        "one are lost, Fast DDS can freeze this whole process (measured with Cyclone DDS). "
+        "Let the publisher offer best effort, and start this program with "
+        f"FASTDDS_DEFAULT_PROFILES_FILE={large_frames_profile()}, whose larger receive buffer "
+        "loses fewer; see 'Robots on another DDS' in docs/ros2.md"
     )
 
 
@@ -284,4 +314,4 @@ def is_trap(reception: Reception) -> bool:
 
 def large_frames_profile() -> str:
     """Path of the Fast DDS profile with a 32 MB segment that ships with this package."""
-    return str(resources.files("fluxvla_core.ros2") / "fastdds_large_frames.xml")
+    return str(LARGE_FRAMES)

@@ -194,6 +194,7 @@ class Stream:
         self.lost = 0
         self.reliability = ""
         self.from_fast_dds = False
+        self.other_vendors: list[str] = []
         self._lock = threading.Lock()
         self._asked: tuple[str, bool] | None = None
         self._node = node
@@ -217,6 +218,7 @@ class Stream:
             offers = self._node.get_publishers_info_by_topic(self.topic)
             wanted = qos.reliability(offers), self._latched and qos.keeps_last(offers)
             self.from_fast_dds = qos.from_fast_dds(offers)
+            self.other_vendors = qos.other_vendors(offers)
             if not offers or wanted == self._asked:
                 return
             before, self._asked = self._subscription, wanted

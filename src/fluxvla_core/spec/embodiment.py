@@ -1,4 +1,4 @@
-"""What a robot's numbers mean: one description for dataset, checkpoint, policy and robot.
+"""Embodiment specs: joints, units, limits, cameras; shared by dataset, policy and robot.
 
 Pure data without numpy or torch, so that a config check, a robot's onboard computer and a server
 hello can read it without anything installed. Lengths are metres, angles radians, times seconds.
@@ -73,9 +73,9 @@ class Joint:
         if _SPEED_UNITS.fullmatch(self.unit):
             raise ValueError(f"joint {self.name}: unit {self.unit!r} is a speed's; {NO_SPEEDS}")
         if self.kind not in JOINT_KINDS:
-            raise ValueError(f"joint {self.name}: kind {self.kind!r} is none of {JOINT_KINDS}")
+            raise ValueError(f"joint {self.name}: kind {self.kind!r} is not one of {JOINT_KINDS}")
         if self.unit not in UNITS:
-            raise ValueError(f"joint {self.name}: unit {self.unit!r} is none of {UNITS}")
+            raise ValueError(f"joint {self.name}: unit {self.unit!r} is not one of {UNITS}")
         numbers = (self.lower, self.upper, self.velocity, self.acceleration)
         if not all(math.isfinite(n) for n in numbers):
             raise ValueError(f"joint {self.name}: limits must be finite, got {numbers}")
@@ -143,9 +143,9 @@ class EmbodimentSpec:
 
     def __post_init__(self) -> None:
         if self.action_mode not in ACTION_MODES:
-            raise ValueError(f"action_mode {self.action_mode!r} is none of {ACTION_MODES}")
+            raise ValueError(f"action_mode {self.action_mode!r} is not one of {ACTION_MODES}")
         if self.rotation not in ROTATIONS:
-            raise ValueError(f"rotation {self.rotation!r} is none of {ROTATIONS}")
+            raise ValueError(f"rotation {self.rotation!r} is not one of {ROTATIONS}")
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be positive, got {self.rate_hz}")
         for what, names in (("joint", self.joint_names), ("camera", self.camera_names)):
@@ -194,7 +194,7 @@ class EmbodimentSpec:
         try:
             made = checked(data, cls, SpecMismatch, "")
         except SpecMismatch as error:
-            raise SpecMismatch(f"this is no embodiment spec: {error.what}") from error
+            raise SpecMismatch(f"this is not an embodiment spec: {error.what}") from error
         tables = [*data["joints"], *(data.get("state_joints") or ())]
         for kind, found in ((cls, [data]), (Joint, tables), (Camera, data["cameras"])):
             _refuse_unknown(kind, found)
@@ -206,7 +206,7 @@ def _refuse_unknown(kind: type, tables: Iterable[Mapping[str, Any]]) -> None:
     unknown = sorted({str(key) for table in tables for key in table} - names)
     if unknown:
         raise SpecMismatch(
-            f"this is no embodiment spec: {kind.__name__} takes no "
+            f"this is not an embodiment spec: {kind.__name__} takes no "
             f"{', '.join(map(repr, unknown[:8]))}"
         )
 

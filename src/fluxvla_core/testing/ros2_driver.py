@@ -98,7 +98,7 @@ class Driver:
         self._reader.join(_END_S)
 
     def on(self, topic: str) -> list[dict[str, Any]]:
-        """What it heard on ``topic``, oldest first: ``at`` (monotonic) and the message's fields."""
+        """Messages on ``topic``, oldest first: ``at`` (monotonic) and the message's fields."""
         return [item for item in list(self.heard) if item["topic"] == topic]
 
     def __enter__(self) -> Driver:

@@ -1,4 +1,4 @@
-"""ROS domains for tests that run beside one another, on a machine where others use ROS too."""
+"""ROS domains for tests that run in parallel, on a machine where others use ROS too."""
 
 from __future__ import annotations
 

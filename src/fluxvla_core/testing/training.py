@@ -409,7 +409,7 @@ def _free_port() -> int:
 
 
 def differences(left: Path, right: Path) -> list[str]:
-    """How two work dirs differ: names of checkpoint files whose bytes do, and of metric lines.
+    """Differences of two work dirs: checkpoint files whose bytes differ, and metric lines.
 
     Compares all checkpoints, and ``metrics.jsonl`` without its wall-clock fields.
     """

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fluxvla_core.training.distributed import World as World
     from fluxvla_core.training.distributed import share_buffers as share_buffers
     from fluxvla_core.training.model import units_of as units_of
-    from fluxvla_core.training.optim import refuse_scalars as refuse_scalars
-    from fluxvla_core.training.optim import trainable as trainable
-    from fluxvla_core.training.state import rng_state as rng_state
-    from fluxvla_core.training.state import set_rng_state as set_rng_state
+    from fluxvla_core.training.parameters import refuse_scalars as refuse_scalars
+    from fluxvla_core.training.parameters import trainable as trainable
+    from fluxvla_core.training.rng import rng_state as rng_state
+    from fluxvla_core.training.rng import set_rng_state as set_rng_state
     from fluxvla_core.training.weights import left_out as left_out
 
 __getattr__, __dir__, __all__ = _lazy.attach(
@@ -49,8 +49,8 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
         "fluxvla_core.training.distributed": ["World", "share_buffers"],
         "fluxvla_core.training.model": ["units_of"],
-        "fluxvla_core.training.optim": ["refuse_scalars", "trainable"],
-        "fluxvla_core.training.state": ["rng_state", "set_rng_state"],
+        "fluxvla_core.training.parameters": ["refuse_scalars", "trainable"],
+        "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },
 )

@@ -104,7 +104,7 @@ class BaseTrainRunner(Strategy):
             CheckpointError, ConfigError, DataError: the inputs do not fit.
         """
         from fluxvla_core.training import distributed, memory
-        from fluxvla_core.training.state import Progress
+        from fluxvla_core.training.progress import Progress
         from fluxvla_core.training.stop import StopRequest, stopped
         from fluxvla_core.training.trainer import Trainer
 
@@ -142,8 +142,8 @@ class BaseTrainRunner(Strategy):
 
         if self._trainer is not None:
             self._trainer.close()
-        if self._saver is not None:
-            self._saver.close()
+        if self.saver is not None:
+            self.saver.close()
         if self.world.first:
             self.metric.finalize()
         self.hooks.call("run_finished", outcome=outcome)
@@ -166,7 +166,7 @@ class BaseTrainRunner(Strategy):
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
         from fluxvla_core.training import flops, lora
         from fluxvla_core.training.model import checkpoint_activations, compile_units
-        from fluxvla_core.training.state import seed_all
+        from fluxvla_core.training.rng import seed_all
         from fluxvla_core.training.weights import base_to_note, start_training_from
 
         self._prepare()
@@ -178,7 +178,7 @@ class BaseTrainRunner(Strategy):
             )
         seed_all(self.options.seed)
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
-        options, before = self.options, self._checkpoint
+        options, before = self.options, self.resume_checkpoint
         start_training_from(vla, options.init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = base_to_note(before, options.init_from)
@@ -192,7 +192,7 @@ class BaseTrainRunner(Strategy):
 
     def _build_lr_scheduler(self, n_train_examples: int) -> Any:
         """The schedule over all steps of the run; has ``step`` and a JSON ``state_dict``."""
-        from fluxvla_core.training.optim import ScheduledLR
+        from fluxvla_core.training.lr_scheduler import ScheduledLR
         from fluxvla_core.training.schedule import make_schedule
 
         options = self.options
@@ -243,7 +243,9 @@ class BaseTrainRunner(Strategy):
         self._work_dir_lock = lock_on_first(self._world, self.context)
         configured = self.options.resume_from
         wanted = self.context.resume or configured
-        self._checkpoint = choose_checkpoint(self._world, self.context, wanted, first=configured)
+        self.resume_checkpoint = choose_checkpoint(
+            self._world, self.context, wanted, first=configured
+        )
 
     def check_work_dir(self) -> None:
         """See that the work dir is still this run's; the first rank has the lock.

@@ -36,7 +36,7 @@ class Cursor:
 
 @dataclass(frozen=True)
 class StepPlan:
-    """How an epoch of ``length`` samples is cut into steps.
+    """Cuts an epoch of ``length`` samples into steps.
 
     Args:
         length: samples in the dataset.
@@ -65,7 +65,7 @@ class StepPlan:
         return self.shards.together if self.shards is not None else None
 
     def to_dict(self) -> dict[str, Any]:
-        """What ``trainer.json`` says of it, as JSON values."""
+        """Its part of ``trainer.json``, as JSON values."""
         return {
             "seed": self.seed,
             "n_train_examples": self.length,
@@ -105,7 +105,7 @@ class StepPlan:
 
 
 def episode_shards(dataset: Any, together: int | None, where: str | None) -> EpisodeShards | None:
-    """How ``shuffle_episodes`` cuts ``dataset``: ``together`` episodes at a time, or not at all.
+    """Shards of ``dataset`` by ``shuffle_episodes``: ``together`` episodes at a time, or None.
 
     Raises:
         ConfigError: the dataset does not say where its episodes end.

@@ -124,7 +124,7 @@ def _attempts_store() -> Any:
 
 def _device(name: str, local_rank: int) -> torch.device:
     if name not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"device {name!r} is none of 'auto', 'cpu', 'cuda'")
+        raise ConfigError(f"device {name!r} is not one of 'auto', 'cpu', 'cuda'")
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "device is 'cuda', but torch finds no GPU here",
@@ -257,7 +257,7 @@ def share_buffers(world: World, model: nn.Module) -> None:
 
 
 def explain(error: Exception, world: World, step: int) -> RunFailed | None:
-    """What a broken collective operation means; None if ``error`` is about something else."""
+    """Explain a broken collective operation; None if ``error`` is about something else."""
     text = str(error).strip().lower()
     # A loader worker's error comes with its traceback; an OSError is of this machine's own.
     elsewhere = text.startswith("caught ") or isinstance(error, OSError)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.training.model import loss_of
-from fluxvla_core.training.state import rng_state, set_rng_state
+from fluxvla_core.training.rng import rng_state, set_rng_state
 
 PEAK_TFLOPS: tuple[tuple[str, float], ...] = (
     ("B200", 2250.0),  # NVIDIA DGX B200 datasheet: 36 PFLOPS for eight, with sparsity

@@ -30,7 +30,7 @@ _PEFTS = ("base_layer", "lora_dropout")  # what peft puts into every layer that 
 
 @dataclass(frozen=True)
 class SavedAdapter:
-    """What is read of ``adapter_config.json``."""
+    """The fields read from ``adapter_config.json``."""
 
     r: int
     target_modules: list[str] | str
@@ -61,11 +61,12 @@ class LoraOptions:
 
     @classmethod
     def read(cls, table: Any, where: str | None) -> LoraOptions:
-        """Take and check the table.
+        """Take and check the table, or options that were made in Python.
 
         Raises:
             ConfigError: unknown or missing keys, or invalid values.
         """
+        table = vars(table) if isinstance(table, cls) else table
         known = [field.name for field in fields(cls)]
         if not isinstance(table, Mapping):
             raise ConfigError(f"lora must be a table, got {table!r}", where=where)
@@ -211,7 +212,7 @@ def _check_unambiguous(model: nn.Module, saved: Sequence[str], where: str | None
 
 
 def _also_hit(names: Iterable[str], end: str) -> list[str]:
-    """Modules that peft takes for ``end`` though it is no whole part of their names."""
+    """Modules that peft takes for ``end`` though it is not a whole part of their names."""
     pefts = (f"peft's own {name}" for name in _PEFTS if name.endswith(end))
     return [*(n for n in names if n.endswith(end) and not _ends(n, end)), *pefts]
 

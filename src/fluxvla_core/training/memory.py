@@ -47,7 +47,7 @@ _GO_ON = "then resume with --resume auto: checkpoints are as they were"
 
 
 def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
-    """What ``error`` means if memory ran out, or a loader worker of it; else None."""
+    """Explain ``error`` if memory ran out here or in a loader worker; None for other errors."""
     text = str(error).strip()
     lower = text.lower()
     when = "" if step is None else f" at step {step}"

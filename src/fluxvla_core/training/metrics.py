@@ -111,7 +111,7 @@ class VLAMetric(Metric):
             tracker.sync()
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs to record what an uninterrupted one would."""
+        """State that lets a resumed run record the same as an uninterrupted one."""
         return {"losses": list(self._losses)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -52,13 +52,7 @@ def checkpoint_activations(model: nn.Module) -> None:
     """
     from torch.utils.checkpoint import checkpoint
 
-    units = blocks_of(model)
-    if not units:
-        raise ConfigError(
-            f"enable_gradient_checkpointing: {type(model).__name__} names no units to recompute",
-            cause="it has no fsdp_units()",
-        )
-    for unit in units:
+    for unit in _named_blocks(model, "enable_gradient_checkpointing", "units to recompute"):
         unit.__dict__["forward"] = _recomputed(unit.forward, checkpoint)
 
 
@@ -71,14 +65,17 @@ def compile_units(model: nn.Module) -> None:
     Raises:
         ConfigError: the model names no units.
     """
-    units = blocks_of(model)
-    if not units:
-        raise ConfigError(
-            f"compile_blocks: {type(model).__name__} names no blocks to compile",
-            cause="it has no fsdp_units()",
-        )
-    for unit in units:
+    for unit in _named_blocks(model, "compile_blocks", "blocks to compile"):
         unit.__dict__["forward"] = torch.compile(unit.forward)
+
+
+def _named_blocks(model: nn.Module, option: str, purpose: str) -> list[nn.Module]:
+    blocks = blocks_of(model)
+    if not blocks:
+        raise ConfigError(
+            f"{option}: {type(model).__name__} names no {purpose}", cause="it has no fsdp_units()"
+        )
+    return blocks
 
 
 def _recomputed(forward: Any, checkpoint: Any) -> Any:

@@ -70,7 +70,7 @@ class TrainOptions:
     init_from: str | None = None
     """weights to start from: a checkpoint's folder, a work dir, a safetensors file; a run that goes
     on has its own, or its adapter's base, instead."""
-    lora: Mapping[str, Any] | None = None
+    lora: LoraOptions | Mapping[str, Any] | None = None
     """train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
     ``alpha``, ``dropout``, ``modules_to_save``."""
     ema_decay: float | None = None

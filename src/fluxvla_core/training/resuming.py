@@ -30,15 +30,9 @@ from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
 from fluxvla_core.training.distributed import World, agree, on_first
 from fluxvla_core.training.lora import LoraOptions, adapter_tensors
-from fluxvla_core.training.saving import plain, rng_file
-from fluxvla_core.training.state import (
-    Progress,
-    SavedTrainer,
-    rank_seed,
-    seed_all,
-    seeds_of,
-    set_rng_state,
-)
+from fluxvla_core.training.progress import Progress, SavedTrainer
+from fluxvla_core.training.rng import rank_seed, seed_all, seeds_of, set_rng_state
+from fluxvla_core.training.saving import described_as_json, rng_file
 from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_tensors
 
 AUTO = "auto"
@@ -223,7 +217,7 @@ def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: names the statistics that differ.
     """
-    ours = plain(dict(Dataset.adapt(dataset).statistics or {}))
+    ours = described_as_json(dict(Dataset.adapt(dataset).statistics or {}))
     changed = changed_statistics(checkpoint.statistics(), ours)
     if changed:
         named = ", ".join(changed[:6]) + (", …" if len(changed) > 6 else "")
@@ -377,7 +371,7 @@ def changed_settings(
         {
             key: value
             for name in (section, *TABLES)
-            for key, value in _leaves(name, plain(tree.get(name) or {}), harmless)
+            for key, value in _leaves(name, described_as_json(tree.get(name) or {}), harmless)
         }
         for tree in (saved, ours)
     )

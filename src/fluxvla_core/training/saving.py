@@ -27,8 +27,8 @@ from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, agree, on_first, texts
-from fluxvla_core.training.optim import Ema
-from fluxvla_core.training.state import rng_state
+from fluxvla_core.training.ema import Ema
+from fluxvla_core.training.rng import rng_state
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -169,7 +169,7 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
     rate = described.fps
     config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
     documents: dict[str, dict[str, Any]] = {
-        ckpt.CONFIG: plain(config),
+        ckpt.CONFIG: described_as_json(config),
         ckpt.ENVIRONMENT: environment(),
         ckpt.POLICY: {
             "action_rate_hz": None if rate is None else float(rate),
@@ -183,7 +183,7 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
     return documents
 
 
-def plain(config: Any) -> Any:
+def described_as_json(config: Any) -> Any:
     """``config`` as JSON values; objects, which one made in Python may hold, are described."""
     return json.loads(json.dumps(config, default=_described))
 
@@ -194,7 +194,7 @@ def _described(value: Any) -> str:
 
 
 def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]]:
-    """What fills the checkpoint's ``processors``: the dataset's pipeline, else the tokenizer."""
+    """Content of the checkpoint's ``processors``: the dataset's pipeline, else the tokenizer."""
     for owner in (getattr(dataset, "pipeline", None), getattr(dataset, "transforms", None)):
         save = getattr(owner, "save_pretrained", None)
         if save is not None:
@@ -283,7 +283,7 @@ class Saver:
             self._job.copied.wait()
 
     def settle(self, wait: bool) -> Saved | None:
-        """What became of the checkpoint on its way; all ranks call it at the same step.
+        """The outcome of the save under way; all ranks call it at the same step.
 
         Args:
             wait: for its end; otherwise None is returned while some rank still writes.

@@ -107,7 +107,7 @@ def _raise(trouble: FluxError | None) -> str:
 
 
 def stopped(number: int, place: str) -> BaseException:
-    """What a run that was asked to stop, and saved, ends with.
+    """The exception that ends a run that was asked to stop, and saved.
 
     SIGINT ends as an interrupted command does (exit code 130), the others as one that could not
     finish (1): a scheduler that restarts failed jobs then restarts this one.

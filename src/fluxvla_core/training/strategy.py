@@ -29,18 +29,18 @@ if TYPE_CHECKING:
     from fluxvla_core.data.sampler import EpisodeShards
     from fluxvla_core.training.batches import StepPlan
     from fluxvla_core.training.distributed import World
+    from fluxvla_core.training.ema import Ema
     from fluxvla_core.training.flops import Meter
     from fluxvla_core.training.model import ForwardArguments
-    from fluxvla_core.training.optim import Ema
+    from fluxvla_core.training.progress import Progress
     from fluxvla_core.training.saving import Saver, Snapshot
-    from fluxvla_core.training.state import Progress
     from fluxvla_core.training.weights import LeftOut
 
 _NO_CONTEXT = nullcontext()
 
 
 class Strategy(TrainRunner):
-    """How a model is put on its devices, trained and saved; as it is, on one process."""
+    """Training strategy: puts a model on its devices, trains and saves it; here on one process."""
 
     # Set by the constructor of BaseTrainRunner.
     context: RunContext
@@ -65,6 +65,8 @@ class Strategy(TrainRunner):
     flops: Meter | None = None
     adapter_base: str | None = None
     left_out: LeftOut | None = None
+    resume_checkpoint: Checkpoint | None = None
+    """The checkpoint that the run resumes from; None for a fresh start."""
     # Known inside run().
     dataset: Any = None
     plan: StepPlan
@@ -73,11 +75,12 @@ class Strategy(TrainRunner):
     sample_losses: Tensor | None = None
     late_stop: int = 0
     """The signal that asked for a stop when training was complete: nothing new is to begin."""
+    forward_arguments: ForwardArguments | None = None
+    """Makes the arguments of the model's ``forward`` from a batch."""
+    saver: Saver | None = None
+    """Writes checkpoints; a strategy that saves outside ``run()`` gets one that waits."""
     _world: World | None = None
     _work_dir_lock: WorkDirLock | None = None
-    _checkpoint: Checkpoint | None = None
-    _arguments: ForwardArguments | None = None
-    _saver: Saver | None = None
 
     # Where the model trains.
 
@@ -103,7 +106,7 @@ class Strategy(TrainRunner):
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
         """The config's ``optimizer``, with weight decay on matrices only."""
-        from fluxvla_core.training.optim import decay_groups
+        from fluxvla_core.training.parameters import decay_groups
 
         groups = decay_groups(self.model, self.weight_decay)
         built: torch.optim.Optimizer = self.optimizer_settings.build(groups, self.learning_rate)
@@ -115,12 +118,12 @@ class Strategy(TrainRunner):
         """Forward pass of one batch on the device: its loss, a scalar with a gradient."""
         from fluxvla_core.training.model import autocast, loss_of, sample_losses_of
 
-        if self._arguments is None:
+        if self.forward_arguments is None:
             raise RuntimeError("a batch's arguments are known inside run() only")
         with autocast(self.world.device, self.compute_dtype):
-            output = self.vla(**self._arguments(batch))
+            output = self.vla(**self.forward_arguments(batch))
         self.sample_losses = sample_losses_of(output)
-        return loss_of(output, self._arguments.model_name)
+        return loss_of(output, self.forward_arguments.model_name)
 
     def sync_gradients(self, last: bool) -> AbstractContextManager[object]:
         """Entered for each batch of a step; only the ``last`` one exchanges gradients."""
@@ -136,7 +139,7 @@ class Strategy(TrainRunner):
         Where ``clip_grad_norm`` returns None it is computed here: gradients that are not finite
         must not go unseen.
         """
-        from fluxvla_core.training.optim import gradient_norm
+        from fluxvla_core.training.gradients import gradient_norm
 
         norm = self.clip_grad_norm()
         if norm is None:
@@ -152,7 +155,7 @@ class Strategy(TrainRunner):
 
         None says nothing of the norm, as where there is no ``max_grad_norm``.
         """
-        from fluxvla_core.training.optim import clip_
+        from fluxvla_core.training.gradients import clip_
 
         return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
 
@@ -185,10 +188,10 @@ class Strategy(TrainRunner):
         """
         from fluxvla_core.training.saving import Saver, save_snapshot
 
-        if self._saver is None:
-            self._saver = Saver(self.world, False)
+        if self.saver is None:
+            self.saver = Saver(self.world, False)
         path = save_snapshot(
-            self._saver,
+            self.saver,
             Path(run_dir),
             global_step,
             epoch,
@@ -196,7 +199,7 @@ class Strategy(TrainRunner):
             self.options.max_keep_ckpts,
             self.progress.best_step,
         )
-        if not self._saver.background:
+        if not self.saver.background:
             self.settle_saves()
         return path
 
@@ -209,7 +212,7 @@ class Strategy(TrainRunner):
         Raises:
             RunFailed: it could not be written; the earlier ones are as they were.
         """
-        saved = self._saver.settle(wait) if self._saver is not None else None
+        saved = self.saver.settle(wait) if self.saver is not None else None
         if saved is None or not self.world.first:
             return
         from fluxvla_core.checkpoints.retention import name_best
@@ -224,8 +227,8 @@ class Strategy(TrainRunner):
     def _snapshot(self, train_loss: float | None, only_trainable: bool) -> Snapshot:
         """The present moment, without frozen weights that the model brings itself if so asked."""
         from fluxvla_core.training import lora
+        from fluxvla_core.training.rng import seeds_of
         from fluxvla_core.training.saving import Snapshot, run_documents, run_folders
-        from fluxvla_core.training.state import seeds_of
         from fluxvla_core.training.weights import LeftOut
 
         brings = self.left_out if only_trainable and self.left_out is not None else LeftOut()
@@ -267,10 +270,10 @@ class Strategy(TrainRunner):
         """
         from fluxvla_core.checkpoints import checkpoint as ckpt
         from fluxvla_core.training import resuming
-        from fluxvla_core.training.optim import SavedOptimizer
-        from fluxvla_core.training.state import Progress
+        from fluxvla_core.training.optimizer_state import SavedOptimizer
+        from fluxvla_core.training.progress import Progress
 
-        checkpoint = self._checkpoint
+        checkpoint = self.resume_checkpoint
         if checkpoint is None:
             return 0
         where = str(checkpoint.path)
@@ -301,7 +304,7 @@ class Strategy(TrainRunner):
         The rate follows the part of the run that is done. A count of the old steps would be past
         the end of fewer, larger ones, and train the rest at a rate of 0.
         """
-        from fluxvla_core.training.optim import ScheduledLR
+        from fluxvla_core.training.lr_scheduler import ScheduledLR
 
         same = saved["step_samples"] == self.plan.step_samples
         if same or not isinstance(self.lr_scheduler, ScheduledLR):
@@ -328,7 +331,7 @@ class Strategy(TrainRunner):
 
     def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""
-        from fluxvla_core.training.optim import named_state
+        from fluxvla_core.training.optimizer_state import named_state
 
         return named_state(self.model, self.optimizer)
 
@@ -336,7 +339,7 @@ class Strategy(TrainRunner):
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
         """The inverse of :meth:`optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
-        from fluxvla_core.training.optim import torch_state
+        from fluxvla_core.training.optimizer_state import torch_state
 
         state = torch_state(self.model, self.optimizer, tensors, described, where)
         return self._load_optimizer_state(state)
@@ -357,7 +360,7 @@ class Strategy(TrainRunner):
 
     @cached_property
     def compute_dtype(self) -> torch.dtype | None:
-        """What the forward pass computes in; None for the weights' own fp32."""
+        """The dtype of the forward pass; None for the weights' own fp32."""
         from fluxvla_core.training.model import compute_dtype
 
         options = self.options
@@ -371,7 +374,7 @@ class Strategy(TrainRunner):
         return done + self.plan.run_steps_left(done, cursor, self.max_steps, self.max_epochs)
 
     def plan_steps(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
-        """How epochs of so many samples are cut into steps."""
+        """The plan that cuts epochs of so many samples into steps."""
         from fluxvla_core.training.batches import StepPlan
 
         return StepPlan(

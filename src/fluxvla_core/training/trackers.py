@@ -66,7 +66,7 @@ class TensorboardTracker:
         from torch.utils.tensorboard import SummaryWriter
 
         place = os.environ.get("TENSORBOARD_LOG_PATH") or str(run_dir / "tensorboard")
-        # Steps that a resumed run does again, or one that begins anew in the folder of a run that
+        # Steps that a resumed run does again, or one that starts again in the folder of a run that
         # was killed before its first checkpoint, replace what was shown for them.
         self._writer: Any = SummaryWriter(place, purge_step=step + 1)
 
@@ -220,7 +220,7 @@ def open_tracker(
 
 
 def _identity(tracker: str, run_dir: Path, step: int) -> str:
-    """What the tracker knows this run by: random, kept with the run, a new one for a new run."""
+    """The run's id at the tracker: random, kept with the run, a new one for a new run."""
     path = run_dir / f"{tracker}_run_id"
     if step and path.is_file():
         return path.read_text(encoding="utf-8").strip()

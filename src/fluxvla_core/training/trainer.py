@@ -18,11 +18,12 @@ from fluxvla_core.data.loader import make_loader
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.training import memory
 from fluxvla_core.training.batches import IDS, StepSampler, episode_shards, loader_source, to_device
+from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.model import ForwardArguments
-from fluxvla_core.training.optim import Ema, trainable
+from fluxvla_core.training.parameters import trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
+from fluxvla_core.training.rng import take_seed
 from fluxvla_core.training.saving import Saver
-from fluxvla_core.training.state import take_seed
 from fluxvla_core.training.step_metrics import StepMetrics, as_metrics
 from fluxvla_core.training.stop import StopRequest
 from fluxvla_core.training.validation import NotFinite, Validation, validation_dataset
@@ -56,14 +57,15 @@ class Trainer:
         where = context.where("train_dataloader.shuffle_episodes")
         shards = episode_shards(dataset, run.loader_options.shuffle_episodes, where)
         run.plan = run.plan_steps(len(dataset), shards)
-        run._saver = Saver(world, options.async_save, run.optimizer)
-        run._arguments = ForwardArguments(run.model, context.where(f"{context.section}.collator"))
+        run.saver = Saver(world, options.async_save, run.optimizer)
+        where = context.where(f"{context.section}.collator")
+        run.forward_arguments = ForwardArguments(run.model, where)
         if run.left_out is None:
             run.left_out = left_out(run.model)
         if options.ema_decay is not None:
             run.ema = Ema(trainable(run.model), options.ema_decay)
         run.resume()
-        forget_missing(run.progress, world, context.work_dir, run._checkpoint)
+        forget_missing(run.progress, world, context.work_dir, run.resume_checkpoint)
         self._validation: Validation | None = None
         if run.val_options is not None:
             self._validation = Validation(
@@ -93,7 +95,7 @@ class Trainer:
         run.vla.train()
         run.hooks.call("run_started")
         # Last, so that nothing above has drawn from the generators that are restored.
-        restore_rng(world, run._checkpoint, options.seed)
+        restore_rng(world, run.resume_checkpoint, options.seed)
 
     def run(self, finished: Callable[[], bool], due: Callable[[], bool]) -> int:
         """Step until ``finished()``, saving whenever ``due()``, and at the end.
@@ -214,8 +216,8 @@ class Trainer:
         first = next(self._batches)
         self._batches = chain([first], self._batches)
         shown = to_device(first, run.world.device)
-        if run.flops is not None and run._arguments is not None:
-            trouble = run.flops.count(run._arguments(shown))
+        if run.flops is not None and run.forward_arguments is not None:
+            trouble = run.flops.count(run.forward_arguments(shown))
             if trouble is not None and run.world.first:
                 run.context.reporter.warn(f"mfu is not reported: {trouble}")
         run.warm_up(shown)

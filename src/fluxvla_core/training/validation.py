@@ -17,14 +17,14 @@ from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.training.batches import loader_source, to_device
 from fluxvla_core.training.distributed import World, total
-from fluxvla_core.training.optim import Ema
+from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.options import LoaderOptions
-from fluxvla_core.training.state import rank_seed, rng_state, seed_all, set_rng_state, take_seed
+from fluxvla_core.training.rng import rank_seed, rng_state, seed_all, set_rng_state, take_seed
 from fluxvla_core.training.stop import StopRequest
 
 
 class NotFinite(RunFailed):
-    """A validation loss that is no number; every rank raises it at the same place."""
+    """A validation loss that is not a number; every rank raises it at the same place."""
 
 
 class Validation:
@@ -153,7 +153,7 @@ def share_statistics(train: Any, val: Any) -> None:
         name = dataset.statistic_name
         if name not in train.statistics:
             raise ConfigError(
-                f"val_dataloader: its statistic_name {name!r} is none of the training data's, "
+                f"val_dataloader: its statistic_name {name!r} is not one of the training data's, "
                 f"{', '.join(train.statistics)}"
             )
         dataset.use_statistics(train.statistics[name])

@@ -47,13 +47,13 @@ class SavedLeftOut:
 
 @dataclass(frozen=True)
 class SavedWeights:
-    """What ``trainer.json`` says in every checkpoint, exported ones too."""
+    """The fields of ``trainer.json`` that every checkpoint has, exported ones too."""
 
     left_out: SavedLeftOut
 
 
 def left_out(model: nn.Module) -> LeftOut:
-    """What :class:`LeftOut` there is in ``model``; reads those weights once to hash them."""
+    """The :class:`LeftOut` weights of ``model``; reads them once to hash them."""
     sources = frozen_sources(model)
     state = model.state_dict(keep_vars=True)
     # What stands in no part by itself but in the whole model may be a buffer that training changes.
@@ -75,7 +75,7 @@ def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, 
     """Parameters and persistent buffers by name, but for those in ``without``.
 
     Raises:
-        CheckpointError: the model keeps extra state that is no tensor.
+        CheckpointError: the model keeps extra state that is not a tensor.
     """
     skipped = set(without)
     state = model.state_dict(keep_vars=True)

@@ -91,7 +91,7 @@ def test_equal_generators_draw_equally_and_others_differ():
         ({"type": "SampleFlowNoise", "repeats": 0}, "repeats must be at least 1, got 0"),
         (
             {"type": "SampleFlowNoise", "distribution": "gamma"},
-            "distribution 'gamma' is none of beta, uniform, logit_normal",
+            "distribution 'gamma' is not one of beta, uniform, logit_normal",
         ),
         ({"type": "SampleFlowNoise", "alpha": 0.0}, "alpha, beta and std must be positive"),
     ],

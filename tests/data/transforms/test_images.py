@@ -115,14 +115,14 @@ def test_simple_normalisation_maps_to_minus_one_and_one():
 @pytest.mark.parametrize(
     ("cfg", "message"),
     [
-        ({"type": "ResizeImages", "height": 0, "width": 8}, "ResizeImages: 0 x 8 is no size"),
+        ({"type": "ResizeImages", "height": 0, "width": 8}, "ResizeImages: 0 x 8 is not a size"),
         (
             {"type": "ResizeImages", "height": 8, "width": 8, "interpolation": "cubic"},
-            "interpolation 'cubic' is none of linear, area",
+            "interpolation 'cubic' is not one of linear, area",
         ),
         (
             {"type": "CropImages", "top": -1, "left": 0, "height": 2, "width": 2},
-            "CropImages: top -1, left 0, height 2, width 2 is no rectangle",
+            "CropImages: top -1, left 0, height 2, width 2 is not a rectangle",
         ),
         (
             {"type": "NormalizeImages", "means": [1, 2], "stds": [1, 2]},

@@ -161,12 +161,10 @@ def test_statistics_come_from_a_checkpoints_file(tmp_path):
 def test_an_unknown_norm_type_is_refused_with_the_nearest(cls):
     with pytest.raises(ConfigError) as caught:
         cls(norm_type="meanstd")
-    text = str(caught.value)
-    assert (
-        f"{cls.__name__}: norm_type 'meanstd' is none of mean_std, quantile, min_max, none" in text
-    )
+    text, names = str(caught.value), "mean_std, quantile, min_max, none"
+    assert f"{cls.__name__}: norm_type 'meanstd' is not one of {names}" in text
     assert "did you mean 'mean_std'?" in text
-    with pytest.raises(ConfigError, match="norm_type 'proprio' is none of"):
+    with pytest.raises(ConfigError, match="norm_type 'proprio' is not one of"):
         cls(norm_type="proprio")
 
 
@@ -177,7 +175,7 @@ def test_an_unknown_norm_type_is_refused_with_the_nearest(cls):
         ({"state_dim": 2}, {}, "state_dim 2 would cut the data's 3 dimensions"),
         ({"state_key": "eef"}, {}, "no entry 'eef'; they have action, proprio"),
         ({}, {"stats": None}, "no entry 'proprio'; they have nothing"),
-        ({}, {"stats": {"proprio": [1]}}, "the statistics' entry 'proprio' is no table"),
+        ({}, {"stats": {"proprio": [1]}}, "the statistics' entry 'proprio' is not a table"),
         ({}, {"stats": make_stats(dim=4)}, r"states have shape \(3,\), the statistics 'proprio'"),
         ({"action_norm_mask": [True]}, {}, "action_norm_mask has 1 entries, the statistics have 3"),
         (
@@ -239,8 +237,8 @@ def test_what_hardly_moves_is_named_with_its_scale():
     (said,) = NormalizeStatesAndActions().warnings(seldom(), JOINTS, JOINTS)
     assert "NormalizeStatesAndActions(norm_type='mean_std', std_floor=0)" in said
     assert said.endswith(
-        ": state wrist (range 0, divided by 1e-06); set std_floor=0.01 or so, in the data's units: "
-        "nothing is divided by less; or another norm_type"
+        ": state wrist (range 0, divided by 1e-06); --set <NormalizeStatesAndActions>.std_floor="
+        "0.01 or so, in the data's units: nothing is divided by less; or another norm_type"
     )
     (said,) = NormalizeStatesAndActions(std_floor=1e-5).warnings(seldom())
     assert ": state 1 (range 0, divided by 1.1e-05);" in said
@@ -255,7 +253,7 @@ def test_moves_that_would_be_blown_up_are_refused():
         assert f"{what} gripper (range 0.08, divided by 5e-07)" in words
     assert "waist" not in words
     assert "wrist" not in words
-    assert "set std_floor=0.01 or so" in words
+    assert ".std_floor=0.01 or so" in words
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_an_instruction_is_never_cut():
     with pytest.raises(ConfigError) as caught:
         ProcessPrompts(Letters(), max_len=3)({"task_description": "abcd"})
     assert "the instruction 'abcd' has 4 tokens, max_len is 3" in str(caught.value)
-    assert "set max_len to 4 or more" in str(caught.value)
+    assert "--set <ProcessPrompts>.max_len=4 (or more)" in str(caught.value)
 
 
 @pytest.mark.parametrize("sample", [{}, {"task_description": " "}, {"task_description": None}])
@@ -226,8 +226,8 @@ def test_a_chat_that_does_not_fit_its_pictures_is_refused(sample, words):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"task_pos": "after"}, "task_pos 'after' is none of after_images, before_images"),
-        ({"padding_side": "up"}, "padding_side 'up' is none of left, right"),
+        ({"task_pos": "after"}, "task_pos 'after' is not one of after_images, before_images"),
+        ({"padding_side": "up"}, "padding_side 'up' is not one of left, right"),
         ({"num_images": 0}, "num_images 0 and fixed_img_tokens 3 must be at least 1"),
     ],
 )
@@ -237,7 +237,7 @@ def test_a_chat_of_settings_that_mean_nothing_is_refused(settings, words):
 
 
 def test_a_tokenizer_that_knows_no_pictures_is_refused():
-    with pytest.raises(ConfigError, match="<IMG_CONTEXT> is no token of this tokenizer"):
+    with pytest.raises(ConfigError, match="<IMG_CONTEXT> is not a token of this tokenizer"):
         Pipeline([{"type": "ProcessPromptsWithImage", "tokenizer": TOKENIZER}])
 
 

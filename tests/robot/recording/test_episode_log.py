@@ -26,6 +26,13 @@ def test_counts_and_timings() -> None:
     assert found["timings"]["late"]["count"] == 1
 
 
+def test_filters_that_were_late_are_counted_by_name() -> None:
+    late = [{"event": "filter", "t": 0.2, "filter": name} for name in ("Slow", "Other", "Slow")]
+
+    assert summarise([*EVENTS, *late])["late_filters"] == {"Slow": 2, "Other": 1}
+    assert summarise(EVENTS)["late_filters"] == {}
+
+
 def test_a_record_without_an_end_was_cut_short() -> None:
     found = summarise(EVENTS)
     assert found["outcome"] == "cut short"

@@ -1,4 +1,4 @@
-"""What the two robots of this example are: joints, limits, cameras."""
+"""Embodiments of the two robots of this example: joints, limits, cameras."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Driver:
         values = np.atleast_1d(message.data if first else message.position)
         columns = slice(first, first + len(values))
         if not np.isfinite(values).all() or columns.stop > len(self._names):
-            raise BadMessage(f"{topic}: this is no command: {values.tolist()}")
+            raise BadMessage(f"{topic}: this is not a command: {values.tolist()}")
         self._target[columns] = values / self._scale[columns]
 
     def target(self, now):

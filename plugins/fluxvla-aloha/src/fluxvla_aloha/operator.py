@@ -179,8 +179,8 @@ class AlohaOperator(RosOperator):
                 where=self._place,
                 cause="cobot_magic is sold with ARX X5 and with AgileX PiPER arms, behind the same "
                 "topics",
-                next="look at the arms, then set arms='arx_x5' or arms='piper' in the operator's "
-                "table; others are described with embodiment=dict(…)",
+                next="look at the arms, then --set <AlohaOperator>.arms=arx_x5 or "
+                "--set <AlohaOperator>.arms=piper; others are described with embodiment=dict(…)",
             )
         super().connect()
 
@@ -248,7 +248,9 @@ class AlohaOperator(RosOperator):
             NotReady: not connected.
         """
         if not self._use_base:
-            raise Rejected("the base is not used", next="set use_robot_base=True")
+            raise Rejected(
+                "the base is not used", next=f"--set <{type(self).__name__}>.use_robot_base=true"
+            )
         with self._lock:
             if self._connection is None:
                 raise NotReady("aloha is not connected", next="call connect() first")

@@ -49,7 +49,7 @@ class SuccessCriterion:
 
     def __post_init__(self) -> None:
         if self.by not in SUCCESS:
-            raise ConfigError(f"success {self.by!r} is none of {', '.join(SUCCESS)}")
+            raise ConfigError(f"success {self.by!r} is not one of {', '.join(SUCCESS)}")
         if self.reward is not None and self.total is not None:
             raise ConfigError("success_reward and success_return are two ways: give one of them")
 
@@ -99,7 +99,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         instruction_from: instead: a text of the observation, which may be another in each episode.
         max_steps: steps after which an episode ends at the latest.
         state: parts of the observation that are the state, in this order, keys of nested parts
-            joined by dots; by default every part that is no picture and no text, by name.
+            joined by dots; by default every part that is neither a picture nor text, by name.
         cameras: camera of the embodiment -> part of the observation, or ``render`` for what
             Gymnasium's ``render()`` gives; by default the part of that name.
         success: ``info`` (its ``is_success`` or ``success``), ``terminated``, or ``truncated``:
@@ -136,10 +136,12 @@ class GymnasiumEnvironment(MujocoEnvironment):
         if ":" in id:
             name, _, rest = id.partition(":")
             raise ConfigError(
-                f"id {id!r} names a module", next=f"set module = {name!r} and id = {rest!r}"
+                f"id {id!r} names a module",
+                next=f"--set <GymnasiumEnvironment>.module={name} "
+                f"--set <GymnasiumEnvironment>.id={rest}",
             )
         if module is not None and not module.isidentifier():
-            raise ConfigError(f"module {module!r} is no name of an installed package")
+            raise ConfigError(f"module {module!r} is not the name of an installed package")
         self._criterion = SuccessCriterion(success, success_reward, success_return)
         if instruction is not None and instruction_from is not None:
             raise ConfigError("instruction and instruction_from are two ways: give one of them")
@@ -210,7 +212,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
                 f"the state of {self.spec.name} has {len(self.state)} numbers, "
                 f"the embodiment {self.spec.embodiment.state_dim}",
                 cause=f"the observation's parts are {_shapes(self._parts)}",
-                next="mend state_joints, or name the parts that are the state: state = ['...']",
+                next="fix state_joints, or name the parts that are the state: state = ['...']",
             )
         if self._criterion.needs_info and not self._checked:
             _check_reports_success(self._env, self._max_steps)
@@ -269,7 +271,8 @@ class GymnasiumEnvironment(MujocoEnvironment):
         if len(ends) != 1:
             raise SpecMismatch(
                 f"{self.spec.name} has no picture {key!r}; it has {', '.join(found) or 'none'}",
-                next=f"set cameras = {{{camera!r}: '<one of these, or render>'}}",
+                next=f"--set '<GymnasiumEnvironment>.cameras={{{camera} = \"NAME\"}}', "
+                "one of these or render",
             )
         return found[ends[0]].copy()
 
@@ -294,7 +297,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
             raise MissingPlugin(
                 f"there is no Gymnasium environment {self.spec.name!r}: {error}",
                 cause="its package is not installed, or registers it only when it is imported",
-                next="install it; set module = '<the package>'",
+                next="install it, and --set <GymnasiumEnvironment>.module=<the package>",
             ) from error
         except Exception as error:
             raise RunFailed(
@@ -302,7 +305,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
             ) from error
         space = env.action_space
         if not isinstance(space, (Box, Discrete)):
-            raise SpecMismatch(f"{where}: actions in {space} are no vector", where=where)
+            raise SpecMismatch(f"{where}: actions in {space} are not a vector", where=where)
         numbers = 1 if isinstance(space, Discrete) else int(np.prod(space.shape))
         if numbers != self.spec.embodiment.dim:
             raise SpecMismatch(
@@ -333,8 +336,9 @@ def _check_reports_success(env: Any, max_steps: int) -> None:
     raise ConfigError(
         f"{env.spec.id} does not say whether its task is done: its info has "
         f"{', '.join(sorted(map(str, info))) or 'nothing'}, and neither of {', '.join(KEYS)}",
-        next="set success = 'terminated' or 'truncated', success_reward = <a step's reward when it "
-        "is done>, or success_return = <an episode's>",
+        next="--set <GymnasiumEnvironment>.success=terminated (or truncated), "
+        "--set <GymnasiumEnvironment>.success_reward=<a step's reward when it is done>, or "
+        "--set <GymnasiumEnvironment>.success_return=<an episode's>",
     )
 
 

@@ -19,7 +19,7 @@ def parts(seen: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
     An observation that is one array has the name ``""``, or ``image`` if it is a picture.
 
     Raises:
-        SpecMismatch: a part is no array of numbers, and no text.
+        SpecMismatch: a part is neither an array of numbers nor text.
     """
     if isinstance(seen, (tuple, list)) and not all(np.isscalar(each) for each in seen):
         seen = {str(number): each for number, each in enumerate(seen)}
@@ -68,7 +68,7 @@ def pictures(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
 
 
 def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float64]:
-    """The parts ``keys``, or all that are no pictures and no texts, as one row.
+    """The parts ``keys``, or all that are neither pictures nor texts, as one row.
 
     Raises:
         SpecMismatch: there is no such part, or it is a text.

@@ -116,7 +116,7 @@ class LiberoEnvironment(MujocoEnvironment):
 
     @cached_property
     def spec(self) -> EnvironmentSpec:
-        """What is known before a scene is built.
+        """The description of the environment, known before a scene is built.
 
         Raises:
             MissingPlugin, RunFailed: LIBERO is not installed, or cannot be imported.
@@ -190,7 +190,7 @@ class LiberoEnvironment(MujocoEnvironment):
                 raise ConfigError(
                     f"{self.suite} has {len(states)} fixed states for each task; there is no "
                     f"episode {seed}",
-                    next="evaluate fewer episodes, or set begin = 'random'",
+                    next="evaluate fewer episodes, or --set <LiberoEnvironment>.begin=random",
                 )
             state = states[seed]
         scene = self._enter(where)

@@ -182,7 +182,7 @@ class LiberoEvalRunner(EvalRunner):
         super().run_setup()
 
     def identity(self) -> dict[str, Any]:
-        """What outcomes follow from, besides each episode's key, as JSON values."""
+        """Everything that outcomes follow from, besides each episode's key, as JSON values."""
         about = super().identity()
         about["settings"]["task_suite_name"] = self._suite
         if self.model_family:

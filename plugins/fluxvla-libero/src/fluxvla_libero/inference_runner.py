@@ -253,7 +253,7 @@ class LiberoInferenceRunner:
             return
         import numpy as np
 
-        from fluxvla_libero.live import LiveView
+        from fluxvla_libero.live_view import LiveView
 
         with LiveView(self.live_port) as view:
             self.context.reporter.info(f"live at {view.url}")
@@ -268,8 +268,9 @@ class LiberoInferenceRunner:
         if self.scene is None:
             if not named:
                 raise UsageError(
-                    f"{asked.instruction!r} is no instruction of {self.suite}: in which scene?",
-                    next="set scene = <index or name> in this section, or use a task's own words",
+                    f"{asked.instruction!r} is not an instruction of {self.suite}: in which scene?",
+                    next=f"--set {self.context.section}.scene=<index or name>, "
+                    "or use a task's own words",
                 )
             return named[0], named[0]
         (where,) = choose_tasks(self.suite, [self.scene])

@@ -57,7 +57,7 @@ class SuiteTask:
 
 
 def max_steps(suite: str) -> int:
-    """How many control steps an episode of ``suite`` may take.
+    """The most control steps that an episode of ``suite`` may take.
 
     Raises:
         ConfigError: an unknown suite.
@@ -67,7 +67,7 @@ def max_steps(suite: str) -> int:
 
 
 def check_suite(suite: str) -> None:
-    """Refuse a name that is no suite's.
+    """Refuse a name that is not a suite's.
 
     Raises:
         ConfigError: the message lists the suites.

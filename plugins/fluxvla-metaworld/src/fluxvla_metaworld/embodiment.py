@@ -1,4 +1,4 @@
-"""What Meta-World's numbers mean: a Sawyer arm whose hand is moved by small steps."""
+"""Embodiment of Meta-World: a Sawyer arm whose hand is moved by small steps."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Meta-World builds a model for each task; it is built once and then put back before every episode,
 so that an episode follows from its task and seed alone. Tests hold an episode against one in a
-model that was built anew.
+model that was just built.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
         """Begin an episode: objects and goals are placed by ``seed``.
 
         Raises:
-            ConfigError: it is none of the environment's tasks.
+            ConfigError: it is not one of the environment's tasks.
             MissingPlugin, RunFailed: Meta-World is not installed, or cannot be imported.
         """
         if task not in {known.name for known in self.spec.tasks}:

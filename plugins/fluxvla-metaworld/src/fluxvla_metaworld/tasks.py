@@ -89,7 +89,7 @@ def choose_tasks(wanted: str | Sequence[str]) -> tuple[str, ...]:
     if isinstance(wanted, str):
         if wanted not in SETS:
             raise ConfigError(
-                f"tasks: {wanted!r} is no set of tasks; there are {', '.join(SETS)}",
+                f"tasks: {wanted!r} is not a set of tasks; there are {', '.join(SETS)}",
                 next="name single tasks in a list",
             )
         return SETS[wanted]

@@ -59,7 +59,7 @@ class ConvEncoder(nn.Module):
         image_size: ``(height, width)`` of each picture, multiples of 16.
         channels: widths of the three stages (strides 4, 8 and 16), multiples of 8.
         keypoints: spatial-softmax keypoints of the stages at stride 4 and at stride 8.
-        map_channels: channels of the last stage's map, which is flattened beside the keypoints.
+        map_channels: channels of the last stage's map, flattened and joined to the keypoints.
         num_cameras: pictures per sample; each is encoded by the same weights.
     """
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class FiLMProjector(nn.Module):
-    """Visual features, scaled and shifted by the instruction, beside state and instruction.
+    """Visual features scaled and shifted by the instruction, joined with state and instruction.
 
     The scaling is FiLM (Perez et al. 2018): the instruction chooses what in the picture counts.
 

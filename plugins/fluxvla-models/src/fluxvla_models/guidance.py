@@ -21,7 +21,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Guide:
-    """What a chunk has to agree with.
+    """Constraints that a chunk has to agree with.
 
     Args:
         actions: ``(B, T, D)`` normalised: the old chunk at the new one's times.

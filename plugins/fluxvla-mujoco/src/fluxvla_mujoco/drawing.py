@@ -101,6 +101,15 @@ def use_egl() -> None:
         ) from error
 
 
+def no_context(error: Exception) -> RunFailed:
+    """The error to raise where MuJoCo or PyOpenGL could not make an OpenGL context."""
+    return RunFailed(
+        f"the simulator cannot draw: no OpenGL context could be made ({error})",
+        cause="no EGL driver is installed, or none works without a display",
+        next=APT,
+    )
+
+
 _drawn_by: set[str] = set()
 
 
@@ -177,11 +186,7 @@ class Drawing:
             made = mujoco.Renderer(self._model, height, width)
         # PyOpenGL and mujoco raise ImportError, RuntimeError and classes of their own here.
         except Exception as error:
-            raise RunFailed(
-                f"the simulator cannot draw: no OpenGL context could be made ({error})",
-                cause="no EGL driver is installed, or none works without a display",
-                next=APT,
-            ) from error
+            raise no_context(error) from error
         note_renderer()
         self._renderers[height, width] = made
         return made

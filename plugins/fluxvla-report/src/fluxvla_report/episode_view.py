@@ -58,7 +58,7 @@ def episode_view(episode: Episode, put: Callable[[Video], Mapping[str, Any]]) ->
 
 
 def headline(episode: Episode) -> str:
-    """How it went, in one line."""
+    """The outcome of an episode in one line."""
     parts = [f"ended: {episode.outcome}"]
     if episode.joints:
         count = len(episode.joints[0].times)

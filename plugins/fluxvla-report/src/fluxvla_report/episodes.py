@@ -97,6 +97,7 @@ def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
         "control ticks without a chunk, held": summary.get("held_beats"),
         "trips": _trips(summary.get("trips", [])),
         "clamped commands": clamp_counts(summary.get("clamps")),
+        "commands without a late filter": _late_filters(summary.get("late_filters")),
         "not recorded": ", ".join(f"{count} {what}" for what, count in dropped.items()),
     }
 
@@ -183,6 +184,12 @@ def clamp_counts(clamps: Any) -> str:
         if reasons
     ]
     return ", ".join(parts) or "none"
+
+
+def _late_filters(counts: Any) -> str:
+    """``Slow 3, …`` from filter -> count; nothing where none was late."""
+    found = counts.items() if isinstance(counts, Mapping) else ()
+    return ", ".join(f"{name} {count}" for name, count in found)
 
 
 def _entry(values: Any, column: int) -> float:

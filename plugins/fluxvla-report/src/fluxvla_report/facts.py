@@ -41,7 +41,7 @@ class Video:
 
 @dataclass(frozen=True)
 class Score:
-    """How many episodes succeeded; ``low``, ``high``: bounds of the 95 % interval, in 0..1.
+    """Number of successful episodes; ``low``, ``high``: bounds of the 95 % interval, in 0..1.
 
     ``errors`` episodes gave no result and are not among ``episodes`` (> 0). ``mean_return``: None
     where the environment gives no rewards.
@@ -85,7 +85,7 @@ class Evaluation:
     """One evaluation: its groups, and videos in the order in which to show them.
 
     ``problems`` say in how many episodes what went wrong, the most frequent first. ``details`` are
-    plain values that the results state beside the rates. ``obeyed`` is how often a group did the
+    plain values that the results state with the rates. ``obeyed`` is how often a group did the
     task of its instruction, whatever the scene's own task is. ``live``: the simulation ran on the
     wall clock and did not wait for the policy. ``unseen``: the seeds of the training are known and
     none of them was evaluated. ``made``: when it ran, of which commit, with which versions.
@@ -189,7 +189,7 @@ class Episode:
 
     @property
     def clamped(self) -> int:
-        """How many commands a limit changed."""
+        """The number of commands that a limit changed."""
         return len({time for joint in self.joints for time, _ in joint.clamped})
 
 

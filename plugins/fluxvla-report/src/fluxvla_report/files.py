@@ -59,12 +59,12 @@ class Reader:
             except DataError:
                 bad += line.endswith(b"\n")
         if bad:
-            self.problem(path, f"{bad} line(s) are no JSON objects and were left out")
+            self.problem(path, f"{bad} line(s) are not JSON objects and were left out")
         return rows
 
 
 def number(value: Any) -> float:
-    """``value`` as a float; NaN for what is no number."""
+    """``value`` as a float; NaN for what is not a number."""
     return float(value) if isinstance(value, (int, float)) else float("nan")
 
 

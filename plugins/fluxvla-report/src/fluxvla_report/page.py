@@ -78,8 +78,8 @@ def nothing_there(facts: Facts) -> UsageError:
     )
 
 
-def render(facts: Facts, beside: Path, title: str = "") -> str:
-    """The page as text; videos that are not embedded are linked relative to ``beside``."""
+def render(facts: Facts, folder: Path, title: str = "") -> str:
+    """The page as text; videos that are not embedded are linked relative to ``folder``."""
     templates = resources.files("fluxvla_report") / "templates"
     texts = {
         name: (templates / name).read_text(encoding="utf-8")
@@ -95,7 +95,7 @@ def render(facts: Facts, beside: Path, title: str = "") -> str:
     )
     environment.filters["duration"] = duration
     environment.filters["short"] = short
-    sources = VideoSources(beside)
+    sources = VideoSources(folder)
     return environment.get_template("report.html.jinja").render(
         style=texts["style.css"],
         title=title or heading(facts),
@@ -115,7 +115,7 @@ def render(facts: Facts, beside: Path, title: str = "") -> str:
 class VideoSources:
     """The ``src`` of every video: embedded as long as ``room`` (bytes) lasts, then linked."""
 
-    beside: Path
+    folder: Path
     room: int = EMBEDDED_BYTES
     _known: dict[Path, str] = field(default_factory=dict)
 
@@ -131,7 +131,7 @@ class VideoSources:
                 coded = base64.b64encode(path.read_bytes()).decode("ascii")
                 self._known[path] = f"data:video/mp4;base64,{coded}"
             else:
-                self._known[path] = Path(os.path.relpath(path, self.beside)).as_posix()
+                self._known[path] = Path(os.path.relpath(path, self.folder)).as_posix()
         return self._known[path]
 
 
@@ -255,8 +255,8 @@ def _evaluation(evaluation: Evaluation, sources: VideoSources) -> dict[str, Any]
                     css=f"s{number % 6}",
                 )
             )
-    beside = [video for row in compared(evaluation) for video in row]
-    alone = [video for video in evaluation.videos if video not in beside]
+    compared_ones = [video for row in compared(evaluation) for video in row]
+    alone = [video for video in evaluation.videos if video not in compared_ones]
     return {
         "facts": evaluation,
         "scored_by_instruction": [
@@ -278,7 +278,7 @@ def compared(evaluation: Evaluation) -> list[list[Video]]:
     rows = []
     for task in dict.fromkeys(v.task for v in evaluation.videos if v.group):
         here = [v for v in evaluation.videos if v.task == task]
-        # The trained policy's is a success if there is one, for the others stand beside it.
+        # The trained policy's is a success if there is one, for the others are shown next to it.
         best = {v.group: v for v in sorted(here, key=lambda v: bool(v.success))}
         row = [best[g.name] for g in evaluation.groups if g.name in best]
         rows += [row] if len(row) > 1 else []

@@ -53,7 +53,7 @@ class Row:
     """One row of a chart over a common scale.
 
     Args:
-        label: its name; shown beside the drawing, or above it on a narrow page.
+        label: its name; shown next to the drawing, or above it on a narrow page.
         body: SVG; x in percent of the width (``percent``), y from 0 to ``ROW_HEIGHT``.
         notes: figures at its end, a column each.
         about: shows under the pointer.

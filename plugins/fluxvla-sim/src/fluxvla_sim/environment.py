@@ -14,7 +14,7 @@ from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.ur.world import UR5E
-from fluxvla_sim.world import Scene, SimRobot, World
+from fluxvla_sim.world import Scene, SimRobot, SimWorld
 
 if TYPE_CHECKING:
     from fluxvla_core.models import Observation
@@ -58,7 +58,7 @@ class SimEnvironment(MujocoEnvironment):
             details={"render": render},
         )
         self._scenes: dict[int, Scene] = {}
-        self.world: World = robot.worlds[0]
+        self.world: SimWorld = robot.worlds[0]
         self._task = self._instructed = self.world.tasks[0]
         self._facts = self.world.begin()
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import Policy
-from fluxvla_sim.world import CONTROL_HZ, Expert, Scene, SimRobot, World, task_of
+from fluxvla_sim.world import CONTROL_HZ, Expert, Scene, SimRobot, SimWorld, task_of
 
 if TYPE_CHECKING:
     from fluxvla_core.models import Observation
@@ -22,7 +22,7 @@ class Place(Protocol):
     """Where an expert acts: a ``SimEnvironment``, or a ``SimOperator`` that is connected."""
 
     robot: SimRobot
-    world: World
+    world: SimWorld
 
     @property
     def scene(self) -> Scene: ...
@@ -73,7 +73,7 @@ class SimExpert(Policy):
         """Set where it acts; it reads the scene when it plans an episode's first chunk.
 
         Raises:
-            ConfigError: that is no simulated robot of this plugin.
+            ConfigError: that is not a simulated robot of this plugin.
         """
         if not isinstance(getattr(environment, "robot", None), SimRobot):
             raise ConfigError(

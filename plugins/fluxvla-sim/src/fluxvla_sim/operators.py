@@ -37,19 +37,20 @@ def sim_cameras(
     return tuple(Camera(name, height, width) for name in names)
 
 
-def check_arms(arms: str) -> None:
+def check_arms(arms: str, operator: str) -> None:
     """Refuse arms that the simulated ALOHA does not have.
 
     Args:
         arms: as ``AlohaOperator`` takes it.
+        operator: the name of the class that was given them.
 
     Raises:
-        ConfigError: they are no ViperX 300.
+        ConfigError: they are not ViperX 300.
     """
     if arms != "viperx300":
         raise ConfigError(
             f"the simulated ALOHA has ViperX 300 arms, the config says arms={arms!r}",
-            next="set arms='viperx300'",
+            next=f"--set <{operator}>.arms=viperx300",
         )
 
 
@@ -81,7 +82,7 @@ class AlohaSimOperator(SimOperator):
         render: str = "cheap",
         arms: str = "viperx300",
     ) -> None:
-        check_arms(arms)
+        check_arms(arms, type(self).__name__)
         check_render(render)
         cameras = sim_cameras(ALOHA, camera_names, height, width)
         super().__init__(ALOHA, task, cameras, seed, realtime, render)

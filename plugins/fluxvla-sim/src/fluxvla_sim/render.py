@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from fluxvla_mujoco import APT, note_renderer, use_egl
-
-from fluxvla_core.errors import RunFailed
+from fluxvla_mujoco import no_context, note_renderer, use_egl
 
 
 def import_mujoco() -> Any:
@@ -144,11 +142,7 @@ class Renderer:
             self._context = mujoco.MjrContext(self._model, scale)
         # PyOpenGL and mujoco raise ImportError, RuntimeError and classes of their own here.
         except Exception as error:
-            raise RunFailed(
-                f"the simulator cannot draw: no OpenGL context could be made ({error})",
-                cause="no EGL driver is installed, or none works without a display",
-                next=APT,
-            ) from error
+            raise no_context(error) from error
         note_renderer()
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         # The other way round rounds what is far to one distance.
@@ -168,3 +162,23 @@ def _release_current_context() -> None:
     if egl is not None:
         nothing = egl.EGL.EGL_NO_SURFACE
         egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)
+
+
+class DrawnScene:
+    """A scene with pictures; a subclass sets ``model`` and ``data``."""
+
+    model: Any
+    data: Any
+    _renderer: Renderer | None = None
+
+    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
+        """A new ``(height, width, 3)`` uint8 RGB picture."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.model)
+        return self._renderer.render(self.data, camera, height, width)
+
+    def close(self) -> None:
+        """Free the renderer; any number of times."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

@@ -136,7 +136,7 @@ class SimOperator(Operator):
     def task_success(self) -> bool | None:
         """Whether ``task`` is done by now, from everything since :meth:`reset`.
 
-        None if the episode's instruction is none of the world's.
+        None if the episode's instruction is not one of the world's.
         """
         with self._lock:
             return self.task.success(self._facts) if self._judged else None

@@ -1,8 +1,9 @@
 """Worlds of simulated robots: scenes with their tasks and scripted experts.
 
-A ``World`` is one scene with its tasks and its scripted expert, a ``SimRobot`` is a robot with the
-worlds that it can be put into. Everything else (operators, evaluation, collection, ROS 2 nodes) is
-written against these two, once for all robots. Naming them loads neither MuJoCo nor a model file.
+A ``SimWorld`` is one scene with its tasks and its scripted expert, a ``SimRobot`` is a robot with
+the worlds that it can be put into. Everything else (operators, evaluation, collection, ROS 2 nodes)
+is written against these two, once for all robots. Naming them loads neither MuJoCo nor a model
+file.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Scene(Protocol):
 
 
 class Facts(Protocol):
-    """What has happened in an episode so far: everything that success depends on.
+    """Events of an episode so far: everything that success depends on.
 
     ``steps`` were taken, the last one with ``reward``.
     """
@@ -99,7 +100,7 @@ class Expert(Protocol):
 
 
 @dataclass(frozen=True)
-class World:
+class SimWorld:
     """One scene, its tasks and its expert.
 
     Args:
@@ -137,7 +138,7 @@ class SimRobot:
     title: str
     cameras: tuple[str, ...]
     embodiment: Callable[[Sequence[Camera]], EmbodimentSpec]
-    worlds: tuple[World, ...]
+    worlds: tuple[SimWorld, ...]
     default_tasks: tuple[str, ...]
 
     @property
@@ -145,7 +146,7 @@ class SimRobot:
         """The tasks of all worlds."""
         return tuple(task.name for world in self.worlds for task in world.tasks)
 
-    def find(self, name: str) -> tuple[World, Task]:
+    def find(self, name: str) -> tuple[SimWorld, Task]:
         """The task called ``name``, and its world.
 
         Raises:
@@ -158,7 +159,7 @@ class SimRobot:
         raise ConfigError(f"there is no task {name!r}; there are {', '.join(self.task_names)}")
 
 
-def task_of(world: World, instruction: str) -> Task | None:
+def task_of(world: SimWorld, instruction: str) -> Task | None:
     """The task of ``world`` that an instruction in these words asks for; None if none does."""
     words = instruction.casefold().split()
     return next((t for t in world.tasks if t.instruction.casefold().split() == words), None)

@@ -33,6 +33,8 @@ class RobotiqGripper:
         port: of the URCap.
         speed, force: 0 to 1 of what the gripper can.
         activate: let ``connect`` activate a gripper that is not; it opens and closes then.
+        moves: whether it is commanded here. One that is only read is sent questions alone, and with
+            ``activate`` it is waited for until somebody else has activated it.
     """
 
     def __init__(
@@ -42,10 +44,12 @@ class RobotiqGripper:
         speed: float = 1.0,
         force: float = 0.5,
         activate: bool = False,
+        moves: bool = True,
     ) -> None:
         self._address = host, port
         self._registers = {"SPE": round(speed * CLOSED), "FOR": round(force * CLOSED)}
         self._activate = activate
+        self._moves = moves
         self._socket: socket.socket | None = None
         self._closing = threading.Event()
         self._wanted: int | None = None
@@ -67,13 +71,14 @@ class RobotiqGripper:
             raise NotReady(
                 f"no gripper answers on {self._address[0]}:{self._address[1]}: {error}",
                 cause="the Robotiq URCap is not installed or not running on the controller",
-                next="install it, or set gripper=False for an arm without one",
+                next="install it, or --set <URRTDEOperator>.gripper=false for an arm without one",
             ) from error
         self._socket.settimeout(_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if self._get("STA") != ACTIVATED:
             self._wake(timeout_s)
-        self._set(GTO=1, **self._registers)
+        if self._moves:
+            self._set(GTO=1, **self._registers)
         self._newest = time.monotonic(), self._read()
         self._thread.start()
 
@@ -127,9 +132,11 @@ class RobotiqGripper:
             raise NotReady(
                 "the gripper is not activated",
                 cause="it was switched off and on; to activate it opens and closes it",
-                next="activate it on the teach pendant, or set activate_gripper=True",
+                next="activate it on the teach pendant, or "
+                "--set <URRTDEOperator>.activate_gripper=true",
             )
-        self._set(ACT=1)
+        if self._moves:
+            self._set(ACT=1)
         until = time.monotonic() + timeout_s
         while self._get("STA") != ACTIVATED:
             if time.monotonic() > until:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
-from fluxvla_core.operators import Camera, Frame, Operator
+from fluxvla_core.operators import Camera, Frame, Operator, Part
 from fluxvla_core.ros2 import STATE, Stale, checked_action
 from fluxvla_ur.embodiment import ACCELERATION, JOINTS, RATE_HZ, ur_spec
 from fluxvla_ur.readiness import check_not_paused, check_safety
@@ -70,6 +70,11 @@ class URRTDEOperator(Operator):
 
     The controller is configured to stop by itself when this program falls silent (``watchdog_hz``).
     Protective and emergency stops end the commands, and the speed slider slows them down.
+
+    An arm with a gripper can be divided between two processes. The controller sends its data to
+    several clients; so must the gripper's URCap answer several, as it does programs on the
+    controller (not tried on a real one). Without a gripper the arm cannot be divided: the gripper's
+    number is what it was last sent, which the process that reads the cameras does not know.
 
     Args:
         robot_ip: address of the controller.
@@ -133,6 +138,7 @@ class URRTDEOperator(Operator):
         self.robot_ip = robot_ip
         self._gripper_settings = gripper_port, gripper_speed, gripper_force, activate_gripper
         self._has_gripper = gripper
+        self._part = Part.WHOLE
         self._servo = lookahead_time, gain
         self._watchdog_hz = watchdog_hz
         self._connect_timeout = connect_timeout_s
@@ -156,6 +162,23 @@ class URRTDEOperator(Operator):
 
     # The contract.
 
+    def without_cameras(self) -> URRTDEOperator | None:
+        """This operator, to be connected without its cameras; None without a gripper.
+
+        Raises:
+            Rejected: it is connected, or was made the other part.
+        """
+        return self._divided(Part.WITHOUT_CAMERAS)
+
+    def without_commands(self) -> URRTDEOperator | None:
+        """This operator, to be connected for reading alone: no script, no watchdog, a gripper that
+        is only asked; None without a gripper.
+
+        Raises:
+            Rejected: it is connected, or was made the other part.
+        """
+        return self._divided(Part.WITHOUT_COMMANDS)
+
     def connect(self) -> None:
         """Open every connection and wait until all parts speak; nothing if it is open.
 
@@ -166,7 +189,7 @@ class URRTDEOperator(Operator):
         """
         # Its own lock: stop() must never wait for a robot that does not answer.
         with self._opening:
-            if self._control is not None:
+            if self._is_open:
                 return
             control, receive = import_rtde()
             self._closing = threading.Event()
@@ -219,12 +242,13 @@ class URRTDEOperator(Operator):
         """State and the newest pictures, in fresh arrays, with their receipt stamps.
 
         Raises:
-            NotReady: not connected.
+            NotReady: not connected, or the part without cameras.
             Stale: a stream is silent.
             BadMessage: pictures have another size.
             Faulted: the gripper reports a fault.
         """
         reading, gripper = self._reading(), self._gripper_position()
+        self._part.check_cameras(self.embodiment.name)
         images, stamps = {}, {STATE: min(reading.receipt, gripper[0])}
         for camera in self._cameras:
             newest = camera.newest()
@@ -237,11 +261,13 @@ class URRTDEOperator(Operator):
         """``servoJ`` to one ``(7,)`` command.
 
         Raises:
-            Rejected: wrong shape, not finite, or outside the limits; before anything is sent.
+            Rejected: wrong shape, not finite, or outside the limits; before anything is sent. Or
+                this is the part without commands.
             NotReady: not connected.
             Stale: the controller is silent.
             Faulted: the robot cannot move (a stop, a pause, its program ended).
         """
+        self._part.check_commands(self.embodiment.name)
         checked = checked_action(self.embodiment, action)
         with self._lock:
             reading = self._reading()
@@ -288,7 +314,7 @@ class URRTDEOperator(Operator):
     def close(self) -> None:
         """Stop, then give everything back; any number of times."""
         with self._lock:
-            if self._control is None:
+            if not self._is_open:
                 return
             self.stop()
             self._closing.set()
@@ -297,7 +323,18 @@ class URRTDEOperator(Operator):
         with self._lock:
             self._release()
 
-    # Parts.
+    # Pieces of the above.
+
+    def _divided(self, part: Part) -> URRTDEOperator | None:
+        if not self._has_gripper:
+            return None
+        self._part = self._part.divided(part, self._is_open, self.embodiment.name)
+        return self
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether the arm can be commanded, or in the part without commands, be read."""
+        return (self._control if self._part.commands else self._receive) is not None
 
     def _open(self, control: Any, receive: Any) -> None:
         timeout = self._connect_timeout
@@ -309,9 +346,10 @@ class URRTDEOperator(Operator):
             self._watcher.start()
             self._wait_for(lambda: self._newest is not None, "the controller sends no data")
             assert self._newest is not None
-            check_safety(self._newest.safety)
-            self._control = control.RTDEControlInterface(self.robot_ip, _DATA_HZ)
-            self._wait_for(self._control.isProgramRunning, "the control script does not run")
+            if self._part.commands:
+                check_safety(self._newest.safety)
+                self._control = control.RTDEControlInterface(self.robot_ip, _DATA_HZ)
+                self._wait_for(self._control.isProgramRunning, "the control script does not run")
         except (OSError, RuntimeError) as error:
             raise NotReady(
                 f"no UR controller can be used at {self.robot_ip}: {error}",
@@ -320,16 +358,18 @@ class URRTDEOperator(Operator):
             ) from error
         port, speed, force, activate = self._gripper_settings
         if self._has_gripper:
-            self._gripper = RobotiqGripper(self.robot_ip, port, speed, force, activate)
+            moves = self._part.commands
+            self._gripper = RobotiqGripper(self.robot_ip, port, speed, force, activate, moves)
             self._gripper.connect(timeout)
-        for camera in self.embodiment.cameras:
+        for camera in self.embodiment.cameras if self._part.cameras else ():
             self._cameras.append(VideoCamera(camera, self._sources[camera.name]))
             self._cameras[-1].connect()
         for camera in self._cameras:
             self._wait_for(lambda c=camera: c.newest() is not None, f"{camera.camera.name} is dark")
-        # Last: from here on the controller wants to hear from us.
-        self._control.setWatchdog(self._watchdog_hz)
-        self._spoke = time.monotonic()
+        if self._part.commands:
+            # Last: from here on the controller wants to hear from us.
+            self._control.setWatchdog(self._watchdog_hz)
+            self._spoke = time.monotonic()
 
     def _wait_for(self, condition: Callable[[], bool], what: str) -> None:
         until = time.monotonic() + self._connect_timeout
@@ -371,7 +411,7 @@ class URRTDEOperator(Operator):
                 self._lock.release()
 
     def _reading(self) -> _Reading:
-        if self._control is None:
+        if not self._is_open:
             raise NotReady(f"{self.embodiment.name} is not connected", next="call connect() first")
         reading = self._newest
         self._check_age("controller", None if reading is None else reading.receipt)

@@ -44,7 +44,8 @@ def check_rate(spec: EmbodimentSpec) -> None:
             f"publish_rate {spec.rate_hz:g} Hz: at full speed {name} is commanded {step:.3f} rad "
             f"at a time, and with {STREAMED} the robot ignores more than {STEP:g} rad",
             cause="it moves to each position within 2 ms, and takes no more than 20 rad/s for it",
-            next=f"leave publish_rate out, or set it to {servo_rate(spec):g}; what a policy says "
+            next=f"leave publish_rate out, or "
+            f"--set <UROperator>.publish_rate={servo_rate(spec):g}; what a policy says "
             "at another rate is interpolated",
         )
 

@@ -51,10 +51,10 @@ class ResizeImages(Transform):
 
     def __init__(self, height: int, width: int, interpolation: str = "linear") -> None:
         if height < 1 or width < 1:
-            raise ConfigError(f"ResizeImages: {height} x {width} is no size")
+            raise ConfigError(f"ResizeImages: {height} x {width} is not a size")
         if interpolation not in INTERPOLATIONS:
             raise ConfigError(
-                f"ResizeImages: interpolation {interpolation!r} is none of "
+                f"ResizeImages: interpolation {interpolation!r} is not one of "
                 f"{', '.join(INTERPOLATIONS)}"
             )
         self.height = height
@@ -91,7 +91,7 @@ class CropImages(Transform):
         if min(top, left) < 0 or min(height, width) < 1:
             raise ConfigError(
                 f"CropImages: top {top}, left {left}, height {height}, width {width} "
-                "is no rectangle"
+                "is not a rectangle"
             )
         self.top = top
         self.left = left

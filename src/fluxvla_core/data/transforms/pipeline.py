@@ -80,7 +80,7 @@ class Pipeline:
     def warnings(
         self, stats: Mapping[str, Any], states: Sequence[str], actions: Sequence[str]
     ) -> list[str]:
-        """What the transforms warn of before training; see ``Transform.warnings``."""
+        """Warnings of the transforms before training; see ``Transform.warnings``."""
         return [text for t in self.transforms for text in t.warnings(stats, states, actions)]
 
     def save_pretrained(self, folder: str | Path) -> None:
@@ -132,7 +132,7 @@ def _saved(folder: Path) -> dict[str, str]:
     names = read_json(file, dict[str, str], ConfigError)
     for name in names.values():
         if PurePath(name).name != name:
-            raise ConfigError(f"{name!r} is no folder beside it", where=str(file))
+            raise ConfigError(f"{name!r} is not a folder next to it", where=str(file))
     return {path: str(folder / name) for path, name in names.items()}
 
 

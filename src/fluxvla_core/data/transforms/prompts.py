@@ -67,8 +67,8 @@ class ProcessPrompts(Transform):
             raise ConfigError(
                 f"{self._who}: the instruction {text!r} has {len(ids)} tokens{self._counted()}, "
                 f"max_len is {self.max_len}",
-                next=f"set max_len to {len(ids)} or more where the model was trained, "
-                "or use shorter words",
+                next=f"--set <{self._who}>.max_len={len(ids)} (or more) where the model "
+                "is trained, or use shorter words",
             )
         pad = int(self.tokenizer.pad_token_id or 0)
         left = self.padding_side == "left"
@@ -99,8 +99,8 @@ class ProcessPromptsWithImage(ProcessPrompts):
         padding_side: ``left`` or ``right``.
 
     Raises:
-        ConfigError: as ``ProcessPrompts``; ``<IMG_CONTEXT>`` is no token of the tokenizer; samples
-            have another number of pictures, or an instruction holds ``<IMG_CONTEXT>`` itself.
+        ConfigError: as ``ProcessPrompts``; ``<IMG_CONTEXT>`` is not a token of the tokenizer;
+            samples have another number of pictures, or an instruction holds ``<IMG_CONTEXT>``.
     """
 
     keeps_images = True
@@ -121,7 +121,7 @@ class ProcessPromptsWithImage(ProcessPrompts):
             ("padding_side", padding_side, ("left", "right")),
         ):
             if value not in known:
-                raise ConfigError(f"{self._who}: {name} {value!r} is none of {', '.join(known)}")
+                raise ConfigError(f"{self._who}: {name} {value!r} is not one of {', '.join(known)}")
         if num_images < 1 or fixed_img_tokens < 1:
             raise ConfigError(
                 f"{self._who}: num_images {num_images} and fixed_img_tokens {fixed_img_tokens} "
@@ -139,7 +139,7 @@ class ProcessPromptsWithImage(ProcessPrompts):
         if seen not in (0, self.num_images):
             raise ConfigError(
                 f"{self._who}: num_images is {self.num_images}, the sample has {seen} pictures",
-                next="set num_images to the number of img_keys",
+                next=f"as many as there are img_keys: --set <{self._who}>.num_images={seen}",
             )
         return super().__call__(sample)
 
@@ -170,7 +170,7 @@ class ProcessPromptsWithImage(ProcessPrompts):
         added = Counter(encode(_PLACE * 2)) - Counter(encode(_PLACE))
         if list(added.values()) != [1]:
             raise ConfigError(
-                f"{self._who}: {_PLACE} is no token of this tokenizer, it is cut into several",
+                f"{self._who}: {_PLACE} is not a token of this tokenizer, it is cut into several",
                 cause="the tokenizer is not the one of the model that sees pictures",
             )
         return int(next(iter(added)))

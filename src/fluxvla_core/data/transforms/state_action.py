@@ -112,12 +112,13 @@ class NormalizeStatesAndActions(Transform):
         moved = list(find_idle_dimensions("action", entries[1], action.scale, actions, mask))
         found = [
             *find_idle_dimensions("state", entries[0], state.scale, states),
-            # One that never moves is no harm here: whatever a model says of it, it stays there.
+            # One that never moves does no harm here: whatever a model says of it, it stays there.
             *(dimension for dimension in moved if dimension.blown_up),
         ]
         who = f"{type(self).__name__}(norm_type={self.norm_type!r}, std_floor={self.std_floor:g})"
         todo = (
-            "set std_floor=0.01 or so, in the data's units: nothing is divided by less; "
+            f"--set <{type(self).__name__}>.std_floor=0.01 or so, in the data's units: "
+            "nothing is divided by less; "
             "or another norm_type"
         )
         rare = [dimension for dimension in found if dimension.blown_up and dimension.rare]
@@ -152,7 +153,8 @@ class NormalizeStatesAndActions(Transform):
         if dim < have:
             raise ConfigError(
                 f"{type(self).__name__}: {what}_dim {dim} would cut the data's {have} dimensions",
-                next=f"set {what}_dim to {have} or more, as wide as the model's input",
+                next=f"as wide as the model's input, {have} or more: "
+                f"--set <{type(self).__name__}>.{what}_dim={have}",
             )
         widths = [(0, 0)] * (values.ndim - 1) + [(0, dim - have)]
         return np.pad(values, widths, constant_values=self.pad_value).astype(np.float32)
@@ -284,7 +286,7 @@ class SampleFlowNoise(RandomTransform):
             raise ConfigError(f"SampleFlowNoise: repeats must be at least 1, got {repeats}")
         if distribution not in _DRAWS:
             raise ConfigError(
-                f"SampleFlowNoise: distribution {distribution!r} is none of {', '.join(_DRAWS)}"
+                f"SampleFlowNoise: distribution {distribution!r} is not one of {', '.join(_DRAWS)}"
             )
         if min(alpha, beta, std) <= 0:
             raise ConfigError("SampleFlowNoise: alpha, beta and std must be positive")
@@ -344,7 +346,7 @@ def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:
         raise ConfigError(f"{who}: the statistics have no entry {key!r}; they have {have}")
     entry = stats[key]
     if not isinstance(entry, Mapping):
-        raise ConfigError(f"{who}: the statistics' entry {key!r} is no table")
+        raise ConfigError(f"{who}: the statistics' entry {key!r} is not a table")
     return entry
 
 
@@ -356,7 +358,7 @@ def _check_steps(actions: Any, scale: Affine, key: str) -> None:
             f"NormalizeStatesAndActions: actions of {steps} steps, the statistics {key!r} "
             f"describe {len(scale.offset)} steps one by one",
             cause="per_step_statistics of a window of another length",
-            next="make action_window_size that of the statistics, or compute them anew",
+            next="make action_window_size that of the statistics, or compute them again",
         )
 
 

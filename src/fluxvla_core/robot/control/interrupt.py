@@ -62,7 +62,7 @@ class Interrupts:
             number = getattr(signal, name, None)  # not every system has them
             if number is not None and signal.getsignal(number) != signal.SIG_IGN:
                 numbers.append(number)
-        self._taken.enter_context(handling(self._handle, *numbers))
+        self._taken.enter_context(handling(self.on_signal, *numbers))
         return self
 
     def __exit__(
@@ -93,7 +93,8 @@ class Interrupts:
         if self.signals:
             raise Interrupted(self.signals[-1])
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
+        """A signal came; the handler of all of them."""
         self.signals.append(number)
         if self.stopping:
             return

@@ -32,6 +32,7 @@ thread that keeps it would have to give it up just when its deadline is there.""
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
 _TIMER_ABSTIME = 1  # of <time.h>
+_LOCK_ALL_IN_USE = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of <sys/mman.h>
 _entered = 0  # blocks of ``real_time`` that are open
 
 
@@ -49,6 +50,34 @@ def share_interpreter() -> None:
     """Let other threads have it, for short slices; only within ``real_time``."""
     if _entered:
         sys.setswitchinterval(SHARED_S)
+
+
+@contextmanager
+def shared_interpreter() -> Iterator[None]:
+    """Let other threads have it while the calling one waits for one of them; as it was afterwards.
+
+    One that computes for long then gives it back in time.
+    """
+    interval = sys.getswitchinterval()
+    share_interpreter()
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
+
+
+@contextmanager
+def short_slices() -> Iterator[None]:
+    """Let every thread of this process have the interpreter for short slices until the block ends.
+
+    For a process that commands nothing itself, and has to show in time that it runs.
+    """
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(SHARED_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def wait_until(deadline: float) -> None:
@@ -104,6 +133,24 @@ def real_time() -> Iterator[bool]:
         gc.unfreeze()
         _entered -= 1
         sys.setswitchinterval(interval)
+
+
+def lock_memory() -> bool:
+    """Keep the process's memory from being moved to disk, for good; whether it may.
+
+    Pages are locked once they are in use: a thread's stack is mostly never used.
+    """
+    if sys.platform != "linux":
+        return False
+    import resource  # not on every system
+
+    try:
+        locks = ctypes.CDLL(None, use_errno=True).mlockall
+        unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    except (OSError, AttributeError):
+        return False
+    # Within a limit, what is allocated later would fail.
+    return (unlimited or os.geteuid() == 0) and locks(_LOCK_ALL_IN_USE) == 0
 
 
 def just_below_real_time() -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from enum import StrEnum
+from enum import Enum
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import ConfigError, FluxError, SafetyStop, nearest
@@ -28,6 +28,8 @@ class SafetySettings:
         excess: a chunk that lies further beyond a position limit than this share of the joint's
             range stops; less is clamped. Grippers may be wanted four times as far beyond.
         starvation_s: how long the arm may hold and wait for the next chunk while it runs.
+        silence_s: on a robot that a process of its own commands: how long the main process, with
+            the policy, may not run while the arm moves.
         first_chunk_s: how long the first answer of a policy may take (it may have to warm up), and
             any answer in a simulation whose time stands still meanwhile.
     """
@@ -42,6 +44,7 @@ class SafetySettings:
     jump_s: float = 1.0
     excess: float = 0.25
     starvation_s: float = 2.0
+    silence_s: float = 0.2
     first_chunk_s: float = 120.0
 
     def __post_init__(self) -> None:
@@ -77,8 +80,10 @@ class SafetySettings:
         return cls(**value)
 
 
-class Rule(StrEnum):
+class Rule(str, Enum):
     """The reason of a stop, as records and results have it."""
+
+    __str__ = str.__str__  # its value, also in Python 3.10, which has no StrEnum
 
     LIMITS = "limits"
     FRAME = "frame"
@@ -86,6 +91,8 @@ class Rule(StrEnum):
     CHUNK = "chunk"
     TRACKING = "tracking"
     STARVATION = "starvation"
+    FILTER = "filter"
+    """An action filter was late, one command after the other."""
     POLICY = "policy"
     """The policy raised an error."""
     OPERATOR = "operator"
@@ -94,6 +101,10 @@ class Rule(StrEnum):
     """The runner's own sending raised an error."""
     RUN = "run"
     """Anything else raised an error: a hook, a filter, the runner."""
+    MAIN_PROCESS = "main process"
+    """The main process does not run; the control process stops the arm."""
+    CONTROL_PROCESS = "control process"
+    """The control process is dead, or hangs; the main process stops the arm."""
     INTERRUPT = "interrupt"
     """A signal; the latch is not tripped."""
 
@@ -138,6 +149,12 @@ class Starved(RuleStop):
     """No chunk came in time."""
 
     rule = Rule.STARVATION
+
+
+class FilterLate(RuleStop):
+    """An action filter does not return in time."""
+
+    rule = Rule.FILTER
 
 
 def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:

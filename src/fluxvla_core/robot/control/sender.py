@@ -105,6 +105,8 @@ class CommandSender:
         on_sent: called at each tick with what was sent, None for a tick without a command.
         speed: tells, before each command, the share of the velocity limits that it may use, in
             (0, 1]: a robot that a person slowed down. None where there is no such thing.
+        one_by_one: make each command when its turn comes, and hand it to ``execute`` alone: filters
+            that take long then make no command late but their own.
     """
 
     def __init__(
@@ -116,6 +118,7 @@ class CommandSender:
         filters: Sequence[Filter] = (),
         on_sent: Callable[[Sent | None], None] | None = None,
         speed: Callable[[], float] | None = None,
+        one_by_one: bool = False,
     ) -> None:
         self.rate = rate
         self.limiter = limiter
@@ -124,6 +127,7 @@ class CommandSender:
         self._former = CommandFormer(limiter, filters)
         self._on_sent = on_sent or (lambda sent: None)
         self._speed = speed
+        self._one_by_one = one_by_one or speed is not None
         self._rows: deque[Sent] = deque()
         # When the arm had the command that ``on_sent`` gets, at the latest; of those that a loop
         # with ticks of its own plays, when the first was.
@@ -146,13 +150,12 @@ class CommandSender:
         """
         self.latch.check()
         wanted = np.asarray(targets, dtype=np.float64)
-        shaped = self._former.filtered(wanted) if filtered else wanted
-        if self._speed is None:
-            self._play(wanted, shaped, most)
-            return
-        for row in range(len(wanted)):
-            share = min(self._speed(), most)
-            self._play(wanted[row : row + 1], shaped[row : row + 1], share)
+        count = 1 if self._one_by_one else max(len(wanted), 1)
+        for row in range(0, len(wanted), count):
+            rows = wanted[row : row + count]
+            shaped = self._former.filtered(rows) if filtered else rows
+            share = most if self._speed is None else min(self._speed(), most)
+            self._play(rows, shaped, share)
 
     def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
         before = self.limiter.snapshot()

@@ -42,13 +42,14 @@ FORMAT = "fluxvla-episode-1"
 HELD = "held.jsonl"
 """What went wrong after an episode, while the arm was held: the episode's record is complete."""
 START, OBSERVATION, CHUNK, REFUSED = "start", "observation", "chunk", "refused"
-COMMAND, STOP, END = "command", "stop", "end"
+COMMAND, FILTER, STOP, END = "command", "filter", "stop", "end"
 """Values of an event's ``event``.
 
 ``start``: what runs on what (the first event); ``observation``: a reading that was looked at;
 ``chunk``: a policy's answer that was admitted; ``refused``: a reading or an answer that was not;
-``command``: what was sent; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on
-the loop's clock.
+``command``: what was sent; ``filter``: an action filter was late, and is left out of the command
+that comes next; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on the loop's
+clock.
 """
 
 
@@ -74,6 +75,7 @@ class _Event:
     embodiment: dict[str, Any] | None = None
     instruction: str | None = None
     native: bool | None = None
+    filter: str | None = None
     success: bool | None = None
 
 
@@ -96,6 +98,7 @@ class EpisodeSummary:
         self._end: Mapping[str, Any] = {}
         self._timings = Timings()
         self._clamps: dict[str, dict[str, int]] = {}
+        self._late_filters: dict[str, int] = {}
         self._chunks = 0
         self._steps = 0
         self._held = 0
@@ -113,6 +116,9 @@ class EpisodeSummary:
             self._steps += event.get("phase") == "run"
             self._held += event.get("phase") == "run" and bool(event.get("held"))
             self._count_clamps(event.get("clamps") or ())
+        elif kind == FILTER:
+            name = str(event.get("filter"))
+            self._late_filters[name] = self._late_filters.get(name, 0) + 1
         for stage, value in (event.get("ms") or {}).items():
             if value is not None:
                 self._timings.add(stage, value / 1e3)
@@ -139,6 +145,7 @@ class EpisodeSummary:
             "skipped_beats": end.get("skipped_beats"),
             "held_beats": self._held,
             "clamps": self._clamps,
+            "late_filters": self._late_filters,
             "trips": end.get("trips", []),
             "timings": self._timings.summary(),
         }

@@ -24,7 +24,7 @@ from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording import ros_messages as ros
 from fluxvla_core.robot.recording.bag import McapFile, bag_writer
-from fluxvla_core.robot.recording.trace import EVENTS_FILE, SUMMARY_FILE
+from fluxvla_core.robot.recording.trace import EVENTS_FILE, REST_FILE, SUMMARY_FILE
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 from fluxvla_core.untrusted import read_bytes
 
@@ -88,8 +88,8 @@ class Recorded:
     Args:
         path: the episode's folder, or its MCAP file.
         events: in the order in which they happened.
-        pictures: camera -> its pictures.
         whole: whether the record was finished.
+        pictures: camera -> its pictures.
         depths: camera -> its depth pictures, NaN where nothing was measured.
 
     Raises:
@@ -100,8 +100,8 @@ class Recorded:
         self,
         path: Path,
         events: Sequence[Event],
-        pictures: Mapping[str, Pictures],
         whole: bool,
+        pictures: Mapping[str, Pictures],
         depths: Mapping[str, Pictures] | None = None,
     ) -> None:
         if not events or events[0].get("event") != episode_log.START:
@@ -299,14 +299,29 @@ def read_bag(path: Path) -> BagContent:
 def _read(path: Path) -> Recorded:
     file = bag_of(path) if path.is_dir() else path
     if file is None:
-        events, whole = read_lines(path / EVENTS_FILE)
-        return Recorded(path, events, {}, whole)
+        return Recorded(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), pictures={})
     bag = read_bag(file)
-    cameras = Recorded(path, bag.events, {}, bag.whole).embodiment.camera_names
+    events, whole = _with_rest(file.parent, bag.events, bag.whole)
+    cameras = Recorded(path, events, whole, {}).embodiment.camera_names
     colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
     pictures = _sorted(bag, colours, bag.unpacker.picture)
     depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
-    return Recorded(path, bag.events, pictures, bag.whole, depths)
+    return Recorded(path, events, whole, pictures, depths)
+
+
+def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Event], bool]:
+    """``events`` with those that only the process knew that commanded the robot."""
+    place = folder / REST_FILE
+    if whole or not place.is_file():
+        return events, whole
+    rest, complete = read_lines(place)
+    last = max((e["t"] for e in events if e["event"] == episode_log.COMMAND), default=-np.inf)
+    later = [event for event in rest if event["t"] > last]
+    return sorted([*events, *later], key=_time), complete
+
+
+def _time(event: Event) -> float:
+    return float(event["t"])
 
 
 def _sorted(

@@ -22,6 +22,7 @@ from fluxvla_core.robot.events import (
     EpisodeObserver,
     EpisodePrepared,
     Event,
+    FilterLeftOut,
     Observed,
     Reading,
     Refused,
@@ -29,6 +30,7 @@ from fluxvla_core.robot.events import (
     StoppedWhileHeld,
 )
 from fluxvla_core.robot.recording import episode_log
+from fluxvla_core.robot.recording.logged import logged, milliseconds
 from fluxvla_core.robot.recording.trace import EpisodeTrace, Recording
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.ros2 import RobotFrame, depth_stream
@@ -90,19 +92,14 @@ class EpisodeRecorder(EpisodeObserver):
                     observed=event.reading.at,
                     rate_hz=self._policy.action_rate_hz,
                     keyframes=event.keyframes,
-                    ms=_milliseconds(event.stages),
+                    ms=milliseconds(event.stages),
                 )
             case CommandSent():
-                self._command(event)
-            case Stopped():
-                self._write(
-                    episode_log.STOP,
-                    event.at,
-                    rule=event.rule,
-                    problem=event.problem,
-                    seconds=event.seconds,
-                    failure=event.failure,
-                )
+                self._commands += 1
+                self._keep(logged(event))
+                self._film()
+            case FilterLeftOut() | Stopped():
+                self._keep(logged(event))
             case EpisodeEnded():
                 self._finish(event)
             case StoppedWhileHeld():
@@ -154,25 +151,8 @@ class EpisodeRecorder(EpisodeObserver):
             state=reading.state,
             stamps=stamps,
             **base,
-            ms=_milliseconds(reading.seconds),
+            ms=milliseconds(reading.seconds),
         )
-
-    def _command(self, event: CommandSent) -> None:
-        sent = event.sent
-        self._commands += 1
-        seconds = {"send": event.send_s, "late": event.late_s}
-        self._write(
-            episode_log.COMMAND,
-            event.at,
-            phase=event.phase.value,
-            wanted=sent.target,
-            command=sent.command,
-            state=event.state,
-            clamps=[asdict(clamp) for clamp in sent.clamps],
-            **({"held": True} if sent.held else {}),
-            ms=_milliseconds({k: v for k, v in seconds.items() if v is not None}),
-        )
-        self._film()
 
     def _finish(self, event: EpisodeEnded) -> None:
         """Finish the files, and say what was not recorded.
@@ -180,15 +160,7 @@ class EpisodeRecorder(EpisodeObserver):
         Raises:
             RunFailed: something could not be written, of an episode that ended well.
         """
-        self._write(
-            episode_log.END,
-            event.at,
-            outcome=event.outcome,
-            success=event.success,
-            problem=event.problem,
-            skipped_beats=event.skipped,
-            trips=[asdict(trip) for trip in event.trips],
-        )
+        self._keep(logged(event))
         self.summary = self._counted.to_dict()
         try:
             self.summary = self._trace.close(self.summary)
@@ -216,7 +188,9 @@ class EpisodeRecorder(EpisodeObserver):
             self._reporter.warn(str(problem))
 
     def _write(self, kind: str, at: float, **fields: Any) -> None:
-        event = {"event": kind, "t": at, **fields}
+        self._keep({"event": kind, "t": at, **fields})
+
+    def _keep(self, event: Mapping[str, Any]) -> None:
         self._counted.add(event)
         self._trace.write(event)
 
@@ -260,7 +234,3 @@ def _shown(value: Any) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     return repr(value)[:500]
-
-
-def _milliseconds(seconds: Mapping[str, float]) -> dict[str, float]:
-    return {stage: round(value * 1e3, 3) for stage, value in seconds.items()}

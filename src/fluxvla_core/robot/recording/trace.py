@@ -29,6 +29,9 @@ from fluxvla_core.robot.recording.video import VideoWriter
 
 EVENTS_FILE = "trace.jsonl"
 SUMMARY_FILE = "episode.json"
+REST_FILE = "rest.jsonl"
+"""The newest events of the process that commands the robot, where the one that records was killed:
+its last half second, and how the robot was stopped."""
 # What may wait: pictures in bytes (35 of 640x480 in colour), events in number (minutes of them).
 _WAITING_BYTES = 32 * 1024 * 1024
 _WAITING_EVENTS = 20_000
@@ -76,10 +79,10 @@ class Log(Protocol):
 
 
 class JsonLines(Log):
-    """``trace.jsonl`` in ``folder``. It holds no pictures."""
+    """A file of lines in ``folder``. It holds no pictures."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8")
+    def __init__(self, folder: Path, name: str = EVENTS_FILE) -> None:
+        self._file = (folder / name).open("w", encoding="utf-8")
 
     def add(self, event: Mapping[str, Any]) -> None:
         fields = (f"{json.dumps(key)}: {_json(value)}" for key, value in event.items())

@@ -16,7 +16,7 @@ import numpy as np
 from fluxvla_mujoco import set_render
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.render import DrawnScene, import_mujoco
 from fluxvla_sim.world import SUBSTEPS
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def load_model(file: str, render: str = "cheap") -> Any:
     return model
 
 
-class TwoArms:
+class TwoArms(DrawnScene):
     """Both arms and the objects of one model file; see :class:`fluxvla_sim.world.Scene`.
 
     A subclass says in ``file`` which, places the objects in :meth:`reset`, and gives the reward.
@@ -83,7 +83,6 @@ class TwoArms:
         self.model = load_model(self.file, render)
         self.data = self._mujoco.MjData(self.model)
         self.steps = 0
-        self._renderer: Renderer | None = None
         names = [self.model.geom(i).name for i in range(self.model.ngeom)]
         self.geom = {name: i for i, name in enumerate(names) if name}
         self.fingers = {
@@ -151,15 +150,3 @@ class TwoArms:
         """The geoms that touch the geom called ``name``."""
         geom = self.geom[name]
         return {int(a if b == geom else b) for a, b in self.data.contact.geom if geom in (a, b)}
-
-    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
-        """A new ``(height, width, 3)`` uint8 RGB picture."""
-        if self._renderer is None:
-            self._renderer = Renderer(self.model)
-        return self._renderer.render(self.data, camera, height, width)
-
-    def close(self) -> None:
-        """Free the renderer; any number of times."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None

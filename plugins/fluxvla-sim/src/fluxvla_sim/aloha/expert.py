@@ -59,7 +59,7 @@ class Grip:
 
 @dataclass(frozen=True)
 class ArmPlan:
-    """What one arm does; steps without a motion hold still."""
+    """The plan of one arm; steps without a motion hold still."""
 
     reaches: tuple[Reach, ...]
     grips: tuple[Grip, ...]

@@ -11,7 +11,7 @@ from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene, Facts, LiftHold, Trans
 from fluxvla_sim.aloha.expert import Expert, smooth_noise
 from fluxvla_sim.aloha.insertion import Insertion, InsertionFacts, InsertionScene
 from fluxvla_sim.aloha.insertion_expert import InsertionExpert, insertion_noise
-from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
+from fluxvla_sim.world import CONTROL_HZ, SimRobot, SimWorld
 
 if TYPE_CHECKING:
     from fluxvla_core.operators import Camera, EmbodimentSpec
@@ -25,7 +25,7 @@ CAMERAS = (
     "left_pillar",
     "right_pillar",
 )
-CUBE = World(
+CUBE = SimWorld(
     tasks=(TransferCube(), LiftHold()),
     max_steps=MAX_STEPS,
     open_scene=AlohaScene,
@@ -33,7 +33,7 @@ CUBE = World(
     begin=Facts,
     noise=smooth_noise,
 )
-INSERTION = World(
+INSERTION = SimWorld(
     tasks=(Insertion(),),
     max_steps=MAX_STEPS,
     open_scene=InsertionScene,

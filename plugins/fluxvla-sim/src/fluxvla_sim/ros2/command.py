@@ -46,7 +46,7 @@ class SimCommand:
             type=float,
             default=50.0,
             metavar="HZ",
-            help="of joint states and all else that is no picture, up to 500, in simulated time; "
+            help="of joint states and everything except pictures, up to 500, in simulated time; "
             "default 50",
         )
         parser.add_argument(

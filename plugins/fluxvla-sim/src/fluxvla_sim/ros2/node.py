@@ -41,7 +41,7 @@ from fluxvla_core.ros2 import (
 from fluxvla_sim.ros2.cameras import Cameras
 from fluxvla_sim.ros2.drivers import Driver
 from fluxvla_sim.ros2.settings import NodeSettings, check_fault, depths
-from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, World
+from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, Scene, SimWorld
 
 _FACTS_EVERY = 5
 # Simulated seconds after a reset in which no command is taken.
@@ -50,13 +50,13 @@ _SETTLE_S = 0.1
 _FAR_BEHIND_S = 0.5
 _WELL = "well"
 # Commands that may wait while this process is kept from running: a UR ignores what comes after a
-# gap, and a simulation's stall is none of the commander's.
+# gap, and a simulation's stall is not the commander's.
 _WAITING = 200
 
 
 @dataclass
 class Counts:
-    """What was done, for the line at the end; ``late`` counts parts of periods."""
+    """Counters for the summary at the end; ``late`` counts parts of periods."""
 
     periods: int = 0
     late: int = 0
@@ -72,7 +72,7 @@ class Judge:
     have been done. After the world's ``max_steps`` its outcome is settled.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: SimWorld) -> None:
         self._world = world
         self._facts = world.begin()
         self._seed = 0
@@ -334,7 +334,7 @@ class RobotNode:
 
 def simulate(
     driver: Driver,
-    world: World,
+    world: SimWorld,
     settings: NodeSettings,
     reporter: Reporter,
     render: str = "cheap",

@@ -29,6 +29,7 @@ from fluxvla_core.ros2 import (
     Connection,
     RobotFrame,
     RosOperator,
+    Stale,
     StreamSpec,
     message_class,
 )
@@ -114,12 +115,18 @@ class InSimulation(RosOperator):
             raise ConfigError(
                 f"the simulator runs at {theirs:g} of real time, this operator is set to "
                 f"{self.real_time_factor:g}",
-                next=f"set real_time_factor={theirs:g} in the operator's table, or start "
+                next=f"--set <{type(self).__name__}>.real_time_factor={theirs:g}, or start "
                 f"fluxvla sim with --real-time-factor {self.real_time_factor:g}",
             )
 
     def get_frame(self) -> RobotFrame:
-        """As the robot's operator; receipt stamps are on ``clock``."""
+        """As the robot's operator; receipt stamps are on ``clock``.
+
+        The part without commands is not told of a new episode, and so raises Stale until every
+        stream shows it.
+        """
+        if self._connection is not None and not self._part.commands and not self._shows_episode():
+            raise Stale("the simulator shows nothing of the new episode yet")
         frame = super().get_frame()
         if self.real_time_factor == 1:
             return frame
@@ -154,16 +161,7 @@ class InSimulation(RosOperator):
             return facts["resets"] > before and facts["seed"] == seed
 
         self._wait(begun, f"the simulator did not begin an episode with seed {seed}")
-        # A robot that jumps is nothing that matching in time reckons with: a picture of the new
-        # episode must not find the state of the old one within the skew that is allowed. Nor does
-        # the simulator take commands in an episode's first 0.1 s.
-        wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)
-        at = self.facts()["reset_at"] + round(wait_s * 1e9)
-        streams = [spec.name for spec in self.streams() if spec.kind in (STATE, CAMERA)]
-        self._wait(
-            lambda: all(self._stamp(name) >= at for name in streams),
-            "the simulator shows nothing of the new episode",
-        )
+        self._wait(self._shows_episode, "the simulator shows nothing of the new episode")
         self._instruction = instruction
         self._begun, self._judged = self._simulated(), None
 
@@ -210,6 +208,16 @@ class InSimulation(RosOperator):
             )
         kept = None if kept is None else round(kept, 3)
         return {"real_time_factor": self.real_time_factor, "real_time_kept": kept}
+
+    def _shows_episode(self) -> bool:
+        """Whether everything that this operator reads is of the newest episode alone."""
+        # A robot that jumps is nothing that matching in time reckons with: a picture of the new
+        # episode must not find the state of the old one within the skew that is allowed. Nor does
+        # the simulator take commands in an episode's first 0.1 s.
+        wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)
+        at = self.facts()["reset_at"] + round(wait_s * 1e9)
+        streams = [spec.name for spec in self._specs if spec.kind in (STATE, CAMERA)]
+        return all(self._stamp(name) >= at for name in streams)
 
     def _task(self) -> Mapping[str, Any] | None:
         words = self._instruction.casefold().split()
@@ -259,7 +267,7 @@ class AlohaSimROSOperator(InSimulation, AlohaOperator):
     """
 
     def __init__(self, arms: str = "viperx300", **kwargs: Any) -> None:
-        check_arms(arms)
+        check_arms(arms, type(self).__name__)
         # One of the two says which arms there are.
         super().__init__(arms=None if kwargs.get("embodiment") else arms, **kwargs)
 

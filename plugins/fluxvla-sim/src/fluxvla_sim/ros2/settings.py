@@ -18,7 +18,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """How a simulated robot presents itself.
+    """Settings of a simulated robot on ROS 2.
 
     Args:
         name: of the robot; ``sim_`` before it names the node.
@@ -72,7 +72,7 @@ class NodeSettings:
         return math.floor(part * self.state_hz / (CONTROL_HZ * self.parts) + _ROUNDING)
 
     def latency_s(self, stream: str) -> float:
-        """How long a stream's messages are under way, in seconds of the wall clock."""
+        """Latency of a stream's messages, in seconds of the wall clock."""
         return self.latencies.get(stream, 0.0) / self.real_time_factor
 
 
@@ -82,7 +82,7 @@ def depths(driver: Driver) -> dict[str, str]:
 
 
 def check_stream(driver: Driver, stream: str) -> None:
-    """Refuse what is no stream of a robot's.
+    """Refuse what is not a stream of a robot's.
 
     Raises:
         UsageError: there is no such stream; names those that there are.

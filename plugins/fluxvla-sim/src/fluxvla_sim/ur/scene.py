@@ -15,7 +15,7 @@ from fluxvla_mujoco import set_render
 from fluxvla_ur.embodiment import JOINTS
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_sim.render import Renderer, import_mujoco
+from fluxvla_sim.render import DrawnScene, import_mujoco
 from fluxvla_sim.world import SUBSTEPS
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _furnish(spec: Any, mujoco: Any) -> None:
     hand.add_camera(name="wrist", pos=[0.07, 0, 0.0], xyaxes=[0, -1, 0, -0.94, 0, -0.34], fovy=75)
 
 
-class URScene:
+class URScene(DrawnScene):
     """The simulated robot and its cube; see :class:`fluxvla_sim.world.Scene`."""
 
     def __init__(self, render: str = "cheap") -> None:
@@ -95,7 +95,6 @@ class URScene:
         self.model = load_model(render)
         self.data = self._mujoco.MjData(self.model)
         self.steps = 0
-        self._renderer: Renderer | None = None
         self._joints = np.array([self.model.joint(name).qposadr[0] for name in JOINTS])
         self._finger = self.model.joint(FINGER_JOINT).qposadr[0]
         self._cube = self.model.joint("cube_joint").qposadr[0]
@@ -152,18 +151,6 @@ class URScene:
         touching = {int(a if b == cube else b) for a, b in self.data.contact.geom if cube in (a, b)}
         return bool(all(touching & pad for pad in self._pads) and self.cube[2] > LIFTED_M)
 
-    def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
-        """A new ``(height, width, 3)`` uint8 RGB picture."""
-        if self._renderer is None:
-            self._renderer = Renderer(self.model)
-        return self._renderer.render(self.data, camera, height, width)
-
-    def close(self) -> None:
-        """Free the renderer; any number of times."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
 
 @dataclass(frozen=True)
 class LiftFacts:
@@ -184,7 +171,7 @@ class LiftFacts:
 
 
 class LiftCube:
-    """The fingers hold the cube in the air for 0.2 s: a toss, or a bounce, is no grasp."""
+    """The fingers hold the cube in the air for 0.2 s: a toss, or a bounce, is not a grasp."""
 
     name = "lift_cube"
     instruction = "pick up the red cube"

@@ -9,12 +9,12 @@ from fluxvla_ur.embodiment import ur_spec
 
 from fluxvla_sim.ur.expert import URExpert, lift_noise
 from fluxvla_sim.ur.scene import MAX_STEPS, LiftCube, LiftFacts, URScene
-from fluxvla_sim.world import CONTROL_HZ, SimRobot, World
+from fluxvla_sim.world import CONTROL_HZ, SimRobot, SimWorld
 
 if TYPE_CHECKING:
     from fluxvla_core.operators import Camera, EmbodimentSpec
 
-CUBE = World(
+CUBE = SimWorld(
     tasks=(LiftCube(),),
     max_steps=MAX_STEPS,
     open_scene=URScene,

@@ -13,15 +13,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fluxvla_core.config.docstrings import argument_texts, field_texts
 from fluxvla_core.config.signature import (
     OPTIONS,
     Forward,
     Init,
     Parameter,
     Signature,
-    argument_texts,
     combine,
-    field_texts,
     with_kwargs,
 )
 from fluxvla_core.contracts.check import is_train_runner
@@ -131,7 +130,7 @@ def _class_place(cls: type) -> str:
 
 @dataclass(frozen=True)
 class Misfit:
-    """A key whose value is none of the types that its parameter is annotated with."""
+    """A key whose value is of none of the types that its parameter is annotated with."""
 
     name: str
     expected: str

@@ -1,4 +1,4 @@
-"""A live view: pictures as a stream that any browser shows, served on this machine alone.
+"""A live view: pictures as a stream that any browser shows, served on this machine only.
 
 Motion JPEG, ``multipart/x-mixed-replace`` (RFC 2046 and Netscape's extension): each part replaces
 the one before. Somebody who looks from elsewhere forwards the port, as with
@@ -59,7 +59,7 @@ class LiveView:
         except OSError as error:
             raise RunFailed(
                 f"the live view cannot be served on port {port}: {error}",
-                next="set live_port to another one, or to 0 for any that is free",
+                next="--set <section>.live_port=0 for any that is free",
             ) from error
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_address[1]}/"

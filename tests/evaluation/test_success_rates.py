@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.statistics import (
+from fluxvla_core.evaluation.success_rates import (
     Comparison,
+    all_of,
     mcnemar_test,
     one_sided_p,
     smallest_difference,
@@ -33,6 +34,13 @@ def records(outcomes, task="a", group="policy"):
 )
 def test_the_one_sided_p_value_is_a_binomial_tail(for_it, against, p):
     assert one_sided_p(for_it, against) == pytest.approx(p)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "name"), [(1, "the task"), (2, "all 2 tasks"), (10, "all 10 tasks")]
+)
+def test_all_tasks_are_said_of_several_only(tasks, name):
+    assert all_of(tasks) == name
 
 
 def test_counts_below_zero_are_refused():
@@ -140,7 +148,7 @@ def test_more_confidence_is_a_wider_interval():
 
 @pytest.mark.parametrize("counts", [(-1, 5), (6, 5)])
 def test_impossible_counts_are_refused(counts):
-    with pytest.raises(ValueError, match="are no counts"):
+    with pytest.raises(ValueError, match="are not counts"):
         wilson_interval(*counts)
 
 

@@ -6,7 +6,7 @@ from typing import Any, Optional
 
 import pytest
 
-from fluxvla_core.config.inspection import misfits
+from fluxvla_core.config.runtime_signature import misfits
 
 
 class Base:

@@ -1,4 +1,4 @@
-"""Parameter groups, and optimizer state by name."""
+"""Parameter groups, gradient clipping, and optimizer state by name."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import torch
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.optim import clip_, decay_groups, named_state, torch_state
+from fluxvla_core.training.gradients import clip_
+from fluxvla_core.training.optimizer_state import named_state, torch_state
 from fluxvla_core.training.optimizers import AdamW
+from fluxvla_core.training.parameters import decay_groups
 
 
 def model():

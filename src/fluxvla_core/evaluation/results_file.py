@@ -1,13 +1,10 @@
-"""``results.json`` of an evaluation, its videos, and what it says at its end."""
+"""``results.json`` of an evaluation: assembling, checking, writing and reporting it."""
 
 from __future__ import annotations
 
 import errno
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +12,63 @@ from fluxvla_core import atomic
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
-from fluxvla_core.config.snapshot import write_json
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluation.episodes import DONE, EpisodeKey, reason
-from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.statistics import all_of, describe_problem, describe_rate
+from fluxvla_core.evaluation.episodes import DONE, EvalLog, reason
+from fluxvla_core.evaluation.provenance import Code, provenance
+from fluxvla_core.evaluation.success_rates import (
+    all_of,
+    describe_problem,
+    describe_rate,
+    problems,
+    summarise,
+)
 
 FORMAT = "fluxvla-eval-1"
 NAMED = 5
 """How many different problems are reported; all are in the results."""
+
+
+def assemble(
+    records: Sequence[Mapping[str, Any]],
+    log: EvalLog,
+    *,
+    policy: str,
+    mode: str,
+    checkpoint: Mapping[str, Any] | None,
+    settings: Mapping[str, Any],
+    code: Code,
+    videos: Sequence[Mapping[str, Any]],
+    timing: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The part of ``results.json`` that every evaluation has, in simulation or on a robot.
+
+    Args:
+        records: of all episodes, finished or failed.
+        log: where they are from; says which ones other code ran.
+        policy: its name: ``checkpoint``, ``expert``, a registered type, …
+        mode: ``stepped``, ``live`` or ``robot``.
+        checkpoint: ``path`` and ``sha256``; None for policies without one.
+        settings: what outcomes follow from, for people.
+        code: what ran the new episodes.
+        videos, timing: see :mod:`fluxvla_core.evaluation.videos` and :func:`timing`.
+    """
+    return {
+        "format": FORMAT,
+        "policy": policy,
+        "mode": mode,
+        "groups": summarise(records),
+        "problems": problems(records),
+        "checkpoint": checkpoint,
+        "settings": settings,
+        "provenance": {
+            **provenance(code),
+            "seeds": seeds(records),
+            "reused": {"episodes": len(log.reused), "changed": log.changed},
+        },
+        "videos": videos,
+        "timing": timing,
+    }
 
 
 def save_results(folder: Path, results: Mapping[str, Any], context: RunContext) -> None:
@@ -57,16 +101,17 @@ def write_results(path: Path, results: Mapping[str, Any]) -> None:
 
 
 def keep_config(folder: Path, context: RunContext) -> None:
-    """The resolved config beside the results that came of it; each evaluation has its own.
+    """Keep the resolved config next to the results that came of it; each evaluation has its own.
 
     Raises:
         OSError: it cannot be written.
     """
     if not context.config:  # built by hand, not from a config
         return
-    tree = json.loads(json.dumps(context.config, default=str))
+    tree = as_json(context.config)
     origins = dict(sorted(context.origins.items()))
-    write_json(folder / CONFIG_FILE, {"format": CONFIG_FORMAT, "config": tree, "origins": origins})
+    document = {"format": CONFIG_FORMAT, "config": tree, "origins": origins}
+    atomic.write_json(folder / CONFIG_FILE, document)
 
 
 def seeds(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -79,7 +124,7 @@ def seeds(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def timing(
     records: Sequence[Mapping[str, Any]], new: int, seconds: float, workers: int
 ) -> dict[str, Any]:
-    """How fast the episodes were, as JSON values.
+    """Speed of the episodes, as JSON values.
 
     Args:
         records: with ``steps``, ``calls`` (of the policy) and ``timing``: see ``run_episode``.
@@ -193,134 +238,10 @@ def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path)
         reporter.artifact("video", folder / video["path"])
 
 
-# -- videos: failures show more than successes, so they come first
-
-# Tasks whose groups are all shown.
-_COMPARED = 2
-# What results.json says of a video.
-_VIDEO_KEYS = ("group", "task", "seed", "success", "instruction")
+def as_json(table: Any) -> Any:
+    """A config's table as plain JSON values, which can be sent to other processes."""
+    return json.loads(json.dumps(table, default=_as_json_value))
 
 
-def choose_episodes(
-    records: Sequence[Mapping[str, Any]], count: int, group: str = "policy"
-) -> list[Mapping[str, Any]]:
-    """Up to ``count`` records of ``group``: half failures, half successes, tasks in turn.
-
-    Where there are not enough of one kind the other fills up. Failures come first.
-    """
-    mine = [r for r in records if r["group"] == group and r["status"] == DONE]
-    failures = _in_turn([r for r in mine if not r["success"]])
-    successes = _in_turn([r for r in mine if r["success"]])
-    shown = min(len(failures), max((count + 1) // 2, count - len(successes)))
-    return failures[:shown] + successes[: count - shown]
-
-
-def with_others(
-    shown: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]]
-) -> list[Mapping[str, Any]]:
-    """``shown``, and one episode of each other group for its first tasks, to be seen beside it.
-
-    One of the same seed where there is one.
-    """
-    best = {r["task"]: r for r in reversed(shown)} | {r["task"]: r for r in shown if r["success"]}
-    groups = dict.fromkeys(r["group"] for r in records if r["status"] == DONE)
-    found = list(shown)
-    for task, record in list(best.items())[:_COMPARED]:
-        for group in groups:
-            mine = [r for r in records if (r["group"], r["task"]) == (group, task)]
-            mine = [r for r in mine if r["status"] == DONE]
-            if group != record["group"] and mine:
-                found.append(min(mine, key=lambda r: r["seed"] != record["seed"]))
-    return found
-
-
-def video_name(number: int, record: Mapping[str, Any]) -> str:
-    """``00-failure-TASK-seed-SEED.mp4``."""
-    word = "success" if record["success"] else "failure"
-    return f"{number:02d}-{word}-{record['task']}-seed-{record['seed']}.mp4"
-
-
-def record_videos(
-    pool: WorkerPool,
-    records: Sequence[Mapping[str, Any]],
-    folder: Path,
-    make_job: Callable[[EpisodeKey, str], Any],
-    reporter: Reporter,
-) -> list[dict[str, Any]]:
-    """Run the episodes of ``records`` again to record videos: they repeat exactly.
-
-    Args:
-        pool: its workers return a result with ``state_hash``, as the records have it.
-        folder: where the videos go; those of an evaluation before are removed.
-        make_job: from a key and a path to the job that runs it and leaves its video there.
-
-    Returns:
-        JSON values, one for each video that was made, in the order of ``records``: ``group``,
-        ``task``, ``seed``, ``success``, ``instruction`` and ``path``, relative to ``folder``'s
-        parent.
-    """
-    # Another part of the same job may be doing the same: each makes its own, then puts them there.
-    part = folder / f".part-{os.getpid()}"
-    part.mkdir(parents=True, exist_ok=True)
-    names = [video_name(number, record) for number, record in enumerate(records)]
-    jobs = [
-        make_job(EpisodeKey(r["group"], r["task"], r["seed"]), str(part / name))
-        for r, name in zip(records, names, strict=True)
-    ]
-    made = [False] * len(jobs)
-    with closing(pool.run(jobs)) as outcomes:
-        for done, outcome in enumerate(outcomes, 1):
-            reporter.progress("videos", done, len(jobs))
-            made[outcome.index] = outcome.error is None
-            if outcome.error is not None:
-                reporter.warn(f"no video {names[outcome.index]}: {outcome.error}")
-            elif outcome.result["state_hash"] != records[outcome.index]["state_hash"]:
-                reporter.warn(
-                    f"{names[outcome.index]}: the episode went another way than when it was "
-                    "counted; its outcome does not follow from its seed alone"
-                )
-    for old in folder.glob("*.mp4"):
-        if old.name not in names:
-            old.unlink(missing_ok=True)
-    for name in names:
-        made_here = part / name
-        if made_here.exists():
-            made_here.replace(folder / name)
-    shutil.rmtree(part, ignore_errors=True)
-    return [
-        {
-            **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": f"{folder.name}/{name}",
-        }
-        for record, name, there in zip(records, names, made, strict=True)
-        if there
-    ]
-
-
-def recorded_videos(
-    recordings: Iterable[tuple[Mapping[str, Any], Path]], folder: Path
-) -> list[dict[str, Any]]:
-    """The videos that were recorded while the episodes ran, as :func:`record_videos` lists its own.
-
-    Args:
-        recordings: each episode's record with the folder of its recording.
-        folder: of the results, to which the videos' paths are relative.
-    """
-    return [
-        {
-            **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": Path(os.path.relpath(video, folder)).as_posix(),
-        }
-        for record, place in recordings
-        for video in sorted(place.glob("*.mp4"))[:1]
-    ]
-
-
-def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    seen: dict[str, int] = {}
-    ranked = []
-    for record in records:
-        rank = seen.get(record["task"], 0)
-        seen[record["task"]] = rank + 1
-        ranked.append((rank, record))
-    return [record for _, record in sorted(ranked, key=lambda pair: pair[0])]
+def _as_json_value(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -46,7 +46,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
         ValueError: counts below 0, more successes than trials, or a confidence outside (0, 1).
     """
     if not 0 <= successes <= trials:
-        raise ValueError(f"{successes} successes of {trials} trials are no counts")
+        raise ValueError(f"{successes} successes of {trials} trials are not counts")
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
     if trials == 0:
@@ -82,7 +82,7 @@ def summarise(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     Returns:
         ``{group: {"tasks": {task: rate}, "all": rate}}``, each ``rate`` as :func:`rate` gives it
         with ``errors`` added, and ``mean_return`` where episodes have a return. An episode that
-        ended in an error is no trial: it says nothing about the policy, and is counted beside it.
+        ended in an error is not a trial: it says nothing about the policy, and is counted apart.
     """
     table: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
     for record in records:
@@ -97,7 +97,7 @@ def summarise(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def problems(records: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What went wrong in episodes, the most frequent first, as JSON values.
+    """Problems of episodes, the most frequent first, as JSON values.
 
     Returns:
         ``group``, ``what``, ``episodes`` (in how many of them), and ``status``: ``error`` for
@@ -124,7 +124,7 @@ def describe_problem(row: Mapping[str, Any]) -> str:
 
 
 def all_of(tasks: int) -> str:
-    """What the row over several tasks is called: they may be few of those that there are."""
+    """The name of the row over several tasks: they may be few of those that there are."""
     return f"all {tasks} tasks" if tasks > 1 else "the task"
 
 
@@ -207,7 +207,7 @@ def instruction_test(records: Records) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How two sides did on the same episodes.
+    """Comparison of two sides on the same episodes.
 
     Args:
         both, neither: pairs in which both sides succeeded, or neither did.
@@ -319,7 +319,7 @@ def mcnemar_test(a: Iterable[Mapping[str, Any]], b: Iterable[Mapping[str, Any]])
     """McNemar's exact test on two evaluations, their records paired by task and seed.
 
     Args:
-        a, b: records of an episode log, each of one group.
+        a, b: records of an evaluation log, each of one group.
 
     Raises:
         UsageError: no episode is on both sides, or a side has one twice.

@@ -1,0 +1,191 @@
+"""What ``fluxvla run`` plays in the faults of two processes: an arm, a policy, a hook, and harm.
+
+The program imports this module by ``--plugin``, its control process for the arm's class. It does
+what a line of the pipe ``orders`` names, one of ``HARMS``, and stores in the file ``PROVOKED`` when
+that began.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._robot_faults import Array, BenchArm, Swing
+from fluxvla_core import BaseInferenceRunner
+from fluxvla_core.plugins.registry import HOOKS, OPERATORS, POLICIES, RUNNERS
+from fluxvla_core.robot.process.link import Link
+from fluxvla_core.ros2.streams import Ring
+
+PROVOKED, SENT, FLOOD = "provoked", "sent", "flood"
+# How long what blocks does so: longer than any rule waits, and shorter than a person.
+BLOCKED_S = 5.0
+# Lengths of a driver's warnings that fill what the processes share in a second, to the last byte.
+FLOOD_BYTES = (100_000, 10_000, 1000, 100, 1)
+DRIVER = logging.getLogger("driver")
+
+
+@RUNNERS.register_module()
+class ProgramRunner(BaseInferenceRunner):
+    """Under a name that a config can have."""
+
+
+@OPERATORS.register_module()
+class ProgramArm(BenchArm):
+    """Stores every command that it sends, and writes long warnings while ``FLOOD`` is there."""
+
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        self._flood = Path(folder) / FLOOD
+        # Without a buffer: what was sent before a kill is there.
+        self._file = open(Path(folder) / SENT, "ab", buffering=0)  # noqa: SIM115
+
+    def publish_action(self, action: Array) -> None:
+        self._file.write(np.asarray(action, np.float64).tobytes())
+        super().publish_action(action)
+        if self._flood.exists():
+            for length in FLOOD_BYTES:
+                DRIVER.warning("x" * length)
+
+
+@POLICIES.register_module()
+class HarmfulSwing(Swing):
+    """Swings, until somebody types what harm it is to do."""
+
+    def __init__(self, folder: str, orders: int) -> None:
+        super().__init__()
+        self.folder, self.orders = Path(folder), orders
+        self.blocks = False
+        HarmfulSwing.made = self
+        threading.Thread(target=self._obey, name="orders", daemon=True).start()
+
+    def begun(self) -> None:
+        """The harm begins now."""
+        (self.folder / PROVOKED).write_text(str(time.monotonic()))
+
+    def _obey(self) -> None:
+        with os.fdopen(self.orders, encoding="utf-8") as lines:
+            for line in lines:
+                HARMS[line.strip()](self)
+
+
+@HOOKS.register_module()
+class BlockingHook:
+    """Blocks the thread that it is called in, once it is told to."""
+
+    def action_sent(self, action: Array) -> None:
+        policy = HarmfulSwing.made
+        if policy.blocks:
+            policy.blocks = False
+            policy.begun()
+            time.sleep(BLOCKED_S)
+
+
+def in_policy(harm: Callable[[], object]) -> Callable[[HarmfulSwing], None]:
+    """Done in the policy's next answer, and once."""
+
+    def provoke(policy: HarmfulSwing) -> None:
+        def spoil(chunk: Array) -> Array:
+            policy.spoil = None
+            policy.begun()
+            harm()
+            return chunk
+
+        policy.spoil = spoil
+
+    return provoke
+
+
+def keep_interpreter() -> None:
+    """Native code that computes in one piece: PyDLL, unlike CDLL, keeps the interpreter's lock."""
+    ctypes.PyDLL(None).sleep(int(BLOCKED_S))
+
+
+def fail() -> None:
+    raise ValueError("no answer")
+
+
+def think() -> None:
+    time.sleep(10 * BLOCKED_S)
+
+
+def crash() -> None:
+    ctypes.string_at(0)
+
+
+def use_all_memory() -> None:
+    """As far as the system lets this process go, which is a little more than it has."""
+    in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (in_use + 64 * 2**20, resource.RLIM_INFINITY))
+    blocks = []
+    while True:
+        blocks.append(bytearray(2**20))
+
+
+def stand_in_for_a_picture_callback_that_spins(policy: HarmfulSwing) -> None:
+    """What stores a picture keeps the interpreter's lock; none of ours does that."""
+    add = Ring.add
+
+    def spin(ring: Ring, receipt: float, stamp: float | None, message: Any) -> bool:
+        if type(message).__name__ == "Image":
+            Ring.add = add  # type: ignore[method-assign]
+            policy.begun()
+            # Other threads ask for the lock after so many seconds, and get it between two lines.
+            sys.setswitchinterval(10 * BLOCKED_S)
+            until = time.monotonic() + BLOCKED_S
+            while time.monotonic() < until:
+                pass
+            sys.setswitchinterval(0.005)
+        return add(ring, receipt, stamp, message)
+
+    Ring.add = spin  # type: ignore[method-assign]
+
+
+def stand_in_for_a_link_that_is_not_read(policy: HarmfulSwing) -> None:
+    """The thread that reads what the control process sends finds nothing, for a while."""
+    receive = Link.receive
+    # Of no interest on this program's terminal.
+    DRIVER.propagate = False
+    DRIVER.addHandler(logging.NullHandler())
+    policy.begun()
+    (policy.folder / FLOOD).touch()
+    Link.receive = lambda link: None  # type: ignore[method-assign]
+    time.sleep(BLOCKED_S)
+    (policy.folder / FLOOD).unlink()
+    Link.receive = receive  # type: ignore[method-assign]
+
+
+def stand_in_for_a_link_whose_thread_ends(policy: HarmfulSwing) -> None:
+    """As for want of memory."""
+
+    def receive(link: Link) -> None:
+        policy.begun()
+        raise MemoryError
+
+    Link.receive = receive  # type: ignore[method-assign]
+
+
+def block_a_hook(policy: HarmfulSwing) -> None:
+    policy.blocks = True
+
+
+HARMS: Mapping[str, Callable[[HarmfulSwing], None]] = {
+    "keep the interpreter": in_policy(keep_interpreter),
+    "fail": in_policy(fail),
+    "think": in_policy(think),
+    "crash": in_policy(crash),
+    "use all memory": in_policy(use_all_memory),
+    "picture callback spins": stand_in_for_a_picture_callback_that_spins,
+    "link is not read": stand_in_for_a_link_that_is_not_read,
+    "hook blocks": block_a_hook,
+    "link's thread ends": stand_in_for_a_link_whose_thread_ends,
+}

@@ -1,0 +1,30 @@
+"""Entry of the control process: ``python -m fluxvla_core.robot.process MEMORY SETUP``.
+
+``MEMORY`` and ``SETUP`` are file descriptors: of the shared memory, and of a pipe with the setup.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from fluxvla_core.robot.process.control import serve
+from fluxvla_core.robot.process.link import Link
+from fluxvla_core.robot.process.messages import error_fields
+from fluxvla_core.robot.process.setup import ControlSetup
+
+
+def main() -> None:
+    """Build the robot's commanding side, and serve the main process."""
+    memory, setup = map(int, sys.argv[1:])
+    link = Link(memory, control=True)
+    with os.fdopen(setup, encoding="utf-8") as pipe:
+        text = pipe.read()
+    try:
+        serve(link, ControlSetup.from_json(text))
+    except Exception as error:  # noqa: BLE001 - raised in the main process
+        link.post("failed", **error_fields(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""The control process: commands the robot, and asks the main process for chunks.
+
+It runs the same episodes as a run in one process; where those ask the policy, look at a signal or
+report something, the classes here ask the main process over the link, and never wait for it while
+an arm moves.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import FluxError
+from fluxvla_core.robot.control import realtime
+from fluxvla_core.robot.control.interrupt import Interrupted
+from fluxvla_core.robot.control.joiners import make_joiner
+from fluxvla_core.robot.control.safety import Latch
+from fluxvla_core.robot.control.tracking import TrackingWatch
+from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
+from fluxvla_core.robot.episode import EpisodeParts
+from fluxvla_core.robot.events import (
+    CommandSent,
+    EpisodeEnded,
+    EpisodeObserver,
+    Event,
+    FilterLeftOut,
+    Phase,
+    Stopped,
+)
+from fluxvla_core.robot.process.event_messages import event_message
+from fluxvla_core.robot.process.inbox import Inbox
+from fluxvla_core.robot.process.link import Link
+from fluxvla_core.robot.process.messages import Message, error_fields
+from fluxvla_core.robot.process.remote_source import RemoteSource
+from fluxvla_core.robot.process.setup import ControlSetup
+from fluxvla_core.robot.process.timed_filters import timed_filters
+from fluxvla_core.robot.recording.logged import logged
+from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.tasks import Task
+
+# How often an idle process looks for orders, and a wait for an answer.
+_POLL_S = 0.005
+_NO_REAL_TIME = (
+    "this user may not lock memory or have a real-time priority: commands may be late on a busy "
+    "machine (docs/safety.md, Command pipeline)"
+)
+# Commands between two collections of young objects, which take place right after a command.
+_COMMANDS_PER_COLLECTION = 64
+# Events of half a minute: more than the main process can lose.
+_EVENTS_KEPT = 4096
+_IGNORED = ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGPIPE")
+
+
+class LinkReporter(Reporter):
+    """Passes messages for people to the main process."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def info(self, text: str) -> None:
+        self._link.post("info", text=text)
+
+    def warn(self, text: str) -> None:
+        self._link.post("warn", text=text)
+
+    def artifact(self, kind: str, path: Path) -> None:
+        self._link.post("artifact", artifact=kind, path=str(path))
+
+
+class LinkLog(logging.Handler):
+    """Passes warnings of libraries and drivers to the main process's log."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(logging.WARNING)
+        self._link = link
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        self._link.post("log", logger=record.name, level=record.levelno, text=text)
+
+
+class LinkObserver(EpisodeObserver):
+    """Passes an episode's events to the main process, and keeps the newest for a record."""
+
+    def __init__(self, link: Link, inbox: Inbox) -> None:
+        self._link, self._inbox = link, inbox
+        self._commands = 0
+        self._newest: deque[dict[str, Any]] = deque(maxlen=_EVENTS_KEPT)
+
+    def on_event(self, event: Event) -> None:
+        if isinstance(event, CommandSent):
+            self._inbox.phase = event.phase
+            self._commands += 1
+            if self._commands % _COMMANDS_PER_COLLECTION == 0:
+                gc.collect(1)
+        if isinstance(event, (CommandSent, FilterLeftOut, Stopped, EpisodeEnded)):
+            self._newest.append(logged(event))
+        message = event_message(event)
+        if message is not None:
+            # Of commands there are many: those that find no room are counted.
+            send = self._link.send if isinstance(event, CommandSent) else self._link.post
+            send(message.kind, message.arrays, **message.fields)
+
+    def write_rest(self, folder: Path) -> None:
+        """Write what the main process, which is dead, did not; the robot was stopped.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        from fluxvla_core.robot.recording.trace import REST_FILE, JsonLines  # rarely needed
+
+        file = JsonLines(folder, REST_FILE)
+        for event in self._newest:
+            file.add(event)
+        file.close()
+
+
+def serve(link: Link, setup: ControlSetup) -> None:
+    """Carry out the main process's orders until it says ``close``, or is dead.
+
+    Raises:
+        ConfigError, PluginError: the operator or a filter cannot be built.
+    """
+    reporter = LinkReporter(link)
+    inbox = Inbox(link, setup.settings.safety)
+    _take_signals(inbox)
+    logging.getLogger().addHandler(LinkLog(link))
+    robot = setup.make_robot(reporter)
+    observer = LinkObserver(link, inbox)
+    parts = _parts(link, setup, robot, inbox, reporter, observer)
+    history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
+    engine = LocalEngine(parts, setup.settings, history)
+    link.post("ready")
+    try:
+        with (
+            robot.delays.watched(reporter.warn, setup.settings.safety.starvation_s),
+            engine.commanding() as preferred,
+        ):
+            if not (realtime.lock_memory() and preferred):
+                reporter.info(_NO_REAL_TIME)
+            gc.disable()
+            while not inbox.orphaned:
+                order = inbox.order()
+                if order is None:
+                    _wait(link, inbox, engine)
+                elif order.kind == "close":
+                    return
+                else:
+                    _execute(link, inbox, engine, observer, order)
+    finally:
+        failures = [engine.stop(), engine.close()]
+        link.post("closed", failures=failures)
+        if inbox.orphaned:
+            _report_orphaned(engine, failures)
+
+
+def _report_orphaned(engine: Engine, failures: Sequence[str | None]) -> None:
+    """Print what became of the robot: there is no other process that could."""
+    trouble = "; ".join(text for text in (engine.stop_failure, *failures) if text)
+    with suppress(OSError):  # The terminal may be gone, too.
+        print(
+            "fluxvla: the main process was killed; the robot was stopped"
+            + (f": {trouble}" if trouble else ""),
+            file=sys.stderr,
+        )
+
+
+def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
+    """Hold the arm for a tick, or wait for an order."""
+    if not engine.holding:
+        time.sleep(_POLL_S)
+        return
+    try:
+        inbox.check()
+        engine.hold()
+    except (FluxError, Interrupted) as error:
+        engine.release()
+        link.post("released", **error_fields(error))
+
+
+def _execute(
+    link: Link, inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message
+) -> None:
+    orders: Mapping[str, Callable[[], object]] = {
+        "connect": engine.connect,
+        "rearm": engine.rearm,
+        "release": engine.release,
+        "stop": engine.stop,
+        "play": lambda: _play(inbox, engine, observer, order),
+    }
+    fields: dict[str, Any]
+    try:
+        fields = {"result": orders[order.kind]()}
+    except Interrupted as signal_:
+        fields = {"signal": signal_.number}
+    except BaseException as error:  # noqa: BLE001 - raised in the main process
+        fields = error_fields(error)
+    if order.kind == "play":
+        facts = dict(engine.episode_facts())
+        failure, holding = engine.stop_failure, engine.holding
+        fields |= {"facts": facts, "stop_failure": failure, "holding": holding}
+    link.post("done", order=order.kind, **fields)
+
+
+def _play(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
+    inbox.phase = Phase.START
+    try:
+        task = Task(order["task"], order["instruction"], order["free"])
+        engine.play(task, order["number"], order["seed"], (observer,), Path(order["folder"]))
+    finally:
+        inbox.phase = Phase.OVER
+        gc.collect()
+        if inbox.orphaned:
+            observer.write_rest(Path(order["folder"]))
+
+
+def _parts(
+    link: Link,
+    setup: ControlSetup,
+    robot: Robot,
+    inbox: Inbox,
+    reporter: Reporter,
+    observer: EpisodeObserver,
+) -> EpisodeParts:
+    patience_s = setup.settings.safety.first_chunk_s
+
+    def make_source(
+        task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
+    ) -> RemoteSource:
+        return RemoteSource(link, inbox, robot, patience_s)
+
+    def left_out(name: str) -> None:
+        observer.on_event(FilterLeftOut(robot.clock.now(), name))
+
+    made = setup.make_filters(reporter)
+    return EpisodeParts(
+        robot=robot,
+        source=make_source,
+        filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
+        joiner=make_joiner(*setup.joining),
+        execute=robot.play,
+        latch=Latch(robot.clock.now),
+        interrupts=inbox,
+        reporter=reporter,
+        one_by_one=True,
+    )
+
+
+def _take_signals(inbox: Inbox) -> None:
+    """Leave the terminal's signals to the main process; SIGTERM alone is for this one."""
+    for name in _IGNORED:
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, inbox.on_signal)

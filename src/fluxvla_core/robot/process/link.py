@@ -1,0 +1,90 @@
+"""``Link``: one end of the memory that the main process and the control process share.
+
+Two rings and two times. Each process stores the time at which it last ran; the other one sees
+from it that a process was stopped, killed, or kept from running.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from fluxvla_core.robot.process.messages import Array, Message, decode, encode
+from fluxvla_core.robot.process.ring import Ring
+
+TO_CONTROL_BYTES = 1024 * 1024
+"""Room for chunks and orders."""
+TO_MAIN_BYTES = 1024 * 1024
+"""Room for what happens: half a minute of commands."""
+_TIMES = 64
+SIZE = _TIMES + TO_CONTROL_BYTES + TO_MAIN_BYTES
+
+
+def make_memory() -> int:
+    """A file descriptor of memory for both ends; it is gone with the processes that have it."""
+    descriptor = os.memfd_create("fluxvla-robot")
+    os.ftruncate(descriptor, SIZE)
+    return descriptor
+
+
+class Link:
+    """One end; any thread may send, one thread receives.
+
+    Args:
+        descriptor: of ``make_memory``; remains open.
+        control: whether this is the control process's end.
+    """
+
+    def __init__(self, descriptor: int, control: bool) -> None:
+        memory = memoryview(mmap.mmap(descriptor, SIZE))
+        self._times = memory[:_TIMES].cast("Q")
+        middle = _TIMES + TO_CONTROL_BYTES
+        rings = Ring(memory[_TIMES:middle]), Ring(memory[middle:])
+        self._in, self._out = rings if control else rings[::-1]
+        self._own, self._other = (0, 1) if control else (1, 0)
+        self._lock = threading.Lock()
+        self._waiting: deque[bytes] = deque()
+
+    def send(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> bool:
+        """Send a message; False if there was no room for it, which never keeps the sender."""
+        self.beat()
+        data = encode(Message(kind, fields, arrays))
+        with self._lock:
+            return self._out.write(data)
+
+    def post(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> None:
+        """Send a message that must arrive: one that finds no room is sent again by ``flush``."""
+        self.beat()
+        with self._lock:
+            self._waiting.append(encode(Message(kind, fields, arrays)))
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what waits for room."""
+        with self._lock:
+            while self._waiting and self._out.fits(self._waiting[0]):
+                self._out.write(self._waiting.popleft())
+
+    def receive(self) -> Message | None:
+        """The oldest message that came; None if there is none."""
+        data = self._in.read()
+        return None if data is None else decode(data)
+
+    @property
+    def lost(self) -> int:
+        """How many messages of the other end found no room, of those that need not arrive."""
+        return self._in.dropped
+
+    def beat(self) -> None:
+        """Store that this process runs."""
+        self._times[self._own] = time.monotonic_ns()
+
+    def silent_s(self) -> float:
+        """For how many seconds the other process has not run; 0 before it ever did."""
+        last = self._times[self._other]
+        return (time.monotonic_ns() - last) * 1e-9 if last else 0.0

@@ -1,0 +1,51 @@
+"""Trainable parameters of a model, and their groups for weight decay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+from fluxvla_core.errors import ConfigError
+
+
+def trainable(model: nn.Module) -> dict[str, nn.Parameter]:
+    """Parameters that are trained, by name; a tied one once, under its first name."""
+    return {name: p for name, p in model.named_parameters() if p.requires_grad}
+
+
+def refuse_scalars(parameters: Mapping[str, nn.Parameter], runner: str, where: str | None) -> None:
+    """Refuse parameters without dimensions, for a strategy that cuts along one.
+
+    Raises:
+        ConfigError: names one of them.
+    """
+    for name, parameter in parameters.items():
+        if parameter.ndim == 0:
+            raise ConfigError(
+                f"{name} is a parameter without dimensions, which {runner} cannot split",
+                where=where,
+                cause="a parameter is split over the processes along a dimension",
+                next="give it one, as nn.Parameter(torch.ones(1)) has, or use DDPTrainRunner",
+            )
+
+
+def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Two groups: matrices with ``weight_decay``; biases, norms and other vectors without.
+
+    Raises:
+        ConfigError: nothing is trainable.
+    """
+    parameters = trainable(model)
+    if not parameters:
+        raise ConfigError(
+            "the model has no trainable parameter", cause="all of its parts are frozen"
+        )
+    decayed = {n: p for n, p in parameters.items() if p.ndim > 1 and not n.endswith("bias")}
+    rest = [p for n, p in parameters.items() if n not in decayed]
+    groups = [
+        {"params": list(decayed.values()), "weight_decay": weight_decay},
+        {"params": rest, "weight_decay": 0.0},
+    ]
+    return [group for group in groups if group["params"]]

@@ -1,0 +1,62 @@
+"""An operator may say of itself, as it is set, that it cannot be divided."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.robot.runner import BaseInferenceRunner
+from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+
+
+class Refusing(Operator):
+    """Has the methods, as ``URRTDEOperator`` without a gripper has them."""
+
+    api = "1.0"
+    embodiment = EmbodimentSpec("arm", (Joint("a", "rad", -1.0, 1.0, 2.0, 10.0),), (), 50.0)
+
+    def connect(self): ...
+
+    def get_frame(self):
+        return Frame(np.zeros(1), {}, {})
+
+    def send_action(self, action): ...
+
+    def stop(self): ...
+
+    def close(self): ...
+
+    def without_cameras(self):
+        return None
+
+    def without_commands(self):
+        return None
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    OPERATORS.register_module("Refusing")(Refusing)
+    yield
+    OPERATORS.unregister("Refusing")
+
+
+def runner(tmp_path, **arguments):
+    context = RunContext(section="inference", work_dir=tmp_path)
+    return BaseInferenceRunner(context=context, operator={"type": "Refusing"}, **arguments)
+
+
+def test_it_is_commanded_by_the_process_of_the_policy(tmp_path):
+    made = runner(tmp_path)
+
+    assert not made.divided
+    assert isinstance(made.ros_operator, Refusing)
+
+
+def test_to_ask_for_a_process_of_its_own_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="control_process is True, and Refusing, as it is set"):
+        runner(tmp_path, control_process=True)

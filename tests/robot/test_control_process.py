@@ -1,0 +1,161 @@
+"""When a process of its own commands a robot, and what is said where it cannot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from fluxvla_core import OPERATORS, BaseInferenceRunner, RunContext
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.operators import Camera, EmbodimentSpec, Frame, Joint, Operator
+from fluxvla_core.robot.control.clock import SimulatedClock
+from fluxvla_core.robot.recording.recorded import open_recording
+
+ARM = EmbodimentSpec("arm", (Joint("j", "rad", -1, 1, 2, 10),), (Camera("front", 8, 8),), 50)
+
+
+class Arm(Operator):
+    """An arm that cannot be divided."""
+
+    api = "1.0"
+    embodiment = ARM
+
+    def connect(self):
+        """Nothing to connect to."""
+
+    def get_frame(self):
+        return Frame(np.zeros(1), {"front": np.zeros((8, 8, 3), np.uint8)}, {})
+
+    def send_action(self, action):
+        """Goes nowhere."""
+
+    def stop(self):
+        """Is at rest."""
+
+    def close(self):
+        """Nothing to close."""
+
+
+class DividedArm(Arm):
+    def without_cameras(self):
+        return self
+
+    def without_commands(self):
+        return self
+
+
+class Simulated(DividedArm):
+    def __init__(self):
+        self.clock = SimulatedClock()
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    classes = [Arm, DividedArm, Simulated]
+    for cls in classes:
+        OPERATORS.register_module()(cls)
+    yield
+    for cls in classes:
+        OPERATORS.unregister(cls.__name__)
+
+
+def runner(tmp_path, operator, cls=BaseInferenceRunner, **arguments):
+    origins = {"inference.control_process": "here.py:3"}
+    context = RunContext(section="inference", work_dir=tmp_path, origins=origins)
+    return cls(context=context, operator=operator, **arguments)
+
+
+class OwnSending(BaseInferenceRunner):
+    def _execute_actions(self, actions, rate):
+        """As the specification's runners do."""
+
+
+class OwnObservation(BaseInferenceRunner):
+    def get_ros_observation(self):
+        return super().get_ros_observation()
+
+
+def test_an_operator_that_can_be_divided_is_divided(tmp_path):
+    assert runner(tmp_path, {"type": "DividedArm"}).divided
+    assert not runner(tmp_path, {"type": "DividedArm"}, control_process=False).divided
+
+
+def test_a_runner_that_only_observes_in_its_own_way_is_divided(tmp_path):
+    assert runner(tmp_path, {"type": "DividedArm"}, OwnObservation).divided
+
+
+def local_arm():
+    class Local(DividedArm):
+        pass
+
+    OPERATORS.register_module("Local", force=True)(Local)
+    return {"type": "Local"}
+
+
+@pytest.mark.parametrize(
+    ("operator", "cls", "why"),
+    [
+        ({"type": "Arm"}, BaseInferenceRunner, "Arm cannot be divided"),
+        (DividedArm(), BaseInferenceRunner, "DividedArm is an object, not a table"),
+        ({"type": "Simulated"}, BaseInferenceRunner, "stands still between commands"),
+        ({"type": "DividedArm"}, OwnSending, "OwnSending has an _execute_actions of its own"),
+        (local_arm, BaseInferenceRunner, "Local is defined where no other process can import it"),
+    ],
+)
+def test_why_a_robot_cannot_be_divided(tmp_path, operator, cls, why):
+    given: Mapping | Arm = operator() if operator is local_arm else operator
+
+    assert not runner(tmp_path, given, cls).divided
+    with pytest.raises(ConfigError, match=why) as caught:
+        runner(tmp_path, given, cls, control_process=True)
+    assert caught.value.where == "here.py:3: inference.control_process"
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        ({"limits": {1: 2.0}}, "operator.limits has a key that is not text: 1"),
+        ({"gains": [1.0, {"of": object()}]}, "operator.gains.1.of is an object"),
+    ],
+)
+def test_what_cannot_be_sent_to_another_process_is_named(tmp_path, more, why):
+    class Taking(DividedArm):
+        def __init__(self, **more):
+            """Takes anything."""
+
+    Taking.__qualname__ = "DividedArm"
+    OPERATORS.register_module("DividedArm", force=True)(Taking)
+
+    with pytest.raises(ConfigError, match=why):
+        runner(tmp_path, {"type": "DividedArm", **more}, control_process=True)
+
+
+def lines(path, events):
+    path.write_text("".join(json.dumps(event) + "\n" for event in events))
+
+
+def test_what_only_the_control_process_knew_completes_a_record(tmp_path):
+    start = {"event": "start", "t": 0.0, "format": "fluxvla-episode-1", "embodiment": ARM.to_dict()}
+    command = {"event": "command", "phase": "run", "wanted": [0.0]}
+    lines(tmp_path / "trace.jsonl", [start, {**command, "t": 0.1, "command": [0.1]}])
+    known = [{**command, "t": t / 10, "command": [t / 10]} for t in (1, 2, 3)]
+    end = {"event": "end", "t": 0.4, "outcome": "failed", "problem": "killed", "trips": []}
+    lines(tmp_path / "rest.jsonl", [*known, end])
+
+    recorded = open_recording(tmp_path)
+
+    assert recorded.whole
+    np.testing.assert_array_equal(recorded.commands()[0], [0.1, 0.2, 0.3])
+    assert recorded.summary()["problem"] == "killed"
+
+
+def test_a_record_that_is_whole_ignores_the_rest(tmp_path):
+    start = {"event": "start", "t": 0.0, "format": "fluxvla-episode-1", "embodiment": ARM.to_dict()}
+    end = {"event": "end", "t": 0.4, "outcome": "done", "problem": None, "trips": []}
+    lines(tmp_path / "trace.jsonl", [start, end])
+    lines(tmp_path / "rest.jsonl", [{**end, "t": 0.5, "outcome": "failed"}])
+
+    assert open_recording(tmp_path).summary()["outcome"] == "done"

@@ -1,0 +1,149 @@
+"""What goes wrong with ``fluxvla run`` and its control process, seen from the other side of DDS.
+
+What a fault is, and how it is provoked, is in ``benchmarks/_process_faults.py``; ``play`` holds
+every command that was received against the limits, and sees that no process is left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+
+import numpy as np
+import pytest
+
+from benchmarks._process_faults import (
+    END_S,
+    PREFIX,
+    PROCESS_FAULTS,
+    START_S,
+    play,
+    program,
+)
+from benchmarks._process_program import PROVOKED, SENT
+from benchmarks._robot_faults import GOES_ON, MOVING, NAMES, STOP, stage_crew
+
+pytestmark = pytest.mark.realtime
+OWN_ARM = """
+import benchmarks._process_program as program
+from fluxvla_core.plugins.registry import OPERATORS
+
+OPERATORS.unregister("ProgramArm")
+
+
+@OPERATORS.register_module()
+class ProgramArm(program.ProgramArm):
+    pass
+"""
+QUESTION = "task id or instruction (empty ends):"
+
+
+@pytest.fixture(scope="module")
+def stage(ros_domain):
+    with stage_crew() as make:
+        yield make
+
+
+def of(outcome):
+    faults = [fault for fault in PROCESS_FAULTS if fault.outcome == outcome]
+    return [pytest.param(fault, id=fault.name.removeprefix(PREFIX)) for fault in faults]
+
+
+def provoked(stage, folder, fault):
+    """A machine that stalls for a fifth of a second stops the arm, rightly, before the fault."""
+    for attempt in range(4):
+        result = play(stage(folder / str(attempt)), fault)
+        if result.provoked:
+            return result
+    pytest.fail(f"four times the run ended before the fault was there, at last: {result.said}")
+
+
+@pytest.mark.parametrize("fault", of(STOP))
+def test_the_arm_is_stopped_and_the_cause_is_named(stage, tmp_path, fault):
+    result = provoked(stage, tmp_path, fault)
+
+    assert fault.matches(result.said), f"{result.said!r} does not say {fault.says!r}"
+    assert result.exit_code == fault.exit_code
+    assert result.hold_s is not None
+    if fault.exit_code < 0:
+        # The control process may complete a record, of whatever it knows.
+        return
+    assert result.record["outcome"] == ("interrupted" if fault.interrupts else "failed")
+    rules = [trip["rule"] for trip in result.record["trips"]]
+    assert rules == ([] if fault.interrupts else [fault.rule])
+    assert fault.interrupts or result.record["problem"].strip() in result.said
+
+
+@pytest.mark.parametrize("fault", of(GOES_ON))
+def test_the_run_goes_on(stage, tmp_path, fault):
+    result = provoked(stage, tmp_path, fault)
+
+    assert (result.said, result.exit_code) == ("", 0)
+    assert (result.record["outcome"], result.record["trips"]) == ("max_steps", [])
+    assert len(result.commands) >= result.record["steps"]
+
+
+def test_a_signal_stops_the_arm_after_a_stop_that_was_rearmed(stage, tmp_path):
+    """What ended one episode says nothing of the next."""
+    made = stage(tmp_path)
+    with program(made, words=()) as running:
+
+        def asked():
+            return running.said.count(QUESTION) > answered
+
+        def moving():
+            return len(made.commands()) >= before + MOVING
+
+        for answered, line in enumerate(("1", "rearm", "1")):
+            running.wait_for(asked, "the question", START_S)
+            before = len(made.commands())
+            running.type(f"{line}\n")
+            if line == "1":
+                running.wait_for(moving, "the first command", START_S)
+                if answered == 0:
+                    running.order("fail")
+        running.type("\x03")
+        running.wait_for(lambda: False, "the end", END_S)
+    assert running.process.returncode == 130, running.said
+    assert "the policy raised ValueError: no answer" in running.said
+
+
+def test_a_paused_control_process_keeps_nobody_from_ending_the_run(stage, tmp_path):
+    """Before the first command nothing is urgent, until somebody presses Ctrl-C."""
+    made = stage(tmp_path)
+    with program(made) as running:
+        running.order("think")
+        running.wait_for((tmp_path / PROVOKED).exists, "the first question", START_S)
+        os.kill(running.control, signal.SIGSTOP)
+        running.type("\x03")
+        running.wait_for(lambda: False, "the end", END_S)
+        left = running.processes()
+    assert (running.process.returncode, left) == (1, []), running.said
+    assert re.search(r"the control process did not run for \d+\.\d s and was killed", running.said)
+    assert not made.commands()
+
+
+def test_the_record_of_a_paused_main_process_has_every_command(stage, tmp_path):
+    made = stage(tmp_path)
+    (fault,) = (f for f in PROCESS_FAULTS if "main process paused" in f.name)
+    result = play(made, fault)
+
+    (trace,) = (tmp_path / "inference").glob("*/trace.jsonl")
+    lines = [json.loads(line) for line in trace.read_text().splitlines()]
+    recorded = [line["command"] for line in lines if line["event"] == "command"]
+    sent = np.fromfile(tmp_path / SENT).reshape(-1, len(NAMES))
+    # After these, the operator's own stop.
+    assert len(recorded) >= result.record["steps"]
+    np.testing.assert_allclose(recorded, sent[: len(recorded)])
+    assert (sent[len(recorded) :] == recorded[-1]).all()
+
+
+def test_an_arm_of_a_plugin_file(stage, tmp_path):
+    """What another process imports is the file itself."""
+    made = stage(tmp_path)
+    with program(made, steps=MOVING, plugin=OWN_ARM) as running:
+        running.wait_for(lambda: False, "the end", START_S)
+    assert running.process.returncode == 0, running.said
+    assert len(made.commands()) >= MOVING

@@ -82,6 +82,9 @@ COMMANDS: Mapping[str, Entry] = {
 }
 """Name -> where the command is and its help line, so that only one is imported."""
 
+RESERVED = frozenset({*COMMANDS, *(name.partition(" ")[0] for name in COMMANDS), "help"})
+"""First words that always mean the core's; a plugin's is run as ``fluxvla distribution:name``."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The console script; returns the exit code and never raises.
@@ -227,9 +230,10 @@ def overview() -> str:
     }
     width = _width(list(COMMANDS))
     for name, providers in theirs.items():
-        origin = f"(from {', '.join(p.origin for p in providers)})"
-        about = read_help(providers[0]).partition(". ")[0].rstrip(".")
-        lines.append(f"  {name:{width}}  {about + ' ' if about else ''}{origin}")
+        for plugin in providers:
+            word = name if len(providers) == 1 and name not in RESERVED else f"{plugin.dist}:{name}"
+            about = read_help(plugin).partition(". ")[0].rstrip(".")
+            lines.append(f"  {word:{width}}  {about + ' ' if about else ''}(from {plugin.origin})")
     return "\n".join(lines)
 
 

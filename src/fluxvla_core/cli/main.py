@@ -56,7 +56,7 @@ COMMANDS: Mapping[str, Entry] = {
         "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
     ),
     "plugins doctor": Entry(
-        "fluxvla_core.cli.plugin_commands:Doctor", "look for broken and colliding installations"
+        "fluxvla_core.cli.doctor:Doctor", "look for what is wrong with the installation"
     ),
     "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
     "data validate": Entry(

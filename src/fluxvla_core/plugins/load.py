@@ -23,7 +23,7 @@ from fluxvla_core.errors import (
 )
 from fluxvla_core.plugins import _metadata, first_party
 from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
-from fluxvla_core.registries import PREFIX
+from fluxvla_core.registries import GROUPS, PREFIX
 
 LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
@@ -86,7 +86,10 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
     text = f"no {group} plugin named {name!r}"
     provider = first_party.owner(registry, short)
-    if provider:
+    unread = in_unread_group(short)
+    if unread:
+        text += f"; {unread}"
+    elif provider:
         text += f"; {provider} provides it and is not installed: pip install {provider}"
     else:
         near = nearest(short, [*installed, *first_party.names(registry)])
@@ -99,6 +102,21 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     if broken:
         text += f"\n  {len(broken)} installed distribution(s) could not be read: {DOCTOR}"
     return (f"{text}\n  installed: {', '.join(installed) or '(none)'}",)
+
+
+def in_unread_group(name: str) -> str:
+    """What to say of a plugin called ``name`` that stands in a group that nothing reads, or ""."""
+    for (group, found), providers in sorted(_metadata.index().plugins.items()):
+        if found == name and group not in GROUPS:
+            return unread_group(providers[0])
+    return ""
+
+
+def unread_group(plugin: Plugin) -> str:
+    """That nothing reads a plugin's group, and which one its author may have meant."""
+    meant = _metadata.intended_group(plugin.group)
+    hint = f"; did its author mean {meant!r}?" if meant else ""
+    return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"
 
 
 def unmet(plugin: Plugin) -> str | None:

@@ -51,6 +51,12 @@ COMMANDS: Mapping[str, Entry] = {
     "config check": Entry(
         "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
     ),
+    "config diff": Entry(
+        "fluxvla_core.cli.config_commands:Diff", "compare two configs, or runs, key by key"
+    ),
+    "config schema": Entry(
+        "fluxvla_core.cli.config_commands:Schema", "print a JSON Schema for editors"
+    ),
     "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
     "plugins show": Entry(
         "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"

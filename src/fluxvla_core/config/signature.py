@@ -195,7 +195,7 @@ def table_of(parameter: Parameter) -> Signature | None:
     if not typed and (not known or not _is_dataclass_source(source) or _init_of(source.node)):
         return None
     fields = _fields(order, _is_typed_dict if typed else _is_dataclass_source)
-    return Signature(source.node.name, source.place, fields)
+    return Signature(source.node.name, source.place, fields, documented=lambda: _meanings(order))
 
 
 def read_help(plugin: Plugin) -> str:

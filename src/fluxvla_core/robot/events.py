@@ -195,12 +195,27 @@ class HookObserver(EpisodeObserver):
                 self._hooks.call("observed", observation=_frozen(event.reading.observation))
                 latency = event.stages["policy"]
                 self._hooks.call("inferred", chunk=event.keyframes, latency_s=latency)
-            case CommandSent():
-                action = event.sent.command.copy()
-                action.flags.writeable = False
-                self._hooks.call("action_sent", action=action, stamp=event.at)
+            case CommandSent(at=at, sent=sent, state=state):
+                self._hooks.call(
+                    "action_sent",
+                    action=_kept(sent.command),
+                    stamp=at,
+                    target=_kept(sent.target),
+                    state=None if state is None else _kept(state),
+                )
+            case Stopped(at=at, rule=rule, problem=problem):
+                self._hooks.call("stopped", rule=rule, problem=problem, stamp=at)
+            case StoppedWhileHeld(at=at, trip=trip):
+                self._hooks.call("stopped", rule=trip.rule, problem=trip.what, stamp=at)
             case EpisodeEnded():
                 self._hooks.call("episode_finished", reason=event.problem or event.outcome)
+
+
+def _kept(array: Array) -> Array:
+    """A read-only copy: hooks see it when the loop may have gone on."""
+    copy = array.copy()
+    copy.flags.writeable = False
+    return copy
 
 
 def _frozen(observation: dict[str, Any]) -> dict[str, Any]:

@@ -98,7 +98,12 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "pip install 'fluxvla-metaworld[metaworld]'        "
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
+            ("plugins/fluxvla-latency/README.md", "pip install fluxvla-latency"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+            (
+                "plugins/fluxvla-rerun/README.md",
+                "pip install fluxvla-rerun        # with rerun-sdk, 170 MB",
+            ),
         ],
         EXAMPLE: [
             (

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 
 class Runner(Contract):
@@ -75,8 +76,11 @@ class Hook(Contract):
         """
         return 2.0
 
-    def run_started(self, context: Any) -> None:
-        """Once, when everything is built and the first unit of work begins."""
+    def run_started(self, context: Any, embodiment: EmbodimentSpec | None) -> None:
+        """Once, when everything is built and the first unit of work begins.
+
+        ``embodiment`` is the robot's; None in training.
+        """
 
     def run_finished(self, context: Any, outcome: str) -> None:
         """Once, always, also after an error; ``outcome``: ``ok``, ``interrupted`` or ``failed``."""
@@ -90,13 +94,18 @@ class Hook(Contract):
     def checkpoint_saved(self, context: Any, path: Path, step: int) -> None:
         """After a checkpoint directory has its final name."""
 
-    def episode_started(self, context: Any, task: str) -> None:
-        """When an episode on a robot begins, before its first observation."""
+    def episode_started(self, context: Any, task: str, stamp: float) -> None:
+        """When an episode on a robot begins, before its first observation.
 
-    def observed(self, context: Any, observation: Observation) -> None:
+        Every ``stamp`` is in seconds on the robot's clock.
+        """
+
+    def observed(self, context: Any, observation: Observation, stamp: float) -> None:
         """After each observation that a policy is asked with; its arrays are read-only."""
 
-    def inferred(self, context: Any, chunk: npt.NDArray[np.float64], latency_s: float) -> None:
+    def inferred(
+        self, context: Any, chunk: npt.NDArray[np.float64], latency_s: float, stamp: float
+    ) -> None:
         """After each answer of a policy: ``(T, D)`` physical units, read-only, and its duration."""
 
     def action_sent(
@@ -109,14 +118,14 @@ class Hook(Contract):
     ) -> None:
         """After each command, as it was sent: ``(D,)`` physical units; all arrays are read-only.
 
-        ``stamp`` is in seconds on the robot's clock, ``target`` the ``(D,)`` command before filters
-        and limits, ``state`` the ``(state_dim,)`` state if it was read for this command.
+        ``target`` is the ``(D,)`` command before filters and limits, ``state`` the ``(state_dim,)``
+        state if it was read for this command.
         """
 
     def stopped(self, context: Any, rule: str, problem: str, stamp: float) -> None:
         """After a safe stop before the task was over: the safety rule, and what it saw."""
 
-    def episode_finished(self, context: Any, reason: str) -> None:
+    def episode_finished(self, context: Any, reason: str, stamp: float) -> None:
         """After the safe stop that ends every episode; ``reason`` says what ended it."""
 
     @classmethod

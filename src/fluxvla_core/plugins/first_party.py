@@ -18,6 +18,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
+    "fluxvla-latency": {"hooks": ("LatencyLog",)},
     "fluxvla-libero": {
         "environments": ("LiberoEnvironment",),
         "policies": ("LiberoExpert",),
@@ -35,6 +36,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vlas": ("CompactVLA",),
     },
     "fluxvla-report": {"commands": ("report",)},
+    "fluxvla-rerun": {"hooks": ("RerunViewer",)},
     "fluxvla-sim": {
         "commands": ("collect", "sim"),
         "environments": ("AlohaSimEnvironment", "URSimEnvironment"),

@@ -286,7 +286,7 @@ class BaseInferenceRunner(Runner):
                 engine, self.latch, interrupts, thread,
             )  # fmt: skip
             try:
-                hooks.call("run_started")
+                hooks.call("run_started", embodiment=self.embodiment)
                 source.open()
                 engine.connect()
                 with engine.commanding():

@@ -71,7 +71,8 @@ class Robot:
                 f"{', '.join(moving)}; {NO_SPEEDS}",
                 next="describe them with Joint.base(name, unit, speed, acceleration), or leave "
                 "them out and drive the base by a method of the operator's own, as "
-                "AlohaOperator.drive does; a joint that is commanded by its position needs another name",
+                "AlohaOperator.drive does; a joint that is commanded by its position needs "
+                "another name",
             )
         lacks = missing_operator_methods(operator)
         self.complete = not lacks

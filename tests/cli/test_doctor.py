@@ -322,6 +322,13 @@ def test_a_misspelt_group_of_any_form(fluxvla: Fluxvla, install: Install, group:
     assert ended.code == 1
 
 
+def test_a_group_that_names_no_registry(fluxvla: Fluxvla, install: Install) -> None:
+    points = "[fluxvla]\nMisspelt = desk:Desk\n"
+    install("acme-desk", entry_points=points, files={"desk.py": DESK})
+    out = fluxvla("plugins", "doctor", "--no-import").out
+    assert "acme-desk 1.0: Misspelt is in 'fluxvla', which nothing reads" in told(out)
+
+
 def test_groups_of_others_are_theirs(install: Install) -> None:
     points = "".join(
         f"[{group}]\nX = x:X\n"

@@ -157,7 +157,7 @@ class AcmeArm:
         mode: Literal["fast", "slow"] = "fast", limits: tuple[float, float] = (-1.0, 1.0),
         names: "list[str] | None" = None, tags: dict[str, int] = {}, home: Optional[float] = None,
         gains: Gains | None = None, bounded: Annotated[int, "positive"] = 1, other: Odd = ODD,
-        many: tuple[int, ...] = (), context=None,
+        many: tuple[int, ...] = (), huge: float = 1e999, context=None,
     ): ...
     def get_frame(self): ...
 '''
@@ -208,6 +208,7 @@ def test_types_defaults_and_descriptions_come_from_the_source(arm: Tree) -> None
         "bounded": {"type": "integer", "default": 1},
         "other": {"description": "Default: ODD"},
         "many": {"type": "array", "items": {"type": "integer"}, "default": []},
+        "huge": {"type": "number", "description": "Default: 1e309"},
     }
 
 

@@ -185,3 +185,15 @@ def test_commands_of_one_name_and_commands_of_the_cores_names(
     assert "went" not in capsys.readouterr().out
     listed = [line.split()[0] for line in overview().splitlines() if "Go there" in line]
     assert listed == ["acme-go:config", "acme-go:go", "zeta-go:go"]
+
+
+def test_a_command_in_a_misspelt_group(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {"acme_go.py": COMMAND.format(dist="acme-go")}
+    install("acme-go", entry_points="[fluxvla_command]\ngo = acme_go:Go\n", files=files)
+    assert main(["go"]) == 2
+    assert capsys.readouterr().err.startswith(
+        "no command 'go'; acme-go 1.0: go is in 'fluxvla_command', which nothing reads; did its "
+        "author mean 'fluxvla.commands'?\n"
+    )

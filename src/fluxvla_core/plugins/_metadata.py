@@ -112,7 +112,12 @@ def _groups_of(text: str) -> set[str]:
     if PREFIX not in text and "vla" not in low and "flux" not in low:
         return set()
     named = re.findall(r"^[ \t]*\[(.*)\][ \t]*$", text.replace("\r", ""), re.MULTILINE)
-    return {g.strip() for g in named if g.strip().startswith(PREFIX) or intended_group(g)}
+    return {g for g in map(str.strip, named) if g.startswith(PREFIX) or _is_slip(g)}
+
+
+def _is_slip(group: str) -> bool:
+    """Whether a group outside ``fluxvla.`` was meant to be one of the core's."""
+    return group.lower() == PREFIX.rstrip(".") or intended_group(group) is not None
 
 
 @functools.cache
@@ -149,6 +154,8 @@ def index() -> Index:
             if not _wanted(key):
                 continue
             version, requires = about.version, tuple(about.requires or ())
+            if not version:
+                raise ValueError("its METADATA has no Version; reinstall it")
             versions[key] = version
             for point in about.entry_points:
                 if point.group in ours:

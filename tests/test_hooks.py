@@ -174,6 +174,19 @@ def test_a_pause_of_the_whole_process_is_no_hooks_fault(context, monkeypatch):
     assert sleeps.calls == 3
 
 
+def test_a_thread_that_cannot_be_started_is_no_error_of_the_run(context, monkeypatch):
+    def refuse(thread):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    caller = HookCaller(context, [("Counter", Counter())])
+    caller.call("after_step", step=1, metrics={"loss": 0.0})
+    assert context.reporter.warnings == [
+        "hook Counter.after_step raised RuntimeError: can't start new thread; Counter is left out "
+        "for the rest of this run"
+    ]
+
+
 def test_the_threads_end_with_the_run(context):
     caller = HookCaller(context, [("Ending", Counter())])
     caller.call("after_step", step=1, metrics={"loss": 0.0})
@@ -185,7 +198,7 @@ def test_the_threads_end_with_the_run(context):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("budget", [0, -1.0, float("nan"), "2", True])
+@pytest.mark.parametrize("budget", [0, -1.0, float("nan"), float("inf"), "2", True])
 def test_a_budget_that_is_none_is_refused_when_it_is_built(context, budget):
     with pytest.raises(ConfigError, match="hook Sleeps: budget_s must be a positive number"):
         HookCaller(context, [("Sleeps", Sleeps(budget_s=budget))])

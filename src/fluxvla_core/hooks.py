@@ -9,6 +9,7 @@ the motion that it watches. What it can still do is keep the interpreter's lock 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -96,7 +97,7 @@ class _Observer:
         self._manager, self._hooks = _manager(name, plugin)
         self._budget_s = Hook.adapt(plugin).budget_s
         number = isinstance(self._budget_s, (int, float)) and not isinstance(self._budget_s, bool)
-        if not number or not self._budget_s > 0:
+        if not number or not 0 < self._budget_s < math.inf:
             raise ConfigError(
                 f"hook {name}: budget_s must be a positive number, got {self._budget_s!r}"
             )
@@ -117,7 +118,11 @@ class _Observer:
             if self._thread is None:
                 target, name = self._call, f"hook-{self.name}"
                 self._thread = threading.Thread(target=target, name=name, daemon=True)
-                self._thread.start()
+                try:
+                    self._thread.start()
+                except RuntimeError as error:  # the system has no more of them
+                    self._problem = f"{hook} raised {type(error).__name__}: {error}"
+                    return
             self._waiting.append((time.monotonic(), hook, arguments))
             self._changed.notify_all()
 
@@ -128,6 +133,7 @@ class _Observer:
         """
         with self._changed:
             if self._problem or not self._waiting:
+                self._late_since = None
                 return self._problem
             now = time.monotonic()
             since, hook, _ = self._waiting[0]
@@ -145,7 +151,7 @@ class _Observer:
         """Wait until it has been called with all that it was told, for its budget at most."""
         with self._changed:
             done = lambda: not self._waiting or bool(self._problem)  # noqa: E731
-            if not self._changed.wait_for(done, self._budget_s):
+            if not self._changed.wait_for(done, min(self._budget_s, threading.TIMEOUT_MAX)):
                 since, hook, _ = self._waiting[0]
                 self._problem = self._slow(hook, time.monotonic() - since)
 

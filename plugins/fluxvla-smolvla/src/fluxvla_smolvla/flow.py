@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
-
 from fluxvla_models.guidance import Guide
+from torch import Tensor
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """``(B, T, D)`` at time t ``(B,)`` -> the velocity there, ``(B, T, D)``."""

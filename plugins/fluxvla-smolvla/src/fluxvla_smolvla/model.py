@@ -12,18 +12,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from fluxvla_models.guidance import Guide
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError, DataError
 from fluxvla_core.models import VLA
-from fluxvla_models.guidance import Guide
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
 from fluxvla_smolvla.flow import masked_mean, sample
-from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size
+from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
 from fluxvla_smolvla.transformer import ContextLayer, Memory, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
 
 LOSSES = ("valid", "all")
+SMOLVLM2 = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 BLACK = -1.0
 """What pictures are padded with, normalised."""
 
@@ -69,10 +70,10 @@ class SmolVLA(VLA, nn.Module):
 
     Args:
         vision, text: sizes of the vision tower and of the language model; SmolVLM2-500M's.
-        horizon: actions in a chunk.
+        n_action_steps: actions in a chunk.
         max_state_dim, max_action_dim: widths of states and actions, padded with zeros.
-        action_dim: dimensions of the robot's action: the loss leaves out the padding behind them;
-            None counts all.
+        ori_action_dim: dimensions of the robot's action; the loss leaves out the padding behind
+            them. None counts all.
         num_steps: Euler steps at inference.
         num_expert_layers: layers of the expert; as many as the language model's if None.
         self_attn_every_n_layers: see ``Expert``; 1 never crosses.
@@ -84,6 +85,8 @@ class SmolVLA(VLA, nn.Module):
         loss_mean: ``valid``, as LeRobot: the mean over the steps that are inside their episodes;
             ``all``: steps beyond the end count as 0, which several processes, each with its own
             share of a batch, compute exactly as one process does.
+        vlm_model_name: the backbone's name on the hub, which LeRobot looks up; for exports.
+        pretrained_name_or_path: weights that a training starts from, as ``runner.init_from``.
 
     Raises:
         ConfigError: sizes that do not go together.
@@ -93,10 +96,10 @@ class SmolVLA(VLA, nn.Module):
         self,
         vision: VisionSize | Mapping[str, Any] | None = None,
         text: TextSize | Mapping[str, Any] | None = None,
-        horizon: int = 50,
+        n_action_steps: int = 50,
         max_state_dim: int = 32,
         max_action_dim: int = 32,
-        action_dim: int | None = None,
+        ori_action_dim: int | None = None,
         num_steps: int = 10,
         num_expert_layers: int | None = None,
         self_attn_every_n_layers: int = 2,
@@ -107,16 +110,25 @@ class SmolVLA(VLA, nn.Module):
         train_expert_only: bool = True,
         train_state_proj: bool = True,
         loss_mean: str = "valid",
+        vlm_model_name: str = SMOLVLM2,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
-        seen = vision if isinstance(vision, VisionSize) else VisionSize(**(vision or {}))
-        read = text if isinstance(text, TextSize) else TextSize(**(text or {}))
+        seen, read = size_of(VisionSize, vision), size_of(TextSize, text)
         experts = read.layers if num_expert_layers is None else num_expert_layers
-        _check(horizon, max_action_dim, action_dim, num_steps, loss_mean, experts, read.layers)
-        self.horizon, self.num_steps, self.loss_mean = horizon, num_steps, loss_mean
+        _check_counts(n_action_steps, num_steps, experts, read.layers)
+        if ori_action_dim is not None and not 1 <= ori_action_dim <= max_action_dim:
+            raise ConfigError(
+                f"SmolVLA: ori_action_dim {ori_action_dim} is not in 1..{max_action_dim} "
+                "(max_action_dim)"
+            )
+        if loss_mean not in LOSSES:
+            raise ConfigError(f"SmolVLA: loss_mean {loss_mean!r} is not one of {', '.join(LOSSES)}")
+        self.n_action_steps, self.num_steps, self.loss_mean = n_action_steps, num_steps, loss_mean
         self.max_state_dim, self.max_action_dim = max_state_dim, max_action_dim
-        self.action_dim = max_action_dim if action_dim is None else action_dim
+        self.ori_action_dim = max_action_dim if ori_action_dim is None else ori_action_dim
         self.image_size, self.width = seen.image_size, read.hidden_size
+        self.pretrained_name_or_path = pretrained_name_or_path
         size = expert_size(read, experts, expert_width_multiplier)
         self.vision = VisionTower(seen)
         self.connector = Connector(seen, read.hidden_size)
@@ -157,14 +169,14 @@ class SmolVLA(VLA, nn.Module):
             DataError: an input of a width that the model does not have.
         """
         draws, shape = noise.shape[1], self.action_shape
-        _expect("actions", actions.shape[1:], "horizon and max_action_dim", shape)
-        _expect("noise", noise.shape[2:], "horizon and max_action_dim", shape)
+        _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
+        _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
         memory = self._memory(images, img_masks, lang_tokens, lang_masks, states).repeat(draws)
         t = (1.0 - time)[..., None, None]
         clean = actions[:, None]
         noisy, target = t * noise + (1.0 - t) * clean, noise - clean
         found = self._velocity(noisy.flatten(0, 1), t.flatten(), memory).unflatten(0, (-1, draws))
-        errors = (found.float() - target).square()[..., : self.action_dim]
+        errors = (found.float() - target).square()[..., : self.ori_action_dim]
         loss, each = masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
@@ -192,7 +204,7 @@ class SmolVLA(VLA, nn.Module):
         Raises:
             DataError: an input of a width that the model does not have.
         """
-        _expect("noise", noise.shape[1:], "horizon and max_action_dim", self.action_shape)
+        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
         memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
         guide = None
         if prev_actions is not None:
@@ -209,7 +221,7 @@ class SmolVLA(VLA, nn.Module):
     @property
     def action_shape(self) -> tuple[int, int]:
         """``(T, D)`` of a chunk, and of the noise that one starts from."""
-        return self.horizon, self.max_action_dim
+        return self.n_action_steps, self.max_action_dim
 
     def fsdp_units(self) -> list[nn.Module]:
         """The layers of the vision tower, of the language model and of the expert."""
@@ -260,7 +272,7 @@ class SmolVLA(VLA, nn.Module):
 
 
 def _initialize(module: nn.Module) -> None:
-    """Normal weights of 0.02, as SmolVLM2 begins; projections of states and actions keep torch's."""
+    """Normal weights of 0.02, as SmolVLM2 begins; states and actions are projected by torch's."""
     if isinstance(module, (Expert, LanguageModel, VisionTower, Connector)):
         for part in module.modules():
             if isinstance(part, (nn.Linear, nn.Embedding, nn.Conv2d)):
@@ -269,23 +281,11 @@ def _initialize(module: nn.Module) -> None:
                     nn.init.zeros_(part.bias)
 
 
-def _check(
-    horizon: int,
-    max_action_dim: int,
-    action_dim: int | None,
-    num_steps: int,
-    loss_mean: str,
-    experts: int,
-    layers: int,
-) -> None:
-    if min(horizon, num_steps) < 1:
-        raise ConfigError(f"SmolVLA: horizon {horizon} and num_steps {num_steps} must be positive")
-    if action_dim is not None and not 1 <= action_dim <= max_action_dim:
+def _check_counts(n_action_steps: int, num_steps: int, experts: int, layers: int) -> None:
+    if min(n_action_steps, num_steps) < 1:
         raise ConfigError(
-            f"SmolVLA: action_dim {action_dim} is not in 1..{max_action_dim} (max_action_dim)"
+            f"SmolVLA: n_action_steps {n_action_steps} and num_steps {num_steps} must be positive"
         )
-    if loss_mean not in LOSSES:
-        raise ConfigError(f"SmolVLA: loss_mean {loss_mean!r} is not one of {', '.join(LOSSES)}")
     if experts < 1 or layers % experts:
         raise ConfigError(
             f"SmolVLA: num_expert_layers {experts} does not divide the language model's {layers} "

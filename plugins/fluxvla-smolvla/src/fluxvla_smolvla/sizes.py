@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 from fluxvla_core.errors import ConfigError
 
@@ -63,6 +65,27 @@ class TextSize:
     def __post_init__(self) -> None:
         _divides("heads", self.heads, "kv_heads", self.kv_heads)
         _divides("head_dim", self.head_dim, "2", 2)
+
+
+Size = TypeVar("Size", VisionSize, TextSize)
+
+
+def size_of(kind: type[Size], given: Size | Mapping[str, Any] | None) -> Size:
+    """The size that a config's table describes; the default one where there is none.
+
+    Raises:
+        ConfigError: the table has a key that is not a field, or values that do not fit.
+    """
+    if isinstance(given, kind):
+        return given
+    table = dict(given or {})
+    known = [field.name for field in fields(kind)]
+    unknown = sorted(set(table) - set(known))
+    if unknown:
+        raise ConfigError(
+            f"SmolVLA: {kind.__name__} has no {unknown[0]!r}; it has {', '.join(known)}"
+        )
+    return kind(**table)
 
 
 def expert_size(text: TextSize, layers: int, width_multiplier: float) -> TextSize:

@@ -19,7 +19,7 @@ LONGEST_WAVE = 10_000.0
 
 @dataclass(frozen=True)
 class Rotation:
-    """Cosines and sines of the rotary angles at some positions, each ``(B, 1, L, head_dim / 2)``."""
+    """Cosines and sines of rotary angles at some positions, each ``(B, 1, L, head_dim / 2)``."""
 
     cos: Tensor
     sin: Tensor
@@ -158,8 +158,8 @@ class ContextLayer(Layer):
             last: nobody needs the next layer's tokens; they come back as they are.
 
         Returns:
-            ``(B, C, width)``, ``(B, 1, width)``, keys and values ``(B, kv_heads, C + 1, head_dim)``,
-            the state's behind the context's.
+            ``(B, C, width)``, ``(B, 1, width)``, and keys and values, the state's behind the
+            context's: ``(B, kv_heads, C + 1, head_dim)`` each.
         """
         attention = self.self_attn
         here, own = self.input_layernorm(context), self.input_layernorm(state)

@@ -30,17 +30,22 @@ BLACK = -1.0
 
 
 class LanguageModel(nn.Module):
-    """The first layers of SmolLM2; ``norm`` is kept for checkpoints, nothing uses it."""
+    """The first layers of SmolLM2; ``norm`` is kept for checkpoints, nothing uses it.
 
-    def __init__(self, size: TextSize) -> None:
+    Args:
+        size: of all layers.
+        deepest: number of the last layer whose keys and values are used.
+    """
+
+    def __init__(self, size: TextSize, deepest: int) -> None:
         super().__init__()
-        self.size = size
+        self.size, self.deepest = size, deepest
         self.embed_tokens = nn.Embedding(size.vocabulary, size.hidden_size)
         self.layers = nn.ModuleList(ContextLayer(size) for _ in range(size.layers))
         self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
 
     def forward(self, context: Tensor, seen: Tensor, state: Tensor) -> Memory:
-        """Keys and values of all layers.
+        """Keys and values of the layers up to the deepest.
 
         Args:
             context: ``(B, C, width)``; ``seen``: ``(B, C)`` bool, real ones.
@@ -54,8 +59,8 @@ class LanguageModel(nn.Module):
             state=Rotation.at(count[:, None], head_dim),
         )
         keys, values = [], []
-        for layer in self.layers:
-            last = layer is self.layers[-1]
+        for number, layer in enumerate(self.layers[: self.deepest + 1]):
+            last = number == self.deepest
             context, state, key, value = layer(context, state, prefix, last)
             keys.append(key)
             values.append(value)
@@ -132,12 +137,13 @@ class SmolVLA(VLA, nn.Module):
         size = expert_size(read, experts, expert_width_multiplier)
         self.vision = VisionTower(seen)
         self.connector = Connector(seen, read.hidden_size)
-        self.text = LanguageModel(read)
+        stride = read.layers // experts
+        self.text = LanguageModel(read, deepest=(experts - 1) * stride)
         # Of no use here; kept so that a checkpoint goes back to LeRobot as it came.
         self.lm_head = nn.Linear(read.hidden_size, read.vocabulary, bias=False)
         self.state_proj = nn.Linear(max_state_dim, read.hidden_size)
         self.embed_actions = ActionTimeMLP(max_action_dim, size.hidden_size, min_period, max_period)
-        self.expert = Expert(size, read.layers // experts, self_attn_every_n_layers)
+        self.expert = Expert(size, stride, self_attn_every_n_layers)
         self.action_out_proj = nn.Linear(size.hidden_size, max_action_dim)
         self.apply(_initialize)
         self._freeze(freeze_vision_encoder, train_expert_only, train_state_proj)
@@ -258,14 +264,13 @@ class SmolVLA(VLA, nn.Module):
     def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:
         """As LeRobot freezes: what no gradient reaches never trains either.
 
-        Of the language model's last layer only keys and values are used, and LeRobot trains none
-        of it; with fewer layers of the expert, nor of the one before.
+        Of the deepest layer that the expert attends to, only keys and values are used, and LeRobot
+        trains none of it.
         """
         frozen: list[nn.Module] = [self.lm_head, self.text.norm]
         frozen += [self.vision] if vision or expert_only else []
-        frozen += [self.connector, self.text] if expert_only else [self.text.layers[-1]]
-        if self.expert.stride > 1 and not expert_only:
-            frozen.append(self.text.layers[-2])
+        frozen += [self.connector, self.text] if expert_only else []
+        frozen += self.text.layers[self.text.deepest :]
         frozen += [] if state_proj else [self.state_proj]
         for module in frozen:
             module.requires_grad_(False)

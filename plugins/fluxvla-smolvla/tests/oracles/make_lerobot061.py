@@ -219,8 +219,8 @@ def main() -> None:
     train_once("expert", make_policy(), results)
     whole = make_policy(train_expert_only=False, freeze_vision_encoder=False)
     train_once("whole", whole, results)
-    selfish = make_policy(attention_mode="self_attn")
-    train_once("self", selfish, results)
+    sparse = make_policy(attention_mode="self_attn", num_expert_layers=2)
+    train_once("sparse", sparse, results)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         act(make_policy(empty_cameras=1).eval(), folder, results)

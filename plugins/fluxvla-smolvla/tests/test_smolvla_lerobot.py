@@ -10,7 +10,7 @@ import torch
 from fluxvla_smolvla.lerobot_format import LeRobotSmolVLA
 from safetensors.torch import load_file, save_file
 
-from fluxvla_core import Camera, EmbodimentSpec, Joint
+from fluxvla_core import Camera, Continuation, EmbodimentSpec, Joint
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
 from fluxvla_core.errors import CheckpointError, ConfigError
@@ -108,6 +108,18 @@ def test_it_acts_as_in_lerobot(source, tmp_path, tokenizer, golden, monkeypatch,
         expected = golden[f"act.{number}.actions"].double()
         assert chunk.shape == (HORIZON, ACTION)
         assert relative(torch.from_numpy(chunk), expected) < 1e-5
+
+
+def test_a_policy_continues_a_chunk(source, tmp_path, tokenizer):
+    policy = load_policy(imported(source, tmp_path / "ours", tokenizer))
+    policy.reset(0)
+    free = policy.predict_action(raw_observation(0))
+    rest = Continuation(actions=free + 0.1, weights=np.array([1, 1, 0.5, 0.2, 0, 0, 0]), frozen=2)
+    assert policy.continues
+    policy.reset(0)
+    kept = policy.continue_action(raw_observation(0), rest)
+    np.testing.assert_allclose(kept[:2], free[:2] + 0.1, atol=1e-5)
+    assert np.abs(kept[2] - free[2] - 0.1).mean() < np.abs(free[2] - free[2] - 0.1).mean()
 
 
 def test_observations_are_prepared_as_in_lerobot(source, tokenizer, golden):

@@ -17,7 +17,7 @@ from fluxvla_smolvla.normalization import SmolVLANormalize
 
 from fluxvla_core.errors import ConfigError, DataError
 
-from .tiny import HORIZON, SIZES, TEXT, VISION, WIDTH, model_batch, relative, tiny_model
+from .tiny import ACTION, HORIZON, SIZES, TEXT, VISION, WIDTH, model_batch, relative, tiny_model
 
 KEYS = json.loads((Path(__file__).parent / "keys" / "smolvla-lerobot061.json").read_text())
 ASKED = ("images", "img_masks", "lang_tokens", "lang_masks", "states")
@@ -126,10 +126,26 @@ def test_a_chunk_continues_another():
             prefix_len=torch.tensor([2, 2, 2]),
             max_guidance_weight=torch.full((3,), 5.0),
         )
-    assert torch.equal(kept[:, :2], old[:, :2])
-    gaps = [(chunk[:, 2:4] - old[:, 2:4]).abs().mean() for chunk in (kept, free)]
+    assert torch.equal(kept[:, :2, :ACTION], old[:, :2, :ACTION])
+    gaps = [(chunk - old)[:, 2:4, :ACTION].abs().mean() for chunk in (kept, free)]
     assert gaps[0] < 0.5 * gaps[1]
     assert all(p.grad is None for p in model.parameters())
+
+
+def test_what_padding_the_old_chunk_has_does_not_matter():
+    model, (batch, noise) = tiny_model(), asked()
+    guided = {
+        "prefix_weights": torch.ones(3, HORIZON),
+        "prefix_len": torch.tensor([1, 1, 1]),
+        "max_guidance_weight": torch.full((3,), 5.0),
+    }
+    found = []
+    for padding in (0.0, 100.0):
+        old = torch.full((3, HORIZON, WIDTH), padding)
+        old[..., :ACTION] = 0.5
+        with torch.no_grad():
+            found.append(model.predict_action(**batch, noise=noise, prev_actions=old, **guided))
+    assert torch.equal(*found)
 
 
 def test_units_to_shard_are_disjoint():

@@ -97,6 +97,8 @@ PARTS = {
 
 def on_two(work_dir):
     torch.distributed.init_process_group("gloo")
+    mixed = {"model": PARTS["language"], "enable_mixed_precision_training": True}
+    learn(work_dir / "bf16", "FSDPTrainRunner", batch=2, **mixed)
     for part, model in PARTS.items():
         for runner in ("DDPTrainRunner", "FSDPTrainRunner"):
             learn(work_dir / f"{part}-{runner}", runner, batch=2, model=model)
@@ -119,6 +121,13 @@ def test_two_processes_train_as_one_does(two, tmp_path, part, runner):
     assert ours.keys() == theirs.keys()
     worst = max(ours, key=lambda name: float((ours[name] - theirs[name]).abs().max()))
     assert float((ours[worst] - theirs[worst]).abs().max()) < 1e-5, worst
+
+
+def test_in_bf16_the_losses_are_about_the_same(two, tmp_path):
+    alone = losses(learn(tmp_path, model=PARTS["language"]))
+    found = losses(two / "bf16")
+    assert found != alone
+    np.testing.assert_allclose(found, alone, rtol=0.02)
 
 
 def test_a_training_resumes_bit_for_bit(tmp_path):

@@ -19,7 +19,9 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 def sample(velocity: Velocity, noise: Tensor, steps: int, guide: Guide | None = None) -> Tensor:
     """Integrate from ``noise`` ``(B, T, D)`` to actions by Euler's method.
 
-    With ``guide`` they continue an earlier chunk; that takes a backward pass for each step.
+    With ``guide`` they continue an earlier chunk; that takes a backward pass for each step. Its
+    chunk has the robot's own dimensions, at most D: those of the padding are not pulled, because a
+    loss that leaves them out says nothing of them.
     """
     x = noise
     for step in range(steps):
@@ -28,11 +30,26 @@ def sample(velocity: Velocity, noise: Tensor, steps: int, guide: Guide | None = 
         if guide is None:
             x = x - velocity(x, time) / steps
             continue
-        estimate = _Estimate(velocity, time)
-        found, pull = guide.pull(estimate, x, 1.0 - t)
-        # What the estimate of the clean chunk says of the velocity: (x - found) / t.
-        x = x + ((found - x) / t + pull) / steps
-    return x if guide is None else guide.freeze(x)
+        found, pull = _guided(velocity, x, time, step / steps, guide)
+        x = x + (pull - found) / steps
+    if guide is None:
+        return x
+    own = guide.actions.shape[-1]
+    return torch.cat([guide.freeze(x[..., :own]), x[..., own:]], dim=-1)
+
+
+def _guided(
+    velocity: Velocity, x: Tensor, time: Tensor, share: float, guide: Guide
+) -> tuple[Tensor, Tensor]:
+    """The velocity at ``x``, and how ``guide`` pulls after this ``share`` of the steps."""
+    found: list[Tensor] = []
+
+    def clean(x: Tensor) -> Tensor:
+        found.append(velocity(x, time))
+        return (x - time[:, None, None] * found[-1])[..., : guide.actions.shape[-1]]
+
+    _, pull = guide.pull(clean, x, share)
+    return found[-1].detach(), pull
 
 
 def masked_mean(errors: Tensor, masks: Tensor, over: str) -> tuple[Tensor, Tensor]:
@@ -49,13 +66,3 @@ def masked_mean(errors: Tensor, masks: Tensor, over: str) -> tuple[Tensor, Tenso
         return kept.mean(), kept.flatten(1).mean(1)
     each = masks.sum(1).to(errors.dtype) * errors.shape[1] * errors.shape[3]
     return kept.sum() / each.sum().clamp_min(1), kept.flatten(1).sum(1) / each.clamp_min(1)
-
-
-class _Estimate:
-    """``x`` -> the clean chunk that the velocity at ``x`` points to."""
-
-    def __init__(self, velocity: Velocity, time: Tensor) -> None:
-        self.velocity, self.time = velocity, time
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return x - self.time[:, None, None] * self.velocity(x, self.time)

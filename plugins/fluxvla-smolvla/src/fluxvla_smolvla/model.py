@@ -217,7 +217,8 @@ class SmolVLA(VLA, nn.Module):
             assert prefix_weights is not None
             assert prefix_len is not None
             assert max_guidance_weight is not None
-            guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+            own = prev_actions[..., : self.ori_action_dim]
+            guide = Guide(own, prefix_weights, prefix_len, max_guidance_weight)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
             return self._velocity(x, t, memory).to(x.dtype)

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core import Camera, Continuation, EmbodimentSpec, Joint
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
-from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.errors import CheckpointError, ConfigError, FluxError
 from fluxvla_core.models import load_policy
 from tests.oracles import fill
 
@@ -283,6 +283,40 @@ def test_a_base_model_without_statistics_can_be_trained_on_and_drives_nothing(so
     prepare = PrivateInferenceDataset(tuple(CAMERAS), found.transforms, found.statistics)
     with pytest.raises(ConfigError, match="the statistics have no entry 'proprio'"):
         prepare(raw_observation(0))
+
+
+def leaves(tree, path=()):
+    """Paths to everything in a JSON tree."""
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    for key, value in items:
+        yield (*path, key)
+        if isinstance(value, dict | list):
+            yield from leaves(value, (*path, key))
+
+
+WRONG = (None, -3, 1.5, "other", [], {}, [[]], {"a": 1}, True)
+
+
+@pytest.mark.parametrize(
+    "shift", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, len(WRONG)))]
+)
+def test_whatever_the_files_hold_is_read_or_refused(source, shift):
+    refused = 0
+    for file in ("config.json", f"{BEFORE}.json", "policy_postprocessor.json"):
+        text = (source / file).read_text()
+        for number, path in enumerate(leaves(json.loads(text))):
+            changed = json.loads(text)
+            place = changed
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = WRONG[(number + shift) % len(WRONG)]
+            (source / file).write_text(json.dumps(changed))
+            try:
+                LeRobotSmolVLA().read(source)
+            except FluxError:
+                refused += 1
+        (source / file).write_text(text)
+    assert refused > 20
 
 
 def test_what_is_not_smolvlas_is_not_recognized(tmp_path):

@@ -177,7 +177,10 @@ def test_a_third_of_the_layers_have_an_expert(layers, experts):
         ({"ori_action_dim": 40}, r"ori_action_dim 40 is not in 1..32 \(max_action_dim\)"),
         ({"num_expert_layers": 3}, "num_expert_layers 3 does not divide the language model's 4"),
         ({"num_expert_layers": 2}, "self_attn_every_n_layers 2 and 2 layers"),
-        ({"num_steps": 0}, "n_action_steps 7 and num_steps 0 must be positive"),
+        ({"num_steps": 0}, "num_steps 0 must be positive"),
+        ({"max_state_dim": -1}, "max_state_dim -1 must be positive"),
+        ({"expert_width_multiplier": 0.0}, "the expert is 0 wide .* expert_width_multiplier 0.0"),
+        ({"min_period": 5.0}, "min_period 5.0 and max_period 4.0 must be positive"),
         ({"loss_mean": "sum"}, "loss_mean 'sum' is not one of valid, all"),
     ],
 )

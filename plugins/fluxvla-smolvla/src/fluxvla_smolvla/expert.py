@@ -70,8 +70,11 @@ class ActionTimeMLP(nn.Module):
 
     def __init__(self, action_dim: int, width: int, shortest: float, longest: float) -> None:
         super().__init__()
-        if width % 2:
-            raise ConfigError(f"SmolVLA: the expert's width {width} is odd, sinusoids are in pairs")
+        if not 0 < shortest < longest:
+            raise ConfigError(
+                f"SmolVLA: min_period {shortest} and max_period {longest} must be positive, the "
+                "second one larger"
+            )
         self.shortest, self.longest = shortest, longest
         self.action_in_proj = nn.Linear(action_dim, width)
         self.action_time_mlp_in = nn.Linear(2 * width, width)

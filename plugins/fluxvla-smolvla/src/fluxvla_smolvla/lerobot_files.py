@@ -79,8 +79,7 @@ def read_processors(folder: Path) -> Processors | None:
     tokens: Mapping[str, Any] = {}
     for stem in (BEFORE, AFTER):
         where = str(folder / f"{stem}.json")
-        content = read_json(folder / f"{stem}.json", dict[str, Any], CheckpointError)
-        for step in content.get("steps", ()):
+        for step in _steps(folder / f"{stem}.json"):
             name, settings = step.get("registry_name"), step.get("config", {})
             if name in ("normalizer_processor", "unnormalizer_processor"):
                 norms |= norms_of(settings.get("norm_map", {}), where)
@@ -91,18 +90,20 @@ def read_processors(folder: Path) -> Processors | None:
                     )
                 statistics |= _stored_statistics(folder, step.get("state_file"), where)
             elif name == "rename_observations_processor":
-                renamed |= settings.get("rename_map", {})
+                renamed |= _texts(settings.get("rename_map", {}), "rename_map", where)
             elif name == "tokenizer_processor":
                 tokens = settings
-            elif name not in _IGNORED:
+            elif not isinstance(name, str) or name not in _IGNORED:
                 raise CheckpointError(
                     f"the step {name!r} of the processors is not known here",
                     where=where,
                     cause="it was added to LeRobot's own steps, or by a later version",
                 )
-    return Processors(
-        norms, statistics, renamed, tokens.get("max_length"), tokens.get("tokenizer_name")
-    )
+    length, tokenizer = tokens.get("max_length"), tokens.get("tokenizer_name")
+    for name, value, kind in (("max_length", length, int), ("tokenizer_name", tokenizer, str)):
+        if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
+            raise CheckpointError(f"{name} of the tokenizer's step is {value!r}", where=str(folder))
+    return Processors(norms, statistics, renamed, length, tokenizer)
 
 
 def buffered_statistics(tensors: Mapping[str, Stored]) -> Statistics:
@@ -131,7 +132,8 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
     Raises:
         CheckpointError: an unknown normalisation, or one of pictures.
     """
-    unknown = {kind: norm for kind, norm in mapping.items() if norm not in NORMS}
+    texts = _texts(mapping, "the mapping of normalisations", where)
+    unknown = {kind: norm for kind, norm in texts.items() if norm not in NORMS}
     if unknown:
         kind, norm = next(iter(unknown.items()))
         raise CheckpointError(
@@ -144,6 +146,22 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
             where=where,
         )
     return {kind: NORMS[norm] for kind, norm in mapping.items() if kind in ("STATE", "ACTION")}
+
+
+def _steps(path: Path) -> list[dict[str, Any]]:
+    content = read_json(path, dict[str, Any], CheckpointError)
+    steps = content.get("steps")
+    if not isinstance(steps, list) or not all(
+        isinstance(step, dict) and isinstance(step.get("config", {}), dict) for step in steps
+    ):
+        raise CheckpointError("steps is no list of steps with a config", where=str(path))
+    return steps
+
+
+def _texts(table: Any, what: str, where: str) -> dict[str, str]:
+    if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
+        raise CheckpointError(f"{what} is no table of names: {table!r}", where=where)
+    return table
 
 
 def _stored_statistics(folder: Path, file: Any, where: str) -> Statistics:

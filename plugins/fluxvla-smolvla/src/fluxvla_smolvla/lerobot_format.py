@@ -150,7 +150,7 @@ class Settings:
     def check_size(self, image_size: int, layers: int) -> None:
         """Compare with the weights what the config says of them."""
         resized = self.content.get("resize_imgs_with_padding", [512, 512])
-        if resized is None or list(resized) != [image_size, image_size]:
+        if resized != [image_size, image_size]:
             raise CheckpointError(
                 f"resize_imgs_with_padding is {resized}, the vision tower is for "
                 f"{[image_size, image_size]}",
@@ -165,6 +165,9 @@ class Settings:
     def cameras(self, robot_keys: Mapping[str, str]) -> tuple[tuple[str, ...], int]:
         """Names of the cameras in the model's order, and how many are always empty."""
         features = self.table("input_features")
+        for key, value in features.items():
+            if not isinstance(value, dict):
+                raise self._wrong(f"input_features.{key}", value, "a table")
         keys = [key for key, value in features.items() if value.get("type") == "VISUAL"]
         real = [key for key in keys if not _EMPTY.search(key)]
         if not real:
@@ -231,8 +234,13 @@ class Settings:
         )
 
     def _action_dim(self) -> int | None:
-        shape = self.table("output_features").get("action", {}).get("shape")
-        return int(shape[0]) if isinstance(shape, list) and len(shape) == 1 else None
+        feature = self.table("output_features").get(files.ACTION, {})
+        shape = feature.get("shape") if isinstance(feature, dict) else feature
+        if shape is None:
+            return None
+        if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
+            raise self._wrong("output_features.action.shape", shape, "one whole number")
+        return shape[0]
 
     def _wrong(self, name: str, value: Any, expected: str) -> CheckpointError:
         return CheckpointError(f"{name} is {value!r}, {expected} is expected", where=self.where)

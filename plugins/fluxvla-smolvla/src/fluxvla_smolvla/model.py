@@ -121,7 +121,14 @@ class SmolVLA(VLA, nn.Module):
         super().__init__()
         seen, read = size_of(VisionSize, vision), size_of(TextSize, text)
         experts = read.layers if num_expert_layers is None else num_expert_layers
-        _check_counts(n_action_steps, num_steps, experts, read.layers)
+        _check_counts(
+            experts,
+            read.layers,
+            n_action_steps=n_action_steps,
+            num_steps=num_steps,
+            max_state_dim=max_state_dim,
+            max_action_dim=max_action_dim,
+        )
         if ori_action_dim is not None and not 1 <= ori_action_dim <= max_action_dim:
             raise ConfigError(
                 f"SmolVLA: ori_action_dim {ori_action_dim} is not in 1..{max_action_dim} "
@@ -260,7 +267,11 @@ class SmolVLA(VLA, nn.Module):
         return self.connector(self.vision(whole))
 
     def _velocity(self, noisy: Tensor, t: Tensor, memory: Memory) -> Tensor:
-        return self.action_out_proj(self.expert(self.embed_actions(noisy, t), memory))
+        hidden = self.expert(self.embed_actions(noisy, t), memory)
+        out = self.action_out_proj
+        # The velocity is summed over the steps: it is computed in fp32 whatever the weights are in.
+        with torch.autocast(hidden.device.type, enabled=False):
+            return nn.functional.linear(hidden.float(), out.weight.float(), out.bias.float())
 
     def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:
         """As LeRobot freezes: what no gradient reaches never trains either.
@@ -287,11 +298,10 @@ def _initialize(module: nn.Module) -> None:
                     nn.init.zeros_(part.bias)
 
 
-def _check_counts(n_action_steps: int, num_steps: int, experts: int, layers: int) -> None:
-    if min(n_action_steps, num_steps) < 1:
-        raise ConfigError(
-            f"SmolVLA: n_action_steps {n_action_steps} and num_steps {num_steps} must be positive"
-        )
+def _check_counts(experts: int, layers: int, **counts: int) -> None:
+    for name, count in counts.items():
+        if count < 1:
+            raise ConfigError(f"SmolVLA: {name} {count} must be positive")
     if experts < 1 or layers % experts:
         raise ConfigError(
             f"SmolVLA: num_expert_layers {experts} does not divide the language model's {layers} "

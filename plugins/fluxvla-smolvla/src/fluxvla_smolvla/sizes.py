@@ -94,6 +94,12 @@ def expert_size(text: TextSize, layers: int, width_multiplier: float) -> TextSiz
     The MLP has 4/3 * 2 of the width, rounded up to 256, as Llama sizes it.
     """
     width = int(text.hidden_size * width_multiplier)
+    if width < 2 or width % 2:
+        raise ConfigError(
+            f"SmolVLA: the expert is {width} wide (hidden_size {text.hidden_size} times "
+            f"expert_width_multiplier {width_multiplier}), an even width is needed for sines in "
+            "pairs with cosines"
+        )
     inner = 4 * int(2 * width / 3)
     return TextSize(
         hidden_size=width,

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fluxvla_models.guidance import Guide
-from fluxvla_smolvla.flow import sample
 from fluxvla_smolvla.images import SmolVLAImages
 from fluxvla_smolvla.keys import published_names
 from fluxvla_smolvla.model import SmolVLA
@@ -75,41 +73,6 @@ def test_padding_under_the_masks_does_not_matter():
     with torch.no_grad():
         found = [model.predict_action(**b, noise=noise) for b in (batch, other)]
     assert torch.equal(*found)
-
-
-def test_guided_sampling_is_the_papers_algorithm():
-    """Against Black, Galliker and Levine 2025 (arXiv 2506.07339), with a Jacobian of its own."""
-    rows, width, steps, beta = 3, 2, 4, 5.0
-    rng = np.random.default_rng(0)
-    mix = torch.tensor(rng.normal(size=(rows * width, rows * width)) / 3)
-    noise, old = (torch.tensor(rng.normal(size=(1, rows, width))) for _ in range(2))
-    weights = torch.tensor([[1.0, 0.6, 0.0]], dtype=torch.float64)
-
-    def velocity(x, t):
-        return (torch.tanh(x.flatten(1) @ mix) * (1 + t.double()[:, None])).view_as(x)
-
-    guide = Guide(old, weights, torch.tensor([1]), torch.tensor([beta], dtype=torch.float64))
-    found = sample(velocity, noise, steps, guide)
-
-    a = noise
-    for step in range(steps):
-        tau = step / steps
-        t = torch.tensor([1 - tau])
-
-        def clean(x, t=t):
-            return x - t.double() * velocity(x, t)
-
-        jacobian = torch.autograd.functional.jacobian(clean, a).reshape(rows * width, -1)
-        error = ((old - clean(a)) * weights[..., None]).flatten()
-        r2 = (1 - tau) ** 2 / (tau**2 + (1 - tau) ** 2)
-        weight = beta if tau == 0 else min(beta, (1 - tau) / (tau * r2))
-        a = a + (-velocity(a, t) + weight * (error @ jacobian).view_as(a)) / steps
-    a[:, :1] = old[:, :1]
-    torch.testing.assert_close(found, a, rtol=1e-6, atol=1e-6)
-    plain = sample(velocity, noise, steps)
-    nothing = Guide(old, torch.zeros_like(weights), torch.tensor([0]), guide.most)
-    torch.testing.assert_close(sample(velocity, noise, steps, nothing), plain, rtol=1e-9, atol=1e-9)
-    assert (found - plain).abs().max() > 0.05
 
 
 def test_a_chunk_continues_another():

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
+from fluxvla_models.velocity import sinusoids
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -54,15 +53,6 @@ class Expert(nn.Module):
             place = number * self.stride
             x = layer(x, memory.keys[place], memory.values[place], memory.seen, suffix)
         return self.norm(x)
-
-
-def sinusoids(time: Tensor, width: int, shortest: float, longest: float) -> Tensor:
-    """``(B,)`` -> ``(B, width)`` float64: sines, then cosines, of ``time`` at ``width / 2`` periods
-    from ``shortest`` to ``longest``, spaced evenly on a logarithmic scale."""
-    share = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=time.device)
-    periods = shortest * (longest / shortest) ** share
-    angles = 1.0 / periods * 2 * math.pi * time[:, None]
-    return torch.cat([angles.sin(), angles.cos()], dim=1)
 
 
 class ActionTimeMLP(nn.Module):

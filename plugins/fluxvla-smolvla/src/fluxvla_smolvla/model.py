@@ -13,12 +13,13 @@ from typing import Any
 
 import torch
 from fluxvla_models.guidance import Guide
+from fluxvla_models.velocity import sample
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError, DataError
 from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
-from fluxvla_smolvla.flow import masked_mean, sample
+from fluxvla_smolvla.loss import masked_mean
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
 from fluxvla_smolvla.transformer import ContextLayer, Memory, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad

@@ -1,16 +1,19 @@
-"""Flow matching from noise at t = 1 to actions at t = 0, as pi0 and SmolVLA count time.
+"""Flow matching from noise at t = 1 to actions at t = 0 by a network that predicts the velocity.
 
-The path is ``x_t = t * noise + (1 - t) * actions``, its velocity ``noise - actions`` (Lipman et al.
-2023). Elsewhere in FluxVLA time runs the other way; a batch's ``time`` is ``1 - t``.
+pi0 and SmolVLA count time so: the path is ``x_t = t * noise + (1 - t) * actions``, its velocity
+``noise - actions`` (Lipman et al. 2023). Elsewhere in FluxVLA time runs the other way; a batch's
+``time`` is ``1 - t``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
-from fluxvla_models.guidance import Guide
 from torch import Tensor
+
+from fluxvla_models.guidance import Guide
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """``(B, T, D)`` at time t ``(B,)`` -> the velocity there, ``(B, T, D)``."""
@@ -52,17 +55,10 @@ def _guided(
     return found[-1].detach(), pull
 
 
-def masked_mean(errors: Tensor, masks: Tensor, over: str) -> tuple[Tensor, Tensor]:
-    """The loss of a batch, and that of each sample, ``(B,)``.
-
-    Args:
-        errors: ``(B, K, T, D)``.
-        masks: ``(B, T)``, 0 beyond the end of an episode.
-        over: ``valid``: the mean over steps inside episodes; ``all``: the others count as 0, so
-            that the gradient does not depend on which samples share a batch.
-    """
-    kept = errors * masks[:, None, :, None]
-    if over == "all":
-        return kept.mean(), kept.flatten(1).mean(1)
-    each = masks.sum(1).to(errors.dtype) * errors.shape[1] * errors.shape[3]
-    return kept.sum() / each.sum().clamp_min(1), kept.flatten(1).sum(1) / each.clamp_min(1)
+def sinusoids(time: Tensor, width: int, shortest: float, longest: float) -> Tensor:
+    """``(B,)`` -> ``(B, width)`` float64: sines, then cosines, of ``time`` at ``width / 2`` periods
+    from ``shortest`` to ``longest``, spaced evenly on a logarithmic scale."""
+    share = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=time.device)
+    periods = shortest * (longest / shortest) ** share
+    angles = 1.0 / periods * 2 * math.pi * time[:, None]
+    return torch.cat([angles.sin(), angles.cos()], dim=1)

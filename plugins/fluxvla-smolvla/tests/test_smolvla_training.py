@@ -8,13 +8,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from fluxvla_smolvla.keys import published
 
 from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import checkpoint_differences, run_ranks
 
-from .tiny import ACTION, HORIZON, SIZES, STATE, WIDTH
+from .tiny import ACTION, HORIZON, SIZES, STATE, WIDTH, lerobot_folder, published_weights
 
 KEYS = [
     "images",
@@ -87,6 +88,16 @@ def losses(work_dir):
 def test_the_loss_falls_with_the_expert_alone(tmp_path):
     found = losses(learn(tmp_path, max_steps=80, batch=5, learning_rate=1e-3))
     assert np.mean(found[-5:]) < 0.3 * np.mean(found[:5])
+
+
+def test_a_training_starts_from_lerobots_folder(tmp_path):
+    source = lerobot_folder(tmp_path / "theirs")
+    model = {"pretrained_name_or_path": str(source), "n_action_steps": HORIZON, "num_steps": 2}
+    learn(tmp_path / "run", model=model, max_steps=1, learning_rate=1e-9)
+    found = latest(tmp_path / "run").tensors("model.safetensors")
+    ours = {published(name): tensor for name, tensor in found.items()}
+    for name, tensor in published_weights().items():
+        torch.testing.assert_close(ours[name], tensor, rtol=0, atol=1e-8)
 
 
 PARTS = {

@@ -259,7 +259,7 @@ class SmolVLA(VLA, nn.Module):
         context = torch.cat([pictures.flatten(1, 2), words.to(pictures.dtype)], dim=1)
         seen = torch.cat([shown.flatten(1), masks.bool()], dim=1)
         state = self.state_proj(states)[:, None]
-        # As wide as its features, a token has a length of about 1: Gemma's scaling, as in pi0.
+        # LeRobot scales pictures and words by the root of their width, but not the state.
         return self.text(context * self.width**0.5, seen, state)
 
     def _look(self, pictures: Tensor) -> Tensor:

@@ -54,6 +54,7 @@ CLUSTER = "needs several machines, or a scheduler"
 NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
+HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 NOT_RUN: dict[tuple[str, str], str] = {
@@ -99,6 +100,17 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
+            ),
+        ],
+        HUB: [
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_smolvla policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 30 \\",
+            ),
         ],
         EXAMPLE: [
             (

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 import torch
 
-_SPEC = importlib.util.spec_from_file_location("openvla_tiny", Path(__file__).parent / "tiny.py")
-tiny = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(tiny)
+from . import tiny
 
 OFT = ("oft", "film", "diffusion")
 RELATIVE = 1e-5
@@ -61,8 +56,13 @@ def test_oft_learns_as_the_authors_code(name):
         check_gradients(model, golden)
         return
     # Here its gradients are named as in the file of its vision backbone.
-    check_gradients(model, golden, lambda name: tiny.film_published(name).replace(
-        "vision_backbone.vision_backbone.", "vision_backbone."))
+    check_gradients(
+        model,
+        golden,
+        lambda name: tiny.film_published(name).replace(
+            "vision_backbone.vision_backbone.", "vision_backbone."
+        ),
+    )
 
 
 @pytest.mark.parametrize("name", OFT)

@@ -56,6 +56,11 @@ def film_name(name: str) -> str:
     return re.sub(r"\.blocks\.(\d+)\.block\.", r".blocks.\1.", plain)
 
 
+def published_film_name(name: str) -> str:
+    """The inverse of ``film_name``."""
+    return re.sub(r"\.blocks\.(\d+)\.(?!scale\.|shift\.)", r".blocks.\1.block.", name)
+
+
 def is_buffer(name: str) -> bool:
     """Whether a published tensor follows from the sizes: old files hold rotary frequencies."""
     return name.endswith(".rotary_emb.inv_freq")

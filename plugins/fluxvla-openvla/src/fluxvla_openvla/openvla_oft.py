@@ -44,6 +44,8 @@ class OpenVLAOFT(Prismatic):
         image_size: pixels of a picture's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         num_train_steps, num_inference_steps: of the diffusion, in training and acting.
+        pretrained_name_or_path: a folder that a training starts from, as published or of FluxVLA;
+            ``fluxvla openvla-oft`` makes one of OpenVLA's.
 
     Raises:
         ConfigError: sizes that do not fit together, or an unknown head.
@@ -63,6 +65,7 @@ class OpenVLAOFT(Prismatic):
         language: Mapping[str, Any] | LanguageSize | None = None,
         num_train_steps: int = 50,
         num_inference_steps: int = 50,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         if head not in HEADS:
             raise ConfigError(f"OpenVLAOFT: head {head!r} is not one of {', '.join(HEADS)}")
@@ -74,6 +77,7 @@ class OpenVLAOFT(Prismatic):
         super().__init__(
             horizon, action_dim, num_images, image_size, dino, siglip, language, use_film
         )
+        self.pretrained_name_or_path = pretrained_name_or_path
         width = self.size.hidden_size
         self.state_dim, self.head = state_dim, head
         self.num_train_steps, self.num_inference_steps = num_train_steps, num_inference_steps

@@ -9,6 +9,7 @@ each repository:
     git clone https://github.com/moojink/transformers-openvla-oft   (bc339d9)
 
     PYTHONPATH=. python plugins/fluxvla-openvla/tests/oracles/make_openvla.py openvla openvla
+    (the same with processor instead of openvla)
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py oft openvla-oft
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py film openvla-oft
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py diffusion openvla-oft
@@ -43,6 +44,7 @@ LLAMA = {
     "pad_token_id": 32000,
 }
 IMAGE, PATCHES = 28, 4
+PARTS = ("openvla", "oft", "film", "diffusion", "processor")
 LENGTHS = (9, 6)
 GRADIENTS = {
     "openvla": (
@@ -62,7 +64,7 @@ GRADIENTS = {
 def main() -> None:
     """Write one golden file."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("which", choices=("openvla", "oft", "film", "diffusion", "names"))
+    parser.add_argument("which", choices=(*PARTS, "names"))
     parser.add_argument("repository", type=Path)
     options = parser.parse_args()
     sys.argv = sys.argv[:1]
@@ -72,8 +74,7 @@ def main() -> None:
     if options.which == "names":
         _write_names()
         return
-    parts = {"openvla": openvla, "oft": oft, "film": film, "diffusion": diffusion}
-    arrays = parts[options.which]()
+    arrays = globals()[options.which]()
     import timm
     import transformers
 
@@ -140,6 +141,23 @@ def film() -> dict[str, np.ndarray]:
 def diffusion() -> dict[str, np.ndarray]:
     """The same with the diffusion head, in 50 and in 10 steps."""
     return _oft(film=False, diffuse=True)
+
+
+def processor() -> dict[str, np.ndarray]:
+    """A picture through the published processor, to 28 pixels instead of 224."""
+    from PIL import Image
+    from prismatic.extern.hf.processing_prismatic import PrismaticImageProcessor
+
+    made = PrismaticImageProcessor(
+        use_fused_vision_backbone=True,
+        image_resize_strategy="resize-naive",
+        input_sizes=[(3, IMAGE, IMAGE)] * 2,
+        interpolations=["bicubic"] * 2,
+        means=[(0.485, 0.456, 0.406), (0.5, 0.5, 0.5)],
+        stds=[(0.229, 0.224, 0.225), (0.5, 0.5, 0.5)],
+    )
+    picture = Image.fromarray(fill.integers("picture", (48, 64, 3), 256).astype(np.uint8))
+    return {"pixel_values": made.apply_transform(picture).numpy()}
 
 
 def _oft(film: bool, diffuse: bool) -> dict[str, np.ndarray]:

@@ -95,6 +95,7 @@ class OpenVLAFormat(CheckpointFormat):
                 gripper=platform.gripper if platform is not None else None,
                 crop=bool(sidecar.get("center_crop", fine_tuned)),
                 resize="lanczos" if fine_tuned else "bicubic",
+                size=int(model.get("image_size", 224)),
             ),
             statistics=chosen,
             horizon=int(model.get("horizon", 1)),
@@ -154,9 +155,11 @@ def transforms(
     gripper: str | None,
     crop: bool,
     resize: str,
+    size: int,
 ) -> list[dict[str, Any]]:
     """Tables of the transforms from an observation to a batch."""
-    found: list[dict[str, Any]] = [{"type": "ResizeOpenVLAImages", "interpolation": resize}]
+    first = {"type": "ResizeOpenVLAImages", "size": size, "interpolation": resize}
+    found: list[dict[str, Any]] = [first]
     if crop:
         found.append({"type": "CenterCropOpenVLAImages"})
     normalize = {"type": "NormalizeOpenVLA", "bounds": bounds, "states": states}

@@ -121,7 +121,7 @@ class DenormalizeOpenVLA(Transform):
         self._row.check("the model's actions", action)
         physical = self._row.inverse(action)
         if self.gripper:
-            physical[..., -1] = -np.sign(2 * physical[..., -1] - 1)
+            physical[..., -1] = np.where(physical[..., -1] > 0.5, -1.0, 1.0)
         return physical
 
 

@@ -89,6 +89,6 @@ def read_size(table: Mapping[str, Any] | Size | None, default: Size, where: str)
         number = isinstance(value, int | float) and not isinstance(value, bool)
         fits = isinstance(value, bool) if kind is bool else number and value == kind(value)
         if not fits or value < 0:
-            raise ConfigError(f"{where}.{key} must be a {kind.__name__}, got {value!r}")
+            raise ConfigError(f"{where}.{key} must be of type {kind.__name__}, got {value!r}")
         values[key] = kind(value)
     return type(default)(**values)

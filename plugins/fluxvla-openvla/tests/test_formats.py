@@ -112,6 +112,12 @@ def test_oft_is_written_back_bit_for_bit(tmp_path, settings):
     first, second = (tensors_of(p / "model.safetensors") for p in (tmp_path / "ours", again))
     assert first.keys() == second.keys()
     assert all(torch.equal(first[name], second[name]) for name in first)
+    before, after = (
+        OpenVLAFormat().read(tmp_path / place, "tokenizer") for place in ("theirs", "back")
+    )
+    assert after.transforms == before.transforms
+    assert (after.img_keys, after.horizon) == (before.img_keys, before.horizon)
+    assert after.action_rate_hz == before.action_rate_hz
 
 
 def test_the_native_layout_is_read(tmp_path):
@@ -182,6 +188,8 @@ def damage(folder, what):
         change(folder, "fluxvla_openvla.json", unormkey="x")
     elif what == "towers":
         change(folder, "config.json", vision_backbone_id="siglip-vit-so400m")
+    elif what == "bins":
+        change(folder, "config.json", n_action_bins=512)
     elif what == "statistics":
         (folder / "dataset_statistics.json").unlink()
     elif what == "tokenizer":
@@ -209,6 +217,7 @@ class Evil:
         ("unnorm_key", "'berkeley' is not in the statistics; they have libero_spatial_no_noops"),
         ("unknown key", "unknown key 'unormkey'; known are unnorm_key"),
         ("towers", "vision_backbone_id is 'siglip-vit-so400m'"),
+        ("bins", "n_action_bins is 512; only 256 is built here"),
         ("statistics", "there are no statistics of actions"),
         ("tokenizer", "the folder has no tokenizer.json"),
         ("two heads", "several files of action_head: action_head--150000_checkpoint.pt, action"),

@@ -161,6 +161,13 @@ def test_prompts_that_cannot_be():
     with pytest.raises(ConfigError, match="there is no instruction"):
         process({"task_description": " "})
 
+    class Bare(Words):
+        def encode(self, text):
+            return super().encode(text)[1:]
+
+    with pytest.raises(ConfigError, match=r"first token is 6, not 1 \(<s>\)"):
+        ProcessOpenVLAPrompts(Bare())({"task_description": "pick up"})
+
 
 def test_actions_are_scaled_clipped_and_masked():
     normalize = NormalizeOpenVLA(states=True)

@@ -7,8 +7,9 @@ several statistics are meant: its code takes them from words of the command line
 * ``unnorm_key``: which entry of the statistics;
 * ``img_keys``: cameras, in the model's order;
 * ``horizon``, ``action_rate_hz``: of a chunk;
-* ``center_crop``: whether the middle 0.9 of the pictures is cut out, as after training with
-  augmentation;
+* ``interpolation``, ``center_crop``: how pictures are resized, and whether the middle 0.9 of them
+  is cut out, as after training with augmentation;
+* ``bounds``, ``gripper``: of ``NormalizeOpenVLA``;
 * ``model``: a table that goes over the model's (sizes of other towers).
 """
 
@@ -26,7 +27,17 @@ SIDECAR = "fluxvla_openvla.json"
 STATISTICS = "dataset_statistics.json"
 NATIVE = Path("checkpoints", "latest-checkpoint.pt")
 BACKBONE = "dinosiglip-vit-so-224px"
-_KEYS = ("unnorm_key", "img_keys", "horizon", "action_rate_hz", "center_crop", "model")
+_KEYS = (
+    "unnorm_key",
+    "img_keys",
+    "horizon",
+    "action_rate_hz",
+    "interpolation",
+    "center_crop",
+    "bounds",
+    "gripper",
+    "model",
+)
 
 
 @dataclass(frozen=True)
@@ -165,18 +176,23 @@ def language_table(config: Mapping[str, Any], native: bool) -> dict[str, Any]:
     return table
 
 
-def check_backbone(config: Mapping[str, Any], folder: Path) -> None:
-    """Refuse other towers than DINOv2 and SigLIP at 224 pixels.
+def check_config(config: Mapping[str, Any], folder: Path) -> None:
+    """Refuse other towers than DINOv2 and SigLIP at 224 pixels, and other pictures or bins.
 
     Raises:
-        CheckpointError: with their name.
+        CheckpointError: with what the config says.
     """
-    found = config.get("vision_backbone_id", BACKBONE)
-    if found != BACKBONE:
-        raise CheckpointError(
-            f"vision_backbone_id is {found!r}; only {BACKBONE!r} is built here",
-            where=str(folder / "config.json"),
-        )
+    for key, built in (
+        ("vision_backbone_id", BACKBONE),
+        ("image_resize_strategy", "resize-naive"),
+        ("n_action_bins", 256),
+    ):
+        found = config.get(key, built)
+        if found != built:
+            raise CheckpointError(
+                f"{key} is {found!r}; only {built!r} is built here",
+                where=str(folder / "config.json"),
+            )
 
 
 def _entry(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from fluxvla_openvla.folder import (
     NATIVE,
     SIDECAR,
     STATISTICS,
-    check_backbone,
+    check_config,
     choose_statistics,
     is_native,
     language_table,
@@ -65,7 +65,7 @@ class OpenVLAFormat(CheckpointFormat):
         """The checkpoint in ``folder``; nothing is read of safetensors before it is used."""
         config, sidecar = read_config(folder) or {}, read_sidecar(folder)
         native = is_native(folder, config)
-        check_backbone(config, folder)
+        check_config(config, folder)
         statistics = read_statistics(folder, config)
         dataset, chosen = choose_statistics(statistics, sidecar.get("unnorm_key"), folder)
         parts = read_parts(folder)
@@ -90,11 +90,13 @@ class OpenVLAFormat(CheckpointFormat):
             img_keys=cameras,
             transforms=transforms(
                 tokenizer_path(folder, tokenizer),
-                bounds=platform.bounds if platform is not None and oft else "quantile",
+                bounds=sidecar.get(
+                    "bounds", platform.bounds if platform is not None and oft else "quantile"
+                ),
                 states=bool(model.get("state_dim", 0)),
-                gripper=platform.gripper if platform is not None else None,
+                gripper=sidecar.get("gripper", platform.gripper if platform is not None else None),
                 crop=bool(sidecar.get("center_crop", fine_tuned)),
-                resize="lanczos" if fine_tuned else "bicubic",
+                resize=sidecar.get("interpolation", "lanczos" if fine_tuned else "bicubic"),
                 size=int(model.get("image_size", 224)),
             ),
             statistics=chosen,
@@ -293,20 +295,41 @@ def _write_tables(checkpoint: ForeignCheckpoint, folder: Path) -> None:
         },
     }
     known = {"type", "language", "pretrained_name_or_path"}
+    normalize = _transform(checkpoint, "NormalizeOpenVLA") or {}
+    resize = _transform(checkpoint, "ResizeOpenVLAImages") or {}
     sidecar: dict[str, Any] = {
         "img_keys": list(checkpoint.img_keys),
         "horizon": checkpoint.horizon,
-        "center_crop": any(t["type"].endswith("CropOpenVLAImages") for t in checkpoint.transforms),
+        "interpolation": resize.get("interpolation", "bicubic"),
+        "center_crop": _transform(checkpoint, "CenterCropOpenVLAImages") is not None,
+        "bounds": normalize.get("bounds", "quantile"),
+        "gripper": normalize.get("gripper"),
         "model": {key: value for key, value in checkpoint.model.items() if key not in known},
     }
     if checkpoint.action_rate_hz is not None:
         sidecar["action_rate_hz"] = checkpoint.action_rate_hz
     for name, table in (
         ("config.json", config),
-        (STATISTICS, dict(checkpoint.statistics)),
+        (STATISTICS, _with_mask(checkpoint.statistics, normalize.get("action_mask"))),
         (SIDECAR, sidecar),
     ):
         (folder / name).write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+def _transform(checkpoint: ForeignCheckpoint, name: str) -> Mapping[str, Any] | None:
+    """The table of the transform ``name``, which may be named with its distribution."""
+    tables = (t for t in checkpoint.transforms if str(t.get("type")).rpartition(":")[2] == name)
+    return next(tables, None)
+
+
+def _with_mask(statistics: Mapping[str, Any], mask: Sequence[bool] | None) -> dict[str, Any]:
+    """``statistics`` with the mask of actions where their file has it."""
+    if mask is None:
+        return dict(statistics)
+    return {
+        name: {**entry, "action": {**entry["action"], "mask": list(mask)}}
+        for name, entry in statistics.items()
+    }
 
 
 def _tensors(file: Path) -> dict[str, Tensor]:

@@ -14,6 +14,8 @@ from fluxvla_core.errors import ConfigError
 TEMPLATE = "In: What action should the robot take to {instruction}?\nOut:"
 EMPTY_TOKEN = 29871
 """Llama's token of a lone space, which stood before the actions in training."""
+FIRST_TOKEN = 1
+"""``<s>``: pictures stand behind it."""
 
 
 class ProcessOpenVLAPrompts(Transform):
@@ -29,8 +31,8 @@ class ProcessOpenVLAPrompts(Transform):
         empty_token: appended unless it is the last token anyway.
 
     Raises:
-        ConfigError: the instruction is missing, or longer than ``max_len``: half an instruction is
-            another instruction, so it is never cut.
+        ConfigError: the tokenizer puts no ``<s>`` in front; the instruction is missing, or longer
+            than ``max_len``: half an instruction is another instruction, so it is never cut.
     """
 
     keeps_images = True
@@ -64,6 +66,12 @@ class ProcessOpenVLAPrompts(Transform):
 
     def _tokens(self, text: str) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         ids: Sequence[int] = self.tokenizer.encode(TEMPLATE.format(instruction=text.lower()))
+        if not ids or ids[0] != FIRST_TOKEN:
+            raise ConfigError(
+                f"ProcessOpenVLAPrompts: the prompt's first token is {ids[0] if ids else None}, "
+                f"not {FIRST_TOKEN} (<s>), behind which the pictures stand",
+                cause="the tokenizer is not Llama 2's, or its files do not say that it adds <s>",
+            )
         if ids[-1] != self.empty_token:
             ids = [*ids, self.empty_token]
         if len(ids) > self.max_len:

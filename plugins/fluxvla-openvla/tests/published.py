@@ -90,17 +90,19 @@ def oft(folder: Path, dataset: str = "libero_spatial_no_noops", **settings) -> O
     model = OpenVLAOFT(**{**tiny.SIZES, **OFT, **settings})
     state = model.state_dict()
     parts: dict[str, dict[str, torch.Tensor]] = {}
-    base = {}
+    base, film = {}, {}
     for name, tensor in state.items():
         part, _, rest = name.partition(".")
         own = part in ("action_head", "proprio_projector", "noisy_action_projector")
         if own:
             parts.setdefault(part, {})[f"module.{rest}"] = tensor.bfloat16()
         elif model.use_film and part == "vision_backbone":
-            unmerged(parts.setdefault(part, {}), film_published(name), tensor.bfloat16())
+            film[tiny.film_published(name).removeprefix("vision_backbone.")] = tensor.bfloat16()
         else:
             base[name] = tensor
-    if model.use_film:  # the published folder has OpenVLA's own there, which are not used
+    if model.use_film:
+        parts["vision_backbone"] = unmerged(film)
+        # The published folder has OpenVLA's own there, which are not used.
         plain = [n for n in state if n.startswith("vision_backbone.") and not _film(n)]
         base |= {name: torch.zeros_like(state[name]) for name in plain}
     write_base(folder, base)
@@ -110,20 +112,18 @@ def oft(folder: Path, dataset: str = "libero_spatial_no_noops", **settings) -> O
     return model
 
 
-def film_published(name: str) -> str:
-    return tiny.film_published(name).removeprefix("vision_backbone.")
-
-
-def unmerged(found: dict[str, torch.Tensor], name: str, tensor: torch.Tensor) -> None:
-    """``tensor`` as a layer that peft wrapped: what LoRA adds is 0 for all but one layer."""
-    linear = name.endswith((".attn.qkv.weight", ".mlp.fc1.weight"))
-    if not linear:
-        found[name] = tensor
-        return
-    stem = name.removesuffix(".weight")
-    found[f"{stem}.base_layer.weight"] = tensor
-    found[f"{stem}.lora_A.default.weight"] = torch.ones(32, tensor.shape[1])
-    found[f"{stem}.lora_B.default.weight"] = torch.zeros(tensor.shape[0], 32)
+def unmerged(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """``tensors`` under the names that the authors' code saves, with LoRA that adds nothing."""
+    names = json.loads((tiny.HERE / "keys" / "openvla-oft-film-tiny.json").read_text())
+    made = {"lora_A": torch.ones, "lora_B": torch.zeros}
+    found = {}
+    for name, shape in names.items():
+        kind = name.split(".")[-3]
+        if kind in made:
+            found[name] = made[kind](shape)
+        else:
+            found[name] = tensors[name.replace(".base_layer.", ".")]
+    return found
 
 
 def native(folder: Path) -> OpenVLA:

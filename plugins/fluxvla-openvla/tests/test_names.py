@@ -13,6 +13,7 @@ from fluxvla_openvla.names import (
     native_name,
     part_name,
     published_film_name,
+    with_lora,
 )
 from fluxvla_openvla.openvla import OpenVLA
 from fluxvla_openvla.openvla_oft import OpenVLAOFT
@@ -90,9 +91,27 @@ def test_lora_matrices_are_added_as_the_authors_do():
     found = merge_lora(tensors, "file")
     assert found.keys() == {"a.weight", "a.bias", "b.weight"}
     torch.testing.assert_close(found["a.weight"], base + 0.5 * up @ down)
+    folded = torch.nn.functional.conv2d
+    conv, down, up = torch.randn(5, 3, 2, 2), torch.randn(8, 3, 2, 2), torch.randn(5, 8, 1, 1)
+    names = ("c.base_layer.weight", "c.lora_A.default.weight", "c.lora_B.default.weight")
+    found = merge_lora(dict(zip(names, (conv, down, up), strict=True)), "file")
+    image = torch.randn(1, 3, 4, 4)
+    expected = folded(image, conv, stride=2) + 1.0 * folded(folded(image, down, stride=2), up)
+    torch.testing.assert_close(folded(image, found["c.weight"], stride=2), expected)
     del tensors["a.lora_B.default.weight"]
     with pytest.raises(CheckpointError, match="LoRA matrices of 'a' are not complete"):
         merge_lora(tensors, "file")
+
+
+def test_films_file_is_written_under_the_authors_names():
+    expected = json.loads((KEYS / "openvla-oft-film-tiny.json").read_text())
+    model = OpenVLAOFT(**tiny.SMALL, use_film=True)
+    state = {n: t for n, t in model.state_dict().items() if n.startswith("vision_backbone.")}
+    written = with_lora({published_film_name(n): t for n, t in state.items()})
+    assert {name: list(tensor.shape) for name, tensor in written.items()} == expected
+    back = merge_lora({film_name(n): t for n, t in written.items()}, "file")
+    assert back.keys() == state.keys()
+    assert all(torch.equal(back[name], state[name]) for name in state)
 
 
 def test_a_native_file_of_something_else():

@@ -36,6 +36,7 @@ from fluxvla_openvla.names import (
     merge_lora,
     part_name,
     published_film_name,
+    with_lora,
 )
 from fluxvla_openvla.sizes import LanguageSize
 
@@ -120,6 +121,8 @@ class OpenVLAFormat(CheckpointFormat):
             else:
                 base[name] = tensor.contiguous()
         save_file(base, folder / "model.safetensors", {"format": "pt"})
+        if film:
+            parts[_VISION] = with_lora(parts[_VISION])
         for part, content in parts.items():
             torch.save(content, folder / f"{part}--0{_SUFFIX}")
         _write_tables(checkpoint, folder)
@@ -191,7 +194,7 @@ def tokenizer_path(folder: Path, given: str | None) -> str:
     raise CheckpointError(
         "the folder has no tokenizer.json",
         where=str(folder),
-        next="name the folder of Llama 2's tokenizer: --tokenizer DIR",
+        next="copy Llama 2's tokenizer.json into it, or name its folder: --tokenizer DIR",
     )
 
 

@@ -31,6 +31,7 @@ _NATIVE = (
 )
 _LORA = re.compile(r"\.lora_[AB]\.default\.weight$")
 _LORA_ALPHA = 16
+_LORA_RANK = 32
 
 
 def native_name(name: str) -> str:
@@ -89,10 +90,32 @@ def merge_lora(tensors: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
         down, up = (tensors.get(f"{stem}.lora_{side}.default.weight") for side in "AB")
         if down is None or up is None or weight not in merged:
             raise CheckpointError(f"the LoRA matrices of {stem!r} are not complete", where=where)
-        added = up.float() @ down.float() * (min(len(down), _LORA_ALPHA) / len(down))
-        base = merged[weight]
-        merged[weight] = (base.float() + added).to(base.dtype)
+        base, rank = merged[weight], len(down)
+        # A convolution's are 4-dimensional: (rank, in, h, w) and (out, rank, 1, 1).
+        added = (up.float().flatten(1) @ down.float().flatten(1)).reshape(base.shape)
+        merged[weight] = (base.float() + added * (min(rank, _LORA_ALPHA) / rank)).to(base.dtype)
     return merged
+
+
+def with_lora(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The inverse of ``merge_lora``: matrices of rank 32 that add nothing, where the authors' code
+    has some: on every layer of the towers but FiLM's own."""
+    found: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        stem, _, kind = name.rpartition(".")
+        weight = tensors.get(f"{stem}.weight")
+        plain = weight is None or weight.ndim < 2 or stem.endswith((".scale", ".shift"))
+        if plain or kind not in ("weight", "bias"):
+            found[name] = tensor
+            continue
+        found[f"{stem}.base_layer.{kind}"] = tensor
+        if kind == "weight":
+            ones = (1,) * (tensor.ndim - 2)
+            found[f"{stem}.lora_A.default.weight"] = tensor.new_zeros(_LORA_RANK, *tensor.shape[1:])
+            found[f"{stem}.lora_B.default.weight"] = tensor.new_zeros(
+                len(tensor), _LORA_RANK, *ones
+            )
+    return found
 
 
 def flatten_native(parts: Mapping[str, object], where: str) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ each repository:
     git clone https://github.com/moojink/transformers-openvla-oft   (bc339d9)
 
     PYTHONPATH=. python plugins/fluxvla-openvla/tests/oracles/make_openvla.py openvla openvla
-    (the same with processor instead of openvla)
+    (the same with processor, or names, instead of openvla)
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py oft openvla-oft
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py film openvla-oft
     PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py diffusion openvla-oft
@@ -64,15 +64,15 @@ GRADIENTS = {
 def main() -> None:
     """Write one golden file."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("which", choices=(*PARTS, "names"))
+    parser.add_argument("which", choices=(*PARTS, "names", "film_names"))
     parser.add_argument("repository", type=Path)
     options = parser.parse_args()
     sys.argv = sys.argv[:1]
     torch.manual_seed(0)
     torch.set_num_threads(1)
     _make_importable(options.repository)
-    if options.which == "names":
-        _write_names()
+    if options.which.endswith("names"):
+        {"names": _write_names, "film_names": _write_film_names}[options.which]()
         return
     arrays = globals()[options.which]()
     import timm
@@ -314,6 +314,26 @@ def _write_names() -> None:
     lines = ",\n".join(f"{json.dumps(name)}: {shape}" for name, shape in shapes.items())
     (HERE.parent / "keys" / "openvla-7b.json").write_text(f"{{\n{lines}\n}}\n")
     print(len(shapes), sum(int(np.prod(shape)) for shape in shapes.values()))
+
+
+def _write_film_names() -> None:
+    """Names and shapes of the tiny model's ``vision_backbone--…``, with peft 0.11.1."""
+    from peft import LoraConfig, get_peft_model
+    from prismatic.models.film_vit_wrapper import FiLMedPrismaticVisionBackbone
+
+    settings = LoraConfig(
+        r=32,
+        lora_alpha=16,
+        lora_dropout=0.0,
+        target_modules="all-linear",
+        init_lora_weights="gaussian",
+    )
+    model = get_peft_model(_vla(), settings)
+    wrapped = FiLMedPrismaticVisionBackbone(model.vision_backbone, 32)
+    shapes = {name: list(tensor.shape) for name, tensor in wrapped.state_dict().items()}
+    lines = ",\n".join(f"{json.dumps(name)}: {shape}" for name, shape in shapes.items())
+    (HERE.parent / "keys" / "openvla-oft-film-tiny.json").write_text(f"{{\n{lines}\n}}\n")
+    print(len(shapes))
 
 
 def _make_importable(repository: Path) -> None:

@@ -273,6 +273,8 @@ def test_openvla_gets_new_heads(tmp_path, capsys):
         "use_film": True,
     }
     assert found.img_keys == ("image", "left_wrist_image", "right_wrist_image")
+    assert found.action_rate_hz == 25.0
+    assert {t["type"]: t for t in found.transforms}["NormalizeOpenVLA"]["bounds"] == "min_max"
     for name, tensor in model.state_dict().items():
         kept = found.tensors[name]
         kept = (
@@ -284,3 +286,6 @@ def test_openvla_gets_new_heads(tmp_path, capsys):
     assert run("openvla-oft", out, tmp_path / "more") == 2
     assert "the source is OpenVLAOFT already" in capsys.readouterr().err
     assert run("openvla-oft", tmp_path / "openvla", out) == 2
+    assert run("openvla-oft", tmp_path / "nothing", tmp_path / "more") == 2
+    assert "is no folder of OpenVLA" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.partial"))

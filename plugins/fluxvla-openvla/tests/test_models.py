@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from fluxvla_openvla.language import attention_mask, positions, split_prompt
+from fluxvla_openvla.language import attention_mask, hidden_states, positions, split_prompt
 from fluxvla_openvla.openvla import OpenVLA
 from fluxvla_openvla.openvla_oft import OpenVLAOFT
 
@@ -81,8 +81,6 @@ def test_decoding_with_a_cache_equals_decoding_anew():
     embeddings, real = model._sequence(
         batch["images"], split_prompt(batch["lang_tokens"], batch["lang_masks"])
     )
-    from fluxvla_openvla.language import hidden_states
-
     embeddings = torch.cat([embeddings, model.embed(found)], 1)
     real = torch.cat([real, torch.ones(2, 5, dtype=torch.bool)], 1)
     states = hidden_states(model.language_model, embeddings, real, causal=True)[:, -6:-1]

@@ -225,6 +225,10 @@ def test_an_unknown_unnorm_key_lists_the_known_ones():
             {"stats": {**STATS, "action": {**ROW, "mask": [True]}}},
             "'action' have 3 dimensions, the mask 1",
         ),
+        (
+            {"stats": {**STATS, "action": {**ROW, "relative": [1, 1, 0]}}},
+            "count actions from the state",
+        ),
     ],
 )
 def test_statistics_that_do_not_fit(change, words):

@@ -156,6 +156,12 @@ class Row:
                 f"the statistics of {key!r} lack {', '.join(dict.fromkeys(names))}; they have "
                 f"{have}"
             )
+        if entry.get("relative") is not None:
+            raise ConfigError(
+                f"the statistics of {key!r} count actions from the state (relative_actions), which "
+                "NormalizeOpenVLA does not",
+                next="train without relative_actions",
+            )
         low, high, least, most = (np.asarray(entry[name], np.float64) for name in names)
         chosen = mask if mask is not None else entry.get("mask", np.ones(low.shape, bool))
         used = np.asarray(chosen, bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,8 +15,8 @@ from torch import Tensor, nn
 from fluxvla_core import build_vla_from_cfg
 from fluxvla_core.errors import UsageError
 from fluxvla_core.models import ForeignCheckpoint
-from fluxvla_openvla.folder import PLATFORMS
-from fluxvla_openvla.formats import OpenVLAFormat
+from fluxvla_openvla.folder import PLATFORMS, Platform
+from fluxvla_openvla.formats import OpenVLAFormat, transforms
 from fluxvla_openvla.openvla_oft import HEADS
 
 _FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
@@ -47,11 +48,15 @@ class StartOFT:
 
     def run(self, args: argparse.Namespace) -> int:
         """Make the folder."""
-        platform = PLATFORMS[args.robot]
-        target = Path(args.folder)
+        origin, target = Path(args.source), Path(args.folder)
         if target.exists():
             raise UsageError(f"there is something at {target} already")
-        source = OpenVLAFormat().read(Path(args.source))
+        if not OpenVLAFormat().recognizes(origin):
+            raise UsageError(
+                f"{origin} is no folder of OpenVLA: its config.json does not say so",
+                next="name a copy of openvla/openvla-7b",
+            )
+        platform = PLATFORMS[args.robot]
         cameras = platform.cameras[: args.cameras] if args.cameras else platform.cameras
         names = (*cameras, *(f"image_{i}" for i in range(len(cameras), args.cameras or 0)))
         changes = {
@@ -62,12 +67,9 @@ class StartOFT:
             "head": args.head,
             "use_film": args.film,
         }
-        started, fresh = with_new_parts(source, changes, names, args.seed)
-        target.mkdir(parents=True)
-        OpenVLAFormat().write(started, target)
-        for file in (Path(args.source) / name for name in _FILES):
-            if file.is_file():
-                shutil.copyfile(file, target / file.name)
+        source = OpenVLAFormat().read(origin)
+        started, fresh = with_new_parts(source, changes, platform, names, args.seed)
+        _write(started, origin, target)
         count = sum(tensor.numel() for tensor in fresh.values())
         print(
             f"{target}: {len(started.tensors)} tensors, of which {len(fresh)} are new "
@@ -76,9 +78,25 @@ class StartOFT:
         return 0
 
 
+def _write(started: ForeignCheckpoint, origin: Path, target: Path) -> None:
+    """Write aside and rename, so that there is all of ``target`` or nothing."""
+    aside = target.with_name(f"{target.name}.partial")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        OpenVLAFormat().write(started, aside)
+        for file in (origin / name for name in _FILES):
+            if file.is_file():
+                shutil.copyfile(file, aside / file.name)
+        os.replace(aside, target)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
 def with_new_parts(
     source: ForeignCheckpoint,
     changes: Mapping[str, Any],
+    platform: Platform,
     cameras: tuple[str, ...],
     seed: int,
 ) -> tuple[ForeignCheckpoint, dict[str, Tensor]]:
@@ -88,6 +106,9 @@ def with_new_parts(
 
     Args:
         changes: the model's parameters that OpenVLA does not have.
+        platform: how its pictures, states and actions are prepared.
+        cameras: names of the pictures.
+        seed: of the new weights.
 
     Raises:
         UsageError: ``source`` is not OpenVLA.
@@ -107,9 +128,18 @@ def with_new_parts(
         model=model,
         tensors={**source.tensors, **fresh},
         img_keys=cameras,
-        transforms=source.transforms,
+        transforms=transforms(
+            source.transforms[-1]["tokenizer"]["model_path"],
+            bounds=platform.bounds,
+            states=changes["state_dim"] > 0,
+            gripper=platform.gripper,
+            crop=True,
+            resize="lanczos",
+            size=model.get("image_size", 224),
+        ),
         statistics=source.statistics,
         horizon=changes["horizon"],
+        action_rate_hz=platform.rate_hz,
     )
     return started, fresh
 

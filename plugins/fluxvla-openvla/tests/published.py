@@ -97,7 +97,7 @@ def oft(folder: Path, dataset: str = "libero_spatial_no_noops", **settings) -> O
         if own:
             parts.setdefault(part, {})[f"module.{rest}"] = tensor.bfloat16()
         elif model.use_film and part == "vision_backbone":
-            film[tiny.film_published(name).removeprefix("vision_backbone.")] = tensor.bfloat16()
+            film[tiny.film_file_name(name)] = tensor.bfloat16()
         else:
             base[name] = tensor
     if model.use_film:

@@ -89,6 +89,16 @@ def test_decoding_with_a_cache_equals_decoding_anew():
     assert torch.equal(again, model.action_tokens.decode(found))
 
 
+def test_a_model_in_bfloat16_has_the_same_bins_and_steps():
+    actions = torch.linspace(-1, 1, 7).expand(2, 1, 7)
+    model = make(OpenVLA)
+    expected = model.action_tokens.encode(actions)
+    assert torch.equal(model.bfloat16().action_tokens.encode(actions), expected)
+    # There is nothing else to round but Llama's rotary frequencies, which are transformers' own.
+    diffusion = make(OpenVLAOFT, head="diffusion")
+    assert all("rotary_emb" in name for name, _ in diffusion.named_buffers())
+
+
 def test_only_tokens_of_actions_are_chosen():
     model, batch = make(OpenVLA), observation()
     with torch.no_grad():

@@ -54,6 +54,11 @@ def film_published(name: str) -> str:
     return f"vision_backbone.{name}"
 
 
+def film_file_name(name: str) -> str:
+    """The name of a tensor in their ``vision_backbone--…``; of other parts it stays."""
+    return film_published(name).removeprefix("vision_backbone.")
+
+
 def openvla() -> OpenVLA:
     return filled(OpenVLA(**SIZES))
 

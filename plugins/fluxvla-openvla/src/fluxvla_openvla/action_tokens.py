@@ -9,26 +9,24 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 BINS = 256
+_EDGES = np.linspace(-1.0, 1.0, BINS)
+_CENTERS = (_EDGES[:-1] + _EDGES[1:]) / 2
 
 
-class ActionTokens(nn.Module):
+class ActionTokens:
     """Between normalised actions and token ids.
+
+    The edges are no buffers of the model: one that is cast to bfloat16 would round them.
 
     Args:
         text_vocab_size: tokens of the tokenizer, without padding of the embedding.
     """
 
     def __init__(self, text_vocab_size: int) -> None:
-        super().__init__()
         self.text_vocab_size = text_vocab_size
-        edges = np.linspace(-1.0, 1.0, BINS)
-        # numpy's numbers, wherever the model is made: torch's linspace rounds otherwise.
-        self.register_buffer("edges", torch.from_numpy(edges), persistent=False)
-        centers = torch.from_numpy((edges[:-1] + edges[1:]) / 2)
-        self.register_buffer("centers", centers, persistent=False)
 
     @property
     def first(self) -> int:
@@ -37,10 +35,11 @@ class ActionTokens(nn.Module):
 
     def encode(self, actions: Tensor) -> Tensor:
         """Normalised actions of any shape -> token ids int64; what is outside -1..1 is clipped."""
+        edges = torch.from_numpy(_EDGES).to(actions.device)
         clipped = actions.double().clamp(-1.0, 1.0)
-        return self.text_vocab_size - torch.bucketize(clipped, self.edges.double(), right=True)
+        return self.text_vocab_size - torch.bucketize(clipped, edges, right=True)
 
     def decode(self, tokens: Tensor) -> Tensor:
         """Token ids of any shape -> the centres of their bins, float32."""
         bins = (self.text_vocab_size - tokens - 1).clamp(0, BINS - 2)
-        return self.centers.float()[bins]
+        return torch.from_numpy(_CENTERS).to(tokens.device, torch.float32)[bins]

@@ -105,7 +105,8 @@ def step_embedding(steps: Tensor, width: int) -> Tensor:
 def kept_share(num_steps: int) -> Tensor:
     """How much of the clean actions' variance is left at each step: ``(num_steps,)`` float32.
 
-    The cosine schedule of Nichol and Dhariwal, "Improved denoising diffusion" (2021).
+    The cosine schedule of Nichol and Dhariwal, "Improved denoising diffusion" (2021). It is no
+    buffer of the model: one that is cast to bfloat16 would round it.
     """
 
     def level(t: float) -> float:

@@ -88,7 +88,6 @@ class OpenVLAOFT(Prismatic):
         else:
             self.action_head = DiffusionHead(width, action_dim)
             self.noisy_action_projector = StateProjector(1, width)
-            self.register_buffer("kept", kept_share(num_train_steps), persistent=False)
         # Tokens are not predicted; the weights stay so that published files have a place.
         self.language_model.lm_head.requires_grad_(False)
 
@@ -143,7 +142,7 @@ class OpenVLAOFT(Prismatic):
             assert noise is not None
             assert time is not None
             steps, drawn = time[:, 0].long(), noise[:, 0]
-            kept = self.kept[steps, None, None]
+            kept = kept_share(self.num_train_steps).to(steps.device)[steps, None, None]
             noised = kept.sqrt() * actions + (1 - kept).sqrt() * drawn
             errors = (self._head(seen, prompt, noised, steps) - drawn).square()
         if action_masks is not None:
@@ -165,11 +164,12 @@ class OpenVLAOFT(Prismatic):
             return self._head(seen, prompt)
         assert noise is not None
         stride = self.num_train_steps // self.num_inference_steps
+        kept = kept_share(self.num_train_steps).to(noise.device)
         for step in reversed(range(0, stride * self.num_inference_steps, stride)):
             steps = torch.full((len(noise),), step, device=noise.device)
             found = self._head(seen, prompt, noise, steps)
-            after = self.kept[step - stride] if step >= stride else torch.ones_like(self.kept[0])
-            noise = denoise(noise, found, self.kept[step], after)
+            after = kept[step - stride] if step >= stride else torch.ones_like(kept[0])
+            noise = denoise(noise, found, kept[step], after)
         return noise
 
     def _context(self, images: Tensor, prompt: Prompt, states: Tensor | None) -> Tensor:

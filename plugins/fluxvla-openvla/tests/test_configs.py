@@ -19,7 +19,7 @@ from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 from . import published, tiny
 
 CONFIGS = Path(__file__).parents[3] / "configs"
-NAMES = ("openvla_libero", "openvla_oft_libero", "openvla_oft_aloha")
+NAMES = ("openvla_libero", "openvla_oft_libero", "openvla_oft_aloha", "openvla_oft_ur")
 
 
 def values(name):
@@ -79,24 +79,30 @@ def recorded(folder, cameras, actions, states):
     return spec
 
 
+BOTH = ("image", "wrist_image")
+ALOHA = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+
+
 @pytest.mark.parametrize(
-    ("name", "cameras", "robot"),
+    ("name", "cameras", "actions", "states", "start"),
     [
-        ("openvla_libero", ("image",), None),
-        ("openvla_oft_libero", ("image", "wrist_image"), "libero"),
-        ("openvla_oft_aloha", ("cam_high", "cam_left_wrist", "cam_right_wrist"), "aloha"),
+        ("openvla_libero", ("image",), 7, 8, None),
+        ("openvla_oft_libero", BOTH, 7, 8, "--robot libero"),
+        ("openvla_oft_aloha", ALOHA, 14, 14, "--robot aloha --film"),
+        ("openvla_oft_ur", ("front", "wrist"), 7, 7, "--robot aloha --cameras 2 --horizon 10"),
     ],
 )
-def test_it_trains_from_published_weights_and_acts(tmp_path, capsys, name, cameras, robot):
-    actions, states = (14, 14) if robot == "aloha" else (7, 8)
+def test_it_trains_from_published_weights_and_acts(
+    tmp_path, capsys, name, cameras, actions, states, start
+):
     recorded(tmp_path / "data", cameras, actions, states)
     base = tmp_path / "openvla"
     published.openvla(base)
-    if robot is not None:
-        start = [str(base), str(tmp_path / "start"), "--robot", robot]
-        start += ["--action-dim", str(actions), "--state-dim", str(states)]
+    if start is not None:
+        words = [str(base), str(tmp_path / "start"), *start.split()]
+        words += ["--action-dim", str(actions), "--state-dim", str(states)]
         base = tmp_path / "start"
-        assert main(["openvla-oft", *start, *(["--film"] if robot == "aloha" else [])]) == 0
+        assert main(["openvla-oft", *words]) == 0
     tokenizer = json.dumps(str(base))
     settings = {
         "model.image_size": 28,

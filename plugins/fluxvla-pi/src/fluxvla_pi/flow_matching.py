@@ -97,6 +97,7 @@ class PiFlowMatching(VLA, nn.Module):
         vocab_size: words of the language model.
         freeze_vision_backbone: do not train the vision tower and its projector.
         freeze_llm_backbone: do not train the language model.
+        pretrained_name_or_path: what a training starts from, as ``runner.init_from`` takes it.
 
     Raises:
         ConfigError: sizes that do not belong together.
@@ -117,8 +118,10 @@ class PiFlowMatching(VLA, nn.Module):
         vocab_size: int = 257152,
         freeze_vision_backbone: bool = False,
         freeze_llm_backbone: bool = False,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
+        self.pretrained_name_or_path = pretrained_name_or_path
         llm, expert = gemma_size(variant, "variant"), gemma_size(expert_variant, "expert_variant")
         vision = siglip_size(vision_variant, "vision_variant")
         for name in ("depth", "heads", "kv_heads", "head_dim"):

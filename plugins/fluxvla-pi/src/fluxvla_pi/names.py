@@ -117,7 +117,7 @@ def sources(ours: Collection[str], names: Collection[str], where: str) -> dict[s
         CheckpointError: the file lacks tensors of the model, or has others; they are listed.
     """
     layout = layout_of(names, where)
-    have = {_long(name, layout): name for name in names}
+    have = actual_names(names, layout)
     known = {name: layout.theirs(name) for name in ours}
     if layout.head and known[_EMBEDDING] not in have:
         known[_EMBEDDING] = layout.head
@@ -131,6 +131,11 @@ def sources(ours: Collection[str], names: Collection[str], where: str) -> dict[s
             cause="the model of the file is of another family or size",
         )
     return {name: have[theirs] for name, theirs in known.items()}
+
+
+def actual_names(names: Iterable[str], layout: Layout) -> dict[str, str]:
+    """The names that ``layout`` has -> those in a file of another version of transformers."""
+    return {_long(name, layout): name for name in names}
 
 
 def published(ours: Collection[str], layout: Layout) -> dict[str, str]:

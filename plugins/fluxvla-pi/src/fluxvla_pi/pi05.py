@@ -29,6 +29,7 @@ class PI05FlowMatching(PiFlowMatching):
         vocab_size: int = 257152,
         freeze_vision_backbone: bool = False,
         freeze_llm_backbone: bool = False,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__(
             variant=variant,
@@ -41,6 +42,7 @@ class PI05FlowMatching(PiFlowMatching):
             vocab_size=vocab_size,
             freeze_vision_backbone=freeze_vision_backbone,
             freeze_llm_backbone=freeze_llm_backbone,
+            pretrained_name_or_path=pretrained_name_or_path,
         )
         width = self.llm_expert.size.width
         self.time_mlp_in = nn.Linear(width, width)

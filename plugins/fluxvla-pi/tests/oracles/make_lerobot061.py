@@ -38,7 +38,7 @@ FAMILIES = {
 }
 # Of every kind of weight one, and of both ends of both towers.
 GRADIENTS = (
-    "paligemma_with_expert.paligemma.model.vision_tower.vision_model.embeddings.patch_embedding.weight",
+    "paligemma_with_expert.paligemma.model.vision_tower.vision_model.embeddings.patch_embedding.bias",
     "paligemma_with_expert.paligemma.model.vision_tower.vision_model.embeddings.position_embedding.weight",
     "paligemma_with_expert.paligemma.model.vision_tower.vision_model.encoder.layers.1.mlp.fc1.weight",
     "paligemma_with_expert.paligemma.model.multi_modal_projector.linear.weight",

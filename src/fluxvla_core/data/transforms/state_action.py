@@ -44,8 +44,8 @@ class NormalizeStatesAndActions(Transform):
             LeRobot has it.
 
     Raises:
-        ConfigError: an unknown ``norm_type``, an ``epsilon`` below 0, statistics that are missing or of another width,
-            or a width that would cut dimensions off.
+        ConfigError: an unknown ``norm_type``, an ``epsilon`` below 0, statistics that are missing
+            or of another width, or a width that would cut dimensions off.
     """
 
     keeps_images = True

@@ -74,7 +74,6 @@ class ResizeImagesWithPad(Transform):
     def _resized(self, image: Image, height: int, width: int) -> Image:
         """``(H, W, 3)`` resized to ``(height, width, 3)``."""
         if self.interpolation == "linear":
-            # OpenCV's weights are off by 1e-6 and more, which the model can see.
             return _stretched(_stretched(image.astype(np.float32), height, 0), width, 1)
         if image.dtype != np.uint8:
             raise DataError(
@@ -91,10 +90,14 @@ class ResizeImagesWithPad(Transform):
 def _stretched(image: Image, size: int, axis: int) -> Image:
     """``image`` float32 with ``size`` pixels along ``axis``, each between its two neighbours."""
     have = image.shape[axis]
-    places = np.clip((np.arange(size) + 0.5) * (have / size) - 0.5, 0, have - 1)
+    # As torch has it: a float32 scale, and one rounding of the place. Otherwise shares differ by
+    # up to 4e-6 from LeRobot's.
+    scale = float(np.float32(have / size))
+    places = ((np.arange(size) + 0.5) * scale - 0.5).astype(np.float32)
+    places = np.clip(places, 0, have - 1)
     before = places.astype(np.int64)
     after = np.minimum(before + 1, have - 1)
-    share = (places - before).astype(np.float32).reshape((-1, 1) if axis else (-1, 1, 1))
+    share = (places - before.astype(np.float32)).reshape((-1, 1) if axis else (-1, 1, 1))
     low, high = image.take(before, axis), image.take(after, axis)
     out: Image = low * (1 - share) + high * share
     return out

@@ -113,28 +113,31 @@ class GemmaLayer(nn.Module):
         values: Tensor | None = None,
         condition: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The layer's answer ``(B, L, W)`` and its own keys and values ``(B, kv_heads, L, D)``.
+        """The layer's answer ``(B, L, W)``, and its keys ``(B, kv_heads, L, D)`` and values.
+
+        Values ``(B, L, kv_heads * D)`` are as their projection gives them, because outputs that are
+        views make sharding warn.
 
         Args:
             x: ``(B, L, W)``.
             rope: of the positions of ``x``.
             mask: ``(B, 1, L or 1, M + L)`` bool: what is attended to, ``keys`` first.
-            keys, values: ``(B, kv_heads, M, D)``, rotated already.
+            keys, values: another layer's, of M tokens.
             condition: ``(B, W)`` or ``(B, L, W)`` for adaptive normalisation.
         """
         normed, gate = self.input_layernorm(x, condition)
         attention = self.self_attn
         own_keys = rotate(self._heads(attention.k_proj(normed)), rope)
-        own_values = self._heads(attention.v_proj(normed))
+        own_values = attention.v_proj(normed)
         if self.keys_only:
             return x, own_keys, own_values
         query = rotate(self._heads(attention.q_proj(normed)), rope)
         every_key = own_keys if keys is None else torch.cat([keys, own_keys], dim=2)
-        every_value = own_values if values is None else torch.cat([values, own_values], dim=2)
+        every_value = own_values if values is None else torch.cat([values, own_values], dim=1)
         attended = functional.scaled_dot_product_attention(
             query,
             every_key.repeat_interleave(self.groups, dim=1),
-            every_value.repeat_interleave(self.groups, dim=1),
+            self._heads(every_value).repeat_interleave(self.groups, dim=1),
             attn_mask=mask,
         )
         x = _add(x, attention.o_proj(attended.transpose(1, 2).flatten(2)), gate)

@@ -55,6 +55,7 @@ NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+WEIGHTS = "needs published weights; the plugin's tests run it on a tiny checkpoint"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
@@ -98,7 +99,19 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "pip install 'fluxvla-metaworld[metaworld]'        "
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
+            ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+        ],
+        WEIGHTS: [
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla import-checkpoint hf:lerobot/pi05_libero pi05 --tokenizer paligemma "
+                "--embodiment robot.json --rate 10",
+            ),
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla export work_dirs/pi05 exported --format lerobot",
+            ),
         ],
         EXAMPLE: [
             (

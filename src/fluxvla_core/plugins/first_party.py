@@ -34,6 +34,10 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vision_backbones": ("ConvEncoder",),
         "vlas": ("CompactVLA",),
     },
+    "fluxvla-pi": {
+        "checkpoint_formats": ("LeRobotPi", "OpenPi"),
+        "vlas": ("PI05FlowMatching", "PI0FlowMatching"),
+    },
     "fluxvla-report": {"commands": ("report",)},
     "fluxvla-sim": {
         "commands": ("collect", "sim"),

@@ -12,10 +12,13 @@ from fluxvla_pi.lerobot_format import LeRobotPiFormat
 from fluxvla_pi.names import LEROBOT
 from safetensors.torch import load_file, save_file
 
+from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import load_policy
+from fluxvla_core.operators import RunContext
+from fluxvla_core.testing.training import OneProcessRunner
 
 from .oracles import pi_inputs
 from .published_folders import (
@@ -28,6 +31,7 @@ from .published_folders import (
 )
 
 FAMILIES = ("pi0", "pi05")
+assert OneProcessRunner  # registers itself
 
 
 @pytest.fixture
@@ -229,3 +233,23 @@ def test_other_folders_are_not_recognised(tmp_path):
     (tmp_path / "config.json").write_text("[")
     assert not LeRobotPiFormat().recognizes(tmp_path)
     assert not LeRobotPiFormat().recognizes(tmp_path / "nowhere")
+
+
+def test_a_training_starts_from_it(tmp_path):
+    source = lerobot_folder(tmp_path / "theirs", "pi05")
+    read = LeRobotPiFormat().read(source)
+    config = {
+        "model": {**read.model, "pretrained_name_or_path": str(source)},
+        "train_dataloader": {"per_device_batch_size": 1},
+        "runner": {
+            "type": "OneProcessRunner",
+            "learning_rate": 1e-3,
+            "max_steps": 1,
+            "collator": {"type": "DictCollator", "keys": ["images"]},
+        },
+    }
+    context = RunContext(config=config, section="runner", work_dir=tmp_path / "run")
+    runner = build_runner_from_cfg(config["runner"], context)
+    runner.run_setup(4)
+    theirs, ours = weights("pi05", LEROBOT), runner.vla.state_dict()
+    assert all(torch.equal(ours[name], theirs[LEROBOT.theirs(name)]) for name in ours)

@@ -143,7 +143,8 @@ def test_continuing_a_chunk_is_guided_inpainting(model):
             t = step / 10
 
             def velocity(y, t=t):
-                return model._velocity(y, 1 - t, batch["states"], prefix.real, known)
+                tau = torch.full((BATCH,), 1 - t)
+                return model._velocity(y, tau, batch["states"], prefix.real, known)
 
             def clean(y, t=t, velocity=velocity):
                 return y - (1 - t) * velocity(y)
@@ -154,6 +155,81 @@ def test_continuing_a_chunk_is_guided_inpainting(model):
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     assert torch.equal(found[0, :2], old[0, :2])
     assert (found - old)[:, :3].abs().mean() < (free - old)[:, :3].abs().mean()
+
+
+@pytest.fixture
+def conditioned(model):
+    model.prefix_conditioning = True
+    yield model
+    model.prefix_conditioning = False
+
+
+def test_a_prefix_of_no_actions_changes_nothing(model):
+    batch, _ = drawn(2)
+    with torch.no_grad():
+        free = model(**batch)["loss"]
+        model.prefix_conditioning = True
+        try:
+            found = model(**batch, prefix_len=torch.zeros(BATCH, 2, dtype=torch.int64))["loss"]
+        finally:
+            model.prefix_conditioning = False
+    torch.testing.assert_close(found, free)
+
+
+def test_actions_of_a_prefix_are_given_without_noise_and_not_counted(conditioned):
+    batch, _ = drawn(2)
+    length = torch.tensor([[2, 0], [5, 1], [3, 4]])
+    given = torch.arange(HORIZON) < length[..., None]
+    with torch.no_grad():
+        found = conditioned(**batch, prefix_len=length)
+        other = {**batch, "noise": torch.where(given[..., None], 9.0, batch["noise"])}
+        again = conditioned(**other, prefix_len=length)
+        torch.testing.assert_close(again["loss"], found["loss"])
+        # By hand: the velocity at what is half known, errors of the rest over all.
+        prefix = conditioned.embed_prefix(
+            batch["images"], batch["img_masks"], batch["lang_tokens"], batch["lang_masks"]
+        )
+        known = conditioned._keys_and_values(prefix)
+        total = 0.0
+        for k in range(2):
+            tau = torch.where(given[:, k], 0.0, 1 - batch["time"][:, k : k + 1])
+            x = torch.lerp(batch["actions"], batch["noise"][:, k], tau[..., None])
+            velocity = conditioned._velocity(x, tau, batch["states"], prefix.real, known)
+            errors = (batch["noise"][:, k] - batch["actions"] - velocity).square()
+            total += (errors * ~given[:, k, :, None]).sum().item()
+    count = batch["noise"].numel()
+    assert found["loss"].item() == pytest.approx(total / count, rel=1e-5)
+
+
+def test_a_chunk_continues_by_its_prefix(conditioned):
+    batch = acting_batch()
+    torch.manual_seed(4)
+    old, frozen = torch.randn(BATCH, HORIZON, ACTIONS), torch.tensor([2, 0, 3])
+    more = {
+        "prev_actions": old,
+        "prefix_weights": torch.ones(BATCH, HORIZON),
+        "prefix_len": frozen,
+        "max_guidance_weight": torch.full((BATCH,), 5.0),
+    }
+    with torch.no_grad():
+        found = conditioned.predict_action(**batch, **more)
+        free = conditioned.predict_action(**batch)
+        later = {**more, "prev_actions": old.clone()}
+        later["prev_actions"][0, 2:] = 9.0
+        assert torch.equal(conditioned.predict_action(**batch, **later), found)
+    assert torch.equal(found[0, :2], old[0, :2])
+    assert torch.equal(found[2, :3], old[2, :3])
+    torch.testing.assert_close(found[1], free[1])
+    assert not torch.allclose(found[0, 2:], free[0, 2:])
+
+
+def test_prefixes_and_the_model_belong_together(model, conditioned):
+    with pytest.raises(ConfigError, match="prefix_conditioning is True, and the batch has no"):
+        conditioned(**training_batch())
+    model.prefix_conditioning = False
+    length = torch.zeros(BATCH, 1, dtype=torch.int64)
+    with pytest.raises(ConfigError, match="prefix_conditioning is False, and the batch has a"):
+        model(**training_batch(), prefix_len=length)
 
 
 def test_units_are_pairs_that_share_an_attention(model):

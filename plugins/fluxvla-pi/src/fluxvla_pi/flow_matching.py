@@ -94,6 +94,9 @@ class PiFlowMatching(VLA, nn.Module):
         ori_action_dim: so many of them count in the loss; all if None, as openpi has it (LeRobot
             counts the robot's own).
         num_steps: Euler steps from noise to actions.
+        prefix_conditioning: chunks that continue another are trained for and made by holding their
+            beginning (Black et al. 2025, arXiv 2512.05964); without, they are made by guidance.
+            Training takes ``prefix_len`` of ``SamplePrefixLength`` then.
         vocab_size: words of the language model.
         freeze_vision_backbone: do not train the vision tower and its projector.
         freeze_llm_backbone: do not train the language model.
@@ -115,6 +118,7 @@ class PiFlowMatching(VLA, nn.Module):
         max_action_dim: int = 32,
         ori_action_dim: int | None = None,
         num_steps: int = 10,
+        prefix_conditioning: bool = False,
         vocab_size: int = 257152,
         freeze_vision_backbone: bool = False,
         freeze_llm_backbone: bool = False,
@@ -144,6 +148,7 @@ class PiFlowMatching(VLA, nn.Module):
             )
         self.n_action_steps, self.max_action_dim = n_action_steps, max_action_dim
         self.ori_action_dim, self.num_steps = ori_action_dim, num_steps
+        self.prefix_conditioning = prefix_conditioning
         self.vision_backbone = SiglipVisionTower(vision)
         self.projector = nn.Linear(vision.width, llm.width)
         self.llm_backbone = GemmaDecoder(llm, vocab_size, keys_only=True)
@@ -158,7 +163,10 @@ class PiFlowMatching(VLA, nn.Module):
 
     @abstractmethod
     def embed_suffix(self, states: Tensor, x: Tensor, tau: Tensor) -> Suffix:
-        """State ``(B, S)`` and noisy actions ``(B, T, D)`` at ``tau`` ``(B,)`` as tokens."""
+        """State ``(B, S)`` and noisy actions ``(B, T, D)`` as tokens.
+
+        ``tau`` is ``(B,)``, or ``(B, T)`` where each action has a time of its own.
+        """
 
     @property
     def action_shape(self) -> tuple[int, int]:
@@ -181,6 +189,7 @@ class PiFlowMatching(VLA, nn.Module):
         time: Tensor,
         action_masks: Tensor | None = None,
         img_masks: Tensor | None = None,
+        prefix_len: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -194,20 +203,36 @@ class PiFlowMatching(VLA, nn.Module):
             noise: ``(B, K, T, D)``; ``time``: ``(B, K)``, 0 is noise: K draws for each sample.
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
             img_masks: ``(B, N)``, False for a camera that is not there.
+            prefix_len: ``(B, K)`` int64: so many actions at the beginning are given, without noise
+                and not counted, for ``prefix_conditioning``.
 
         Raises:
-            ConfigError: chunks of another shape than the model's.
+            ConfigError: chunks of another shape than the model's, or ``prefix_len`` without
+                ``prefix_conditioning`` or the reverse.
         """
         self._check(actions, "actions")
+        if self.prefix_conditioning != (prefix_len is not None):
+            raise ConfigError(
+                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
+                f"{'no' if prefix_len is None else 'a'} prefix_len",
+                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
+                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
+            )
         draws = noise.shape[1]
         tau = (1.0 - time).flatten()
         noise, clean = noise.flatten(0, 1), actions.repeat_interleave(draws, 0)
-        share = tau[:, None, None]
+        given = None
+        if prefix_len is not None:
+            given = self._first(prefix_len.flatten())
+            tau = torch.where(given, 0.0, tau[:, None])
+        share = tau[..., None] if tau.ndim == 2 else tau[:, None, None]
         x = share * noise + (1.0 - share) * clean
         prefix = self.embed_prefix(images, img_masks, lang_tokens, lang_masks)
         suffix = self.embed_suffix(states.repeat_interleave(draws, 0), x, tau)
         velocity = self._joint(prefix, suffix, draws)
         errors = (noise - clean - velocity).square()
+        if given is not None:
+            errors = errors * ~given[..., None]
         if action_masks is not None:
             errors = errors * action_masks.repeat_interleave(draws, 0)[..., None]
         errors = errors[..., : self.ori_action_dim]
@@ -233,7 +258,8 @@ class PiFlowMatching(VLA, nn.Module):
 
         Args:
             prev_actions: ``(B, T, D)`` normalised, to go on from; the other three belong to it,
-                see ``fluxvla_models.guidance.Guide``.
+                see ``fluxvla_models.guidance.Guide``. With ``prefix_conditioning`` ``prefix_len``
+                rows are held, and the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
         self._check(noise, "noise")
@@ -245,13 +271,18 @@ class PiFlowMatching(VLA, nn.Module):
             assert prefix_len is not None
             assert max_guidance_weight is not None
             guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        held = guide is not None and self.prefix_conditioning
         x = noise
         for step in range(self.num_steps):
             tau = 1.0 - step / self.num_steps
+            times = torch.full((len(x),), tau, dtype=torch.float32, device=x.device)
+            if guide is not None and held:
+                x = guide.freeze(x)
+                times = torch.where(self._first(guide.frozen), 0.0, times[:, None])
             velocity = partial(
-                self._velocity, tau=tau, states=states, real=prefix.real, known=known
+                self._velocity, tau=times, states=states, real=prefix.real, known=known
             )
-            if guide is None:
+            if guide is None or held:
                 x = x - velocity(x) / self.num_steps
                 continue
             found, pull = guide.pull(partial(_clean, velocity, tau), x, 1.0 - tau)
@@ -301,14 +332,13 @@ class PiFlowMatching(VLA, nn.Module):
     def _velocity(
         self,
         x: Tensor,
-        tau: float,
+        tau: Tensor,
         states: Tensor,
         real: Tensor,
         known: list[tuple[Tensor, Tensor]],
     ) -> Tensor:
         """The velocity at ``x`` ``(B, T, D)``, ``known`` being the language model's."""
-        times = torch.full((len(x),), tau, dtype=torch.float32, device=x.device)
-        suffix = self.embed_suffix(states, x, times)
+        suffix = self.embed_suffix(states, x, tau)
         rope, mask = self._rope(suffix.rope_positions(real)), suffix.mask(real)
         hidden = suffix.hidden
         for layer, (keys, values) in zip(self.llm_expert.layers, known, strict=True):
@@ -320,6 +350,10 @@ class PiFlowMatching(VLA, nn.Module):
         # The velocity is summed up over the steps, so it is never rounded to bf16.
         with torch.autocast(hidden.device.type, enabled=False):
             return self.action_out_proj(hidden[:, -self.n_action_steps :].float())
+
+    def _first(self, length: Tensor) -> Tensor:
+        """``(B, T)``, True for the first ``length`` ``(B,)`` actions of a chunk."""
+        return torch.arange(self.n_action_steps, device=length.device) < length[:, None]
 
     def _rope(self, positions: Tensor) -> Rope:
         return rope_of(positions, self.llm_expert.size.head_dim)

@@ -29,7 +29,7 @@ class RMSNorm(nn.Module):
 
     def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """``x`` normalised, and no gate."""
-        return _unit(x) * (1.0 + self.weight.float()), None
+        return (_unit(x) * (1.0 + self.weight.float())).to(x.dtype), None
 
 
 class AdaRMSNorm(nn.Module):
@@ -50,7 +50,7 @@ class AdaRMSNorm(nn.Module):
         scale, shift, gate = self.dense(condition).float().chunk(3, dim=-1)
         if condition.ndim == 2:
             scale, shift, gate = (part[:, None] for part in (scale, shift, gate))
-        return _unit(x) * (1.0 + scale) + shift, gate
+        return (_unit(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
 
 class GemmaAttention(nn.Module):

@@ -347,9 +347,11 @@ class PiFlowMatching(VLA, nn.Module):
 
     def _project(self, hidden: Tensor, suffix: Suffix) -> Tensor:
         hidden, _ = self.llm_expert.norm(hidden, suffix.condition)
-        # The velocity is summed up over the steps, so it is never rounded to bf16.
+        # The velocity is summed up over the steps, so it is not rounded to bf16 but where sharding
+        # gathers the weights so.
+        last = hidden[:, -self.n_action_steps :].to(self.action_out_proj.weight.dtype)
         with torch.autocast(hidden.device.type, enabled=False):
-            return self.action_out_proj(hidden[:, -self.n_action_steps :].float())
+            return self.action_out_proj(last).float()
 
     def _first(self, length: Tensor) -> Tensor:
         """``(B, T)``, True for the first ``length`` ``(B,)`` actions of a chunk."""

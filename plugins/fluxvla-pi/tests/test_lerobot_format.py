@@ -190,6 +190,20 @@ def step(content, name):
         ("config.json", lambda c: c.update(chunk_size="x"), "chunk_size is 'x', not a number"),
         ("config.json", lambda c: c.update(type="pi0"), "type is pi0, the weights are .* pi05"),
         ("config.json", lambda c: c["input_features"].pop("observation.state"), "no shape of one"),
+        ("config.json", lambda c: c.update(input_features=[]), "input_features is no table"),
+        ("config.json", lambda c: c["output_features"].update(action=3), "is no table of features"),
+        ("config.json", lambda c: c.update(image_resolution=224), "is 224, not two numbers"),
+        (
+            "policy_preprocessor.json",
+            lambda c: step(c, "tokenizer_processor")["config"].update(max_length="long"),
+            "max_length is 'long'",
+        ),
+        (
+            "policy_preprocessor.json",
+            lambda c: step(c, "normalizer_processor")["config"].update(eps=None),
+            "eps is None",
+        ),
+        ("policy_preprocessor.json", lambda c: c.update(steps=3), "no list of steps"),
         (
             "policy_preprocessor.json",
             lambda c: c["steps"].append({"class": "their.Step", "config": {}}),

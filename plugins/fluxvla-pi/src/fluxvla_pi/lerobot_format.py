@@ -61,6 +61,9 @@ class LeRobotPiFormat(CheckpointFormat):
             if config.get(key, value) != value:
                 raise CheckpointError(f"{key} is {config[key]!r}; {value!r} is read", where=where)
         family = config["type"]
+        inputs, outputs = (
+            _features(config, f"{way}_features", where) for way in ("input", "output")
+        )
         old = [name for name in safetensors_in(folder) if name.startswith(BUFFERS)]
         weights = weights_in(folder, old)
         if weights.family != family:
@@ -68,10 +71,11 @@ class LeRobotPiFormat(CheckpointFormat):
                 f"type is {family}, the weights are those of {weights.family}", where=where
             )
         widths = {
-            STATE: _width(config, "input_features", STATE, where),
-            ACTION: _width(config, "output_features", ACTION, where),
+            STATE: _width(inputs, STATE, where),
+            ACTION: _width(outputs, ACTION, where),
         }
-        max_length = int(config.get("tokenizer_max_length", 48 if family == "pi0" else 200))
+        default = 48 if family == "pi0" else 200
+        max_length = _whole(config, "tokenizer_max_length", default, where)
         if os.path.lexists(folder / f"{PREPROCESSOR}.json"):
             preparation = from_files(folder, widths)
         else:
@@ -83,12 +87,14 @@ class LeRobotPiFormat(CheckpointFormat):
             "num_steps": _whole(config, "num_inference_steps", 10, where),
             "ori_action_dim": widths[ACTION],
         }
-        height, width = config.get("image_resolution", (224, 224))
+        size = config.get("image_resolution", [224, 224])
+        if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
+            raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=_cameras(config, where),
-            transforms=_transforms(model, preparation, (height, width), tokenizer),
+            img_keys=_cameras(inputs, where),
+            transforms=_transforms(model, preparation, size, tokenizer),
             statistics={"private": _statistics(preparation, widths)},
             horizon=horizon,
             notes=_notes(preparation, tokenizer),
@@ -117,19 +123,25 @@ def _whole(config: Mapping[str, Any], key: str, default: int, where: str) -> int
     return value
 
 
-def _width(config: Mapping[str, Any], table: str, key: str, where: str) -> int:
-    features = config.get(table)
-    shape = features.get(key, {}).get("shape") if isinstance(features, Mapping) else None
+def _features(config: Mapping[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:
+    features = config.get(key)
+    if not isinstance(features, dict) or not all(isinstance(f, dict) for f in features.values()):
+        raise CheckpointError(f"{key} is no table of features", where=where)
+    return features
+
+
+def _width(features: Mapping[str, Mapping[str, Any]], key: str, where: str) -> int:
+    shape = features.get(key, {}).get("shape")
     if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
-        raise CheckpointError(f"{table}: {key!r} has no shape of one number", where=where)
+        raise CheckpointError(f"the feature {key!r} has no shape of one number", where=where)
     return shape[0]
 
 
-def _cameras(config: Mapping[str, Any], where: str) -> list[str]:
+def _cameras(features: Mapping[str, Mapping[str, Any]], where: str) -> list[str]:
     """Cameras in the model's order, without those that are never there: they are masked."""
     found = [
         key
-        for key, feature in config["input_features"].items()
+        for key, feature in features.items()
         if feature.get("type") == "VISUAL" and not key.startswith(_EMPTY)
     ]
     if not found:
@@ -140,7 +152,7 @@ def _cameras(config: Mapping[str, Any], where: str) -> list[str]:
 def _transforms(
     model: Mapping[str, Any],
     preparation: Preparation,
-    size: tuple[int, int],
+    size: Sequence[int],
     tokenizer: str | None,
 ) -> list[dict[str, Any]]:
     height, width = size

@@ -95,7 +95,7 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
     steps: dict[str, dict[str, Any]] = {}
     for step in listed:
         name = step.get("registry_name")
-        if name not in _KNOWN or not isinstance(step.get("config"), dict):
+        if name not in _KNOWN or not isinstance(step.setdefault("config", {}), dict):
             raise CheckpointError(
                 f"the step {name or step.get('class')!r} is not one of PI0's or PI0.5's",
                 where=where,
@@ -113,17 +113,18 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
         found = {key: _rows(tensors, f"{key}.", widths[key], where) for key in KEYS}
     _check(found, modes, where)
     relative = steps.get("relative_actions_processor", {}).get("config", {})
+    for key in ("exclude_joints", "action_names"):
+        _setting(relative, key, [], (list, type(None)), where)
+    names = steps.get("rename_observations_processor", {}).get("config", {})
     return Preparation(
         modes={key: modes[key] if found.get(key) else "none" for key in KEYS},
         statistics=found,
-        epsilon=float(normalizer.get("eps", 1e-8)),
+        epsilon=_setting(normalizer, "eps", 1e-8, (int, float), where),
         epsilon_if_zero=True,
         relative=_relative(relative, widths[ACTION]) if relative.get("enabled") else None,
-        tokenizer=str(words.get("tokenizer_name", TOKENIZER)),
-        max_length=int(words.get("max_length", 512)),
-        renamed=steps.get("rename_observations_processor", {})
-        .get("config", {})
-        .get("rename_map", {}),
+        tokenizer=_setting(words, "tokenizer_name", TOKENIZER, str, where),
+        max_length=_setting(words, "max_length", 512, int, where),
+        renamed=_setting(names, "rename_map", {}, dict, where),
     )
 
 
@@ -240,6 +241,16 @@ def write_processors(
             written.append(entry)
         text = json.dumps({"name": name, "steps": written}, indent=2)
         (folder / f"{name}.json").write_text(text, encoding="utf-8")
+
+
+def _setting(
+    config: Mapping[str, Any], key: str, default: Any, kind: type | tuple[type, ...], where: str
+) -> Any:
+    """A step's setting, of the type that LeRobot gives it."""
+    value = config.get(key, default)
+    if not isinstance(value, kind):
+        raise CheckpointError(f"{key} is {value!r}", where=where)
+    return value
 
 
 def _modes(given: Any, where: str) -> dict[str, str]:

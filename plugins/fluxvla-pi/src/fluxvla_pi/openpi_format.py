@@ -60,7 +60,8 @@ class OpenPiFormat(CheckpointFormat):
         model = {**weights.model, "n_action_steps": horizon}
         notes = [
             "openpi's data config is in no file: if it made actions relative to the state, or "
-            "turned joints round (adapt_to_pi), so must the robot's operator here",
+            "turned joints round (adapt_to_pi), so must the robot's operator here; the prompt of "
+            "PI0.5 is made with the state (discrete_state_input)",
             f"cameras are openpi's: --camera {CAMERAS[0]}=NAME",
         ]
         if not known:

@@ -20,11 +20,11 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import tokenizer_processor
-from make_lerobot061 import ENVIRONMENT as ENVIRONMENT
 from make_lerobot061 import FAMILIES, VERSIONS, policy_of
 from safetensors.torch import save_file
 from transformers import PreTrainedTokenizerFast
 
+ENVIRONMENT = "lerobot061"
 SETTINGS = {
     # Actions that are counted from the state, all but the gripper's.
     "pi0": {

@@ -87,6 +87,25 @@ def test_what_is_written_is_the_published_list(full, name):
     }
 
 
+@pytest.mark.parametrize("kind", [PI0FlowMatching, PI05FlowMatching])
+def test_full_size_shapes_fit_together(kind):
+    """Three cameras, two draws for each sample; nothing is computed."""
+    with torch.device("meta"):
+        model = kind()
+        seen = {
+            "images": torch.empty(2, 9, 224, 224),
+            "lang_tokens": torch.zeros(2, 48, dtype=torch.int64),
+            "lang_masks": torch.ones(2, 48, dtype=torch.bool),
+            "states": torch.empty(2, 32),
+        }
+        drawn = {"noise": torch.empty(2, 2, 50, 32), "time": torch.empty(2, 2)}
+        losses = model(**seen, **drawn, actions=torch.empty(2, 50, 32))
+        chunk = model.predict_action(**seen, noise=torch.empty(2, 50, 32))
+    assert losses["loss"].shape == ()
+    assert losses["sample_losses"].shape == (2,)
+    assert chunk.shape == (2, 50, 32)
+
+
 def test_a_file_with_the_head_only_gives_the_embedding(full):
     _, shapes = listed("pi05-openpi")
     del shapes[EMBEDDING]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -350,7 +351,8 @@ class PiFlowMatching(VLA, nn.Module):
         # The velocity is summed up over the steps, so it is not rounded to bf16 but where sharding
         # gathers the weights so.
         last = hidden[:, -self.n_action_steps :].to(self.action_out_proj.weight.dtype)
-        with torch.autocast(hidden.device.type, enabled=False):
+        exact = nullcontext() if last.is_meta else torch.autocast(last.device.type, enabled=False)
+        with exact:
             return self.action_out_proj(last).float()
 
     def _first(self, length: Tensor) -> Tensor:

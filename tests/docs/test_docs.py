@@ -54,6 +54,7 @@ CLUSTER = "needs several machines, or a scheduler"
 NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
+HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on a tiny checkpoint"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
@@ -101,6 +102,17 @@ NOT_RUN: dict[tuple[str, str], str] = {
             ),
             ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
+            ),
+        ],
+        HUB: [
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_smolvla policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 30 \\",
+            ),
         ],
         WEIGHTS: [
             (

@@ -51,6 +51,11 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "policies": ("SimExpert",),
         "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
     },
+    "fluxvla-smolvla": {
+        "checkpoint_formats": ("LeRobotSmolVLA",),
+        "transforms": ("SmolVLAImages", "SmolVLANormalize", "SmolVLAPrompt"),
+        "vlas": ("SmolVLA",),
+    },
     "fluxvla-ur": {
         "action_filters": ("URWorkspaceBox",),
         "operators": ("UROperator", "URRTDEOperator"),

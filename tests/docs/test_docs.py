@@ -56,8 +56,8 @@ NO_INDEX = (
 )
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
-WEIGHTS = "needs published weights; the plugin's tests run it on a tiny checkpoint"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
+WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
     for why, lines in {
@@ -100,6 +100,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "pip install 'fluxvla-metaworld[metaworld]'        "
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
+            ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
             ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
             (
@@ -115,6 +116,15 @@ NOT_RUN: dict[tuple[str, str], str] = {
             ),
         ],
         WEIGHTS: [
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla import-checkpoint models/openvla-7b-oft-finetuned-libero-spatial policy "
+                "--embodiment libero.json",
+            ),
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla openvla-oft models/openvla-7b models/openvla-oft-libero --robot libero",
+            ),
             (
                 "plugins/fluxvla-pi/README.md",
                 "fluxvla import-checkpoint hf:lerobot/pi05_libero pi05 --tokenizer paligemma "

@@ -34,6 +34,21 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vision_backbones": ("ConvEncoder",),
         "vlas": ("CompactVLA",),
     },
+    "fluxvla-openvla": {
+        "checkpoint_formats": ("OpenVLAFormat",),
+        "commands": ("openvla-oft",),
+        "transforms": (
+            "CenterCropOpenVLAImages",
+            "DenormalizeOpenVLA",
+            "JitterOpenVLAColors",
+            "NormalizeOpenVLA",
+            "ProcessOpenVLAPrompts",
+            "RandomCropOpenVLAImages",
+            "ResizeOpenVLAImages",
+            "SampleDiffusionSteps",
+        ),
+        "vlas": ("OpenVLA", "OpenVLAOFT"),
+    },
     "fluxvla-pi": {
         "checkpoint_formats": ("LeRobotPi", "OpenPi"),
         "vlas": ("PI05FlowMatching", "PI0FlowMatching"),

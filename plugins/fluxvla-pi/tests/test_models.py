@@ -157,6 +157,28 @@ def test_continuing_a_chunk_is_guided_inpainting(model):
     assert (found - old)[:, :3].abs().mean() < (free - old)[:, :3].abs().mean()
 
 
+def test_padding_that_the_loss_leaves_out_is_not_pulled(model):
+    batch = acting_batch()
+    torch.manual_seed(2)
+    old = torch.randn(BATCH, HORIZON, ACTIONS)
+    more = {
+        "prefix_weights": torch.ones(BATCH, HORIZON),
+        "prefix_len": torch.full((BATCH,), 2),
+        "max_guidance_weight": torch.full((BATCH,), 5.0),
+    }
+    other = old.clone()
+    other[..., 3:] = 9.0
+    model.ori_action_dim = 3
+    try:
+        with torch.no_grad():
+            found = model.predict_action(**batch, prev_actions=old, **more)
+            assert torch.equal(model.predict_action(**batch, prev_actions=other, **more), found)
+    finally:
+        model.ori_action_dim = None
+    assert found.shape == (BATCH, HORIZON, ACTIONS)
+    assert torch.equal(found[:, :2, :3], old[:, :2, :3])
+
+
 @pytest.fixture
 def conditioned(model):
     model.prefix_conditioning = True

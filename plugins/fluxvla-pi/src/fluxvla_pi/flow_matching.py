@@ -12,10 +12,10 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from fluxvla_models.guidance import Guide
+from fluxvla_models.velocity import sample
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -259,8 +259,8 @@ class PiFlowMatching(VLA, nn.Module):
 
         Args:
             prev_actions: ``(B, T, D)`` normalised, to go on from; the other three belong to it,
-                see ``fluxvla_models.guidance.Guide``. With ``prefix_conditioning`` ``prefix_len``
-                rows are held, and the rest is free.
+                see ``fluxvla_models.guidance.Guide``. Padding is not pulled where the loss leaves
+                it out. With ``prefix_conditioning`` ``prefix_len`` rows are held, the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
         self._check(noise, "noise")
@@ -271,24 +271,20 @@ class PiFlowMatching(VLA, nn.Module):
             assert prefix_weights is not None
             assert prefix_len is not None
             assert max_guidance_weight is not None
-            guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
-        held = guide is not None and self.prefix_conditioning
-        x = noise
-        for step in range(self.num_steps):
-            tau = 1.0 - step / self.num_steps
-            times = torch.full((len(x),), tau, dtype=torch.float32, device=x.device)
-            if guide is not None and held:
-                x = guide.freeze(x)
-                times = torch.where(self._first(guide.frozen), 0.0, times[:, None])
-            velocity = partial(
-                self._velocity, tau=times, states=states, real=prefix.real, known=known
-            )
-            if guide is None or held:
-                x = x - velocity(x) / self.num_steps
-                continue
-            found, pull = guide.pull(partial(_clean, velocity, tau), x, 1.0 - tau)
-            x = x + ((found - x) / tau + pull) / self.num_steps
-        return x if guide is None else guide.freeze(x)
+            own = None if self.prefix_conditioning else self.ori_action_dim
+            actions = prev_actions[..., :own]
+            guide = Guide(actions, prefix_weights, prefix_len, max_guidance_weight)
+        held = guide if self.prefix_conditioning else None
+
+        def velocity(x: Tensor, tau: Tensor) -> Tensor:
+            if held is not None:
+                x = held.freeze(x)
+                tau = torch.where(self._first(held.frozen), 0.0, tau[:, None])
+            return self._velocity(x, tau, states, prefix.real, known)
+
+        if held is not None:
+            return held.freeze(sample(velocity, noise, self.num_steps))
+        return sample(velocity, noise, self.num_steps, guide)
 
     def embed_prefix(
         self,
@@ -378,8 +374,3 @@ def time_features(tau: Tensor, width: int) -> Tensor:
     period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** share
     angles = tau.double()[..., None] * (2.0 * math.pi / period)
     return torch.cat([angles.sin(), angles.cos()], dim=-1).float()
-
-
-def _clean(velocity: partial[Tensor], tau: float, x: Tensor) -> Tensor:
-    """The chunk behind ``x`` if the velocity stayed as it is."""
-    return x - tau * velocity(x)

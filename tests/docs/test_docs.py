@@ -102,6 +102,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
             ),
             ("plugins/fluxvla-latency/README.md", "pip install fluxvla-latency"),
             ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
+            ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
             (
                 "plugins/fluxvla-rerun/README.md",
@@ -128,6 +129,15 @@ NOT_RUN: dict[tuple[str, str], str] = {
             (
                 "plugins/fluxvla-openvla/README.md",
                 "fluxvla openvla-oft models/openvla-7b models/openvla-oft-libero --robot libero",
+            ),
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla import-checkpoint hf:lerobot/pi05_libero pi05 --tokenizer paligemma "
+                "--embodiment robot.json --rate 10",
+            ),
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla export work_dirs/pi05 exported --format lerobot",
             ),
         ],
         EXAMPLE: [

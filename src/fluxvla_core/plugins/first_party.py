@@ -50,6 +50,10 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         ),
         "vlas": ("OpenVLA", "OpenVLAOFT"),
     },
+    "fluxvla-pi": {
+        "checkpoint_formats": ("LeRobotPi", "OpenPi"),
+        "vlas": ("PI05FlowMatching", "PI0FlowMatching"),
+    },
     "fluxvla-report": {"commands": ("report",)},
     "fluxvla-rerun": {"hooks": ("RerunViewer",)},
     "fluxvla-sim": {

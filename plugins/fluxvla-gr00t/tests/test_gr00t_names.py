@@ -1,4 +1,4 @@
-"""The names of weights: every published tensor has one of ours, of the same shape, and vice versa."""
+"""Names of weights: every published tensor has one of ours of the same shape, and none is left."""
 
 from __future__ import annotations
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fluxvla_gr00t.qwen3_vl import pictures_to_patches
+from fluxvla_gr00t.transforms import ClipNormalized, ProcessQwenPrompts, ResizeCropImages
 from safetensors.torch import load_file
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_gr00t.qwen3_vl import pictures_to_patches
-from fluxvla_gr00t.transforms import ClipNormalized, ProcessQwenPrompts, ResizeCropImages
 from tests.oracles import fill
 
 GOLDEN = Path(__file__).parent / "golden" / "lerobot061_n17_images.safetensors"

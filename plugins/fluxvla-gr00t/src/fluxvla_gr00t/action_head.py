@@ -47,8 +47,8 @@ class GR00TActionHead(nn.Module):
         dropout: 0.2, as published.
         state_dropout: probability of training on a sample without its state; 0.2 in N1.7.
         attend_padding: let attention see padding (but not where ``attend_text_every`` masks it),
-            as the published training code does. A sample's result then depends on how long the longest
-            of its batch is. False: it is what the published code gives for that sample alone.
+            as the published training code does. A sample's result then depends on how long the
+            longest of its batch is. False: it is what that code gives for the sample alone.
         mean_over_valid: divide the loss by the number of unmasked actions of the batch, as the
             published training code does. A sample's weight then depends on the others of its
             batch, so that several processes train another loss than one. False: by all actions.
@@ -183,7 +183,7 @@ class GR00TActionHead(nn.Module):
         return (found - target)[..., : self.loss_dim].float().square()
 
     def loss(self, errors: Tensor, masks: Tensor) -> Tensor:
-        """The mean of ``errors`` ``(B * K, T, D)``, those that ``masks`` ``(B, T)`` leaves out as 0.
+        """The mean of ``errors`` ``(B * K, T, D)``, where ``masks`` ``(B, T)`` is 0 counted as 0.
 
         See ``mean_over_valid`` for what it is divided by.
         """

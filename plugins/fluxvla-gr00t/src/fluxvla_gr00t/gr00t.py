@@ -25,6 +25,9 @@ class GR00T(VLA, nn.Module):
         vlm_backbone: table or module; pictures and tokens -> ``Context``.
         vla_head: table or module; its ``context_dim`` is filled in here.
         freeze_vlm_backbone: train the head alone, as NVIDIA's fine-tuning does by default.
+        embodiment_id: the embodiment of batches that do not say theirs.
+        pretrained_name_or_path: weights that a training starts from, for instance a published
+            checkpoint's folder.
     """
 
     def __init__(
@@ -32,12 +35,21 @@ class GR00T(VLA, nn.Module):
         vlm_backbone: Mapping[str, Any] | nn.Module,
         vla_head: Mapping[str, Any] | nn.Module,
         freeze_vlm_backbone: bool = True,
+        embodiment_id: int = 0,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
+        self.pretrained_name_or_path = pretrained_name_or_path
         self.vlm_backbone = build_vlm_backbone_from_cfg(vlm_backbone)
         self.vla_head = build_head_from_cfg(vla_head, context_dim=self.vlm_backbone.out_dim)
         self.freeze_vlm_backbone = freeze_vlm_backbone
         self.vlm_backbone.requires_grad_(not freeze_vlm_backbone)
+        if not 0 <= embodiment_id < self.vla_head.embodiments:
+            raise ConfigError(
+                f"GR00T: embodiment_id {embodiment_id} is not in "
+                f"0..{self.vla_head.embodiments - 1}, the embodiments that the head has layers for"
+            )
+        self.embodiment_id = embodiment_id
 
     def forward(
         self,
@@ -60,7 +72,7 @@ class GR00T(VLA, nn.Module):
             states: ``(B, S)`` normalised; actions: ``(B, T, D)`` normalised.
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1: K draws for each sample.
-            embodiment_ids: ``(B,)`` int64; 0 without.
+            embodiment_ids: ``(B,)`` int64; ``embodiment_id`` without.
         """
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
@@ -118,7 +130,7 @@ class GR00T(VLA, nn.Module):
     def _ids(self, states: Tensor, ids: Tensor | None) -> Tensor:
         """``(B,)`` int64, checked: a wrong one would pick another robot's weights, or none."""
         if ids is None:
-            return torch.zeros(len(states), dtype=torch.long, device=states.device)
+            return torch.full((len(states),), self.embodiment_id, device=states.device)
         known = self.vla_head.embodiments
         if bool(((ids < 0) | (ids >= known)).any()):
             raise ConfigError(

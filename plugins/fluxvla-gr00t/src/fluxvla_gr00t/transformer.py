@@ -75,7 +75,7 @@ class DiTBlock(nn.Module):
     def forward(
         self, x: Tensor, time: Tensor, context: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
-        """``x`` ``(B, T, W)``, ``time`` ``(B, W)``, ``context`` ``(B, L, C)``, ``mask`` ``(B, L)``."""
+        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; ``context``, ``mask``: see ``Attention``."""
         scale, shift = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
         attended = self.attention(normal, normal if context is None else context, mask)

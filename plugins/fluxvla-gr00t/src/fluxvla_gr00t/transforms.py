@@ -53,7 +53,8 @@ class ResizeCropImages(Transform):
             raise ConfigError(f"ResizeCropImages: size {size} is not a multiple of {SIDE}")
         if not 0 < crop_fraction <= 1:
             raise ConfigError(
-                f"ResizeCropImages: crop_fraction must be above 0 and at most 1, got {crop_fraction}"
+                "ResizeCropImages: crop_fraction must be above 0 and at most 1, "
+                f"got {crop_fraction}"
             )
         self.size = size
         self.edge = size if shortest_edge is None else shortest_edge
@@ -152,6 +153,27 @@ class ProcessQwenPrompts(Transform):
         mask = np.zeros(self.max_len, np.bool_)
         tokens[self.max_len - len(ids) :], mask[self.max_len - len(ids) :] = ids, True
         return tokens, mask
+
+
+class ListInstruction(Transform):
+    """Write the instruction as a list of one, ``['lift the cup']``, into ``prompt``.
+
+    Before what tokenises it. GR00T N1.5 was trained on instructions written so.
+
+    Raises:
+        ConfigError: there is no instruction.
+    """
+
+    keeps_images = True
+
+    def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+        text = sample.get("prompt", sample.get("task_description"))
+        if not isinstance(text, str) or not text.strip():
+            raise ConfigError(
+                "ListInstruction: there is no instruction: neither 'prompt' nor "
+                f"'task_description' is in the sample ({text!r})"
+            )
+        return {**sample, "prompt": str([text])}
 
 
 class ClipNormalized(Transform):

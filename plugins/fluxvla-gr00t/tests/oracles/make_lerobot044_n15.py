@@ -28,10 +28,11 @@ from lerobot.policies.groot.eagle2_hg_model.modeling_eagle2_5_vl import (
 )
 from lerobot.policies.groot.groot_n1 import EagleBackbone
 from safetensors.torch import save_file
-from tests.oracles import fill
 from torch import nn
 from transformers import Qwen3ForCausalLM, SiglipVisionModel
 from transformers.feature_extraction_utils import BatchFeature
+
+from tests.oracles import fill
 
 ENVIRONMENT = "lerobot044"
 PLACE = 90
@@ -181,8 +182,8 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     seen = model.backbone(inputs(padded))
     found["features"] = seen["backbone_features"].detach()
     with (
-        mock.patch.object(torch, "randn", lambda *_args, **_kwargs: noise),
-        mock.patch.object(model.action_head, "sample_time", lambda *_args, **_kwargs: time),
+        mock.patch.object(torch, "randn", return_value=noise),
+        mock.patch.object(model.action_head, "sample_time", return_value=time),
     ):
         loss = model.action_head(seen, batch(padded))["loss"]
         loss.backward()

@@ -176,8 +176,8 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     seen = model.backbone(BatchFeature(inputs(padded)))
     found["features"] = seen["backbone_features"].detach()
     with (
-        mock.patch.object(torch, "randn", lambda *_args, **_kwargs: noise),
-        mock.patch.object(model.action_head, "sample_time", lambda *_args, **_kwargs: time),
+        mock.patch.object(torch, "randn", return_value=noise),
+        mock.patch.object(model.action_head, "sample_time", return_value=time),
     ):
         loss = model.action_head(seen, batch(padded))["loss"]
         loss.backward()

@@ -20,8 +20,9 @@ from lerobot.policies.groot.processor_groot import (
     _transform_n1_7_image_for_vlm_torch,
 )
 from safetensors.torch import save_file
-from tests.oracles import fill
 from transformers import Qwen2VLImageProcessor
+
+from tests.oracles import fill
 
 ENVIRONMENT = "lerobot061"
 SIZES = {"wide": (60, 80), "tall": (90, 50)}

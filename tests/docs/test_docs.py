@@ -55,6 +55,7 @@ NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+PUBLISHED = "fetches published weights of several GB; the plugin's tests run it on tiny ones"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
@@ -83,6 +84,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
         ],
         NO_INDEX: [
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
+            ("plugins/fluxvla-gr00t/README.md", "pip install fluxvla-gr00t 'fluxvla-core[hub]'"),
             (
                 "plugins/fluxvla-gymnasium/README.md",
                 "pip install fluxvla-gymnasium gym-aloha        "
@@ -99,6 +101,18 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+        ],
+        PUBLISHED: [
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_gr00t policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 20",
+            ),
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla run --config configs/gr00t_n15_aloha.py --section runner --nproc 8 "
+                "--set model.pretrained_name_or_path=hf:nvidia/GR00T-N1.5-3B",
+            ),
         ],
         EXAMPLE: [
             (

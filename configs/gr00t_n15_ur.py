@@ -1,8 +1,8 @@
 """GR00T N1.5 fine-tuned on a UR arm with two cameras; see ``gr00t_n15_aloha.py``.
 
-    pip install fluxvla-gr00t fluxvla-fsdp fluxvla-ur
-    fluxvla run --config configs/gr00t_n15_ur.py --section runner --nproc 8
-    fluxvla run --config configs/gr00t_n15_ur.py --section inference --task 1
+pip install fluxvla-gr00t fluxvla-fsdp fluxvla-ur
+fluxvla run --config configs/gr00t_n15_ur.py --section runner --nproc 8
+fluxvla run --config configs/gr00t_n15_ur.py --section inference --task 1
 """
 
 _base_ = "gr00t_n15_aloha.py"

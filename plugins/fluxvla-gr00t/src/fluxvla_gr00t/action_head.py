@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError
 from fluxvla_gr00t.context import Context
 from fluxvla_gr00t.embodiments import ActionEncoder, EmbodimentMLP
-from fluxvla_gr00t.transformer import ContextBlock, DiT
+from fluxvla_gr00t.transformer import ContextBlock, DiT, Kept
 
 _BUCKETS = 1000
 
@@ -139,13 +139,20 @@ class GR00TActionHead(nn.Module):
         return tokens
 
     def velocity(
-        self, x: Tensor, steps: Tensor, context: Context, state: Tensor, ids: Tensor
+        self,
+        x: Tensor,
+        steps: Tensor,
+        context: Context,
+        state: Tensor,
+        ids: Tensor,
+        kept: list[Kept] | None = None,
     ) -> Tensor:
         """The velocity ``(B, T, D)`` at ``x`` ``(B, T, D)``.
 
         Args:
             steps: ``(B,)`` int64, the time in thousandths.
             context: what ``read`` gave; state: what ``encode_states`` gave; ids: ``(B,)`` int64.
+            kept: what the blocks keep of the context from one step to the next.
         """
         actions = self.action_encoder(x, steps, ids)
         actions = actions + self.positions.weight[: x.shape[1]].to(actions.dtype)
@@ -153,7 +160,8 @@ class GR00TActionHead(nn.Module):
         if self.future_tokens is not None:
             future = self.future_tokens.weight.to(actions.dtype)
             tokens.insert(1, future.expand(len(x), -1, -1))
-        found = self.dit(torch.cat(tokens, dim=1), steps, context.features, self._masks(context))
+        joined = torch.cat(tokens, dim=1)
+        found = self.dit(joined, steps, context.features, self._masks(context), kept)
         return self.action_decoder(found[:, -x.shape[1] :], ids)
 
     def errors(
@@ -206,11 +214,12 @@ class GR00TActionHead(nn.Module):
         """
         read = self.read(context)
         state = self.encode_states(states, ids)
+        kept = [Kept() for _ in range(len(self.dit.blocks) // 2)]
         x = noise
         for step in range(self.num_steps):
             share = step / self.num_steps
             steps = torch.full((len(x),), int(share * _BUCKETS), device=x.device)
-            at = partial(self.velocity, steps=steps, context=read, state=state, ids=ids)
+            at = partial(self.velocity, steps=steps, context=read, state=state, ids=ids, kept=kept)
             if guide is None:
                 x = x + at(x) / self.num_steps
                 continue

@@ -9,6 +9,7 @@ models, whose weights are of use with these alone.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,17 @@ from torch.nn import functional
 
 _SINES = 256
 _LONGEST = 10000.0
+
+
+@dataclass
+class Kept:
+    """Keys and values of a context, ``(B, heads, L, head_dim)``, once they have been computed.
+
+    They do not depend on the noisy actions, so that the steps of an integration share them.
+    """
+
+    key: Tensor | None = None
+    value: Tensor | None = None
 
 
 class Attention(nn.Module):
@@ -29,15 +41,26 @@ class Attention(nn.Module):
         self.value = nn.Linear(context_dim, heads * head_dim)
         self.out = nn.Linear(heads * head_dim, width)
 
-    def forward(self, x: Tensor, context: Tensor, mask: Tensor | None = None) -> Tensor:
-        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it."""
-        query, key, value = (
-            made.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for made in (self.query(x), self.key(context), self.value(context))
-        )
+    def forward(
+        self, x: Tensor, context: Tensor, mask: Tensor | None = None, kept: Kept | None = None
+    ) -> Tensor:
+        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it.
+
+        ``kept``: keys and values of this same context from before; it is filled if it is empty.
+        """
+        query = self._heads(self.query(x))
+        if kept is None or kept.key is None or kept.value is None:
+            key, value = self._heads(self.key(context)), self._heads(self.value(context))
+            if kept is not None:
+                kept.key, kept.value = key.detach(), value.detach()
+        else:
+            key, value = kept.key, kept.value
         seen = None if mask is None else mask[:, None, None, :]
         mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=seen)
         return self.out(mixed.transpose(1, 2).flatten(2))
+
+    def _heads(self, made: Tensor) -> Tensor:
+        return made.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
 class FeedForward(nn.Module):
@@ -73,12 +96,17 @@ class DiTBlock(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self, x: Tensor, time: Tensor, context: Tensor | None = None, mask: Tensor | None = None
+        self,
+        x: Tensor,
+        time: Tensor,
+        context: Tensor | None = None,
+        mask: Tensor | None = None,
+        kept: Kept | None = None,
     ) -> Tensor:
-        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; ``context``, ``mask``: see ``Attention``."""
+        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``."""
         scale, shift = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
-        attended = self.attention(normal, normal if context is None else context, mask)
+        attended = self.attention(normal, normal if context is None else context, mask, kept)
         x = x + self.dropout(self.dropout(attended))
         return x + self.feed_forward(functional.layer_norm(x, x.shape[-1:], eps=1e-5))
 
@@ -142,20 +170,27 @@ class DiT(nn.Module):
         self.out = nn.Linear(width, out_dim)
 
     def forward(
-        self, x: Tensor, steps: Tensor, context: Tensor, masks: list[Tensor | None]
+        self,
+        x: Tensor,
+        steps: Tensor,
+        context: Tensor,
+        masks: list[Tensor | None],
+        kept: list[Kept] | None = None,
     ) -> Tensor:
         """``x`` ``(B, T, W)`` at ``steps`` ``(B,)`` int64.
 
         Args:
             context: ``(B, L, C)``.
             masks: for each even block ``(B, L)`` bool, what of the context it sees; None: all.
+            kept: for each even block its keys and values of this same context.
         """
         time = self.time(steps)
         for layer, block in enumerate(self.blocks):
             if layer % 2:
                 x = block(x, time)
             else:
-                x = block(x, time, context, masks[layer // 2])
+                pair = layer // 2
+                x = block(x, time, context, masks[pair], None if kept is None else kept[pair])
         shift, scale = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-6)
         return self.out(normal * (1 + scale) + shift)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from fluxvla_gr00t import formats
+from fluxvla_gr00t import tables
 from fluxvla_gr00t.gr00t import GR00T
 from fluxvla_gr00t.names import published_name
 from safetensors.torch import save_file
@@ -101,7 +101,7 @@ def model(version: str, **settings: object) -> GR00T:
 
 def folder(version: str, place: Path, monkeypatch, tags=("new_embodiment",)) -> Path:
     """The published folder of the tiny model, whose backbone is known while a test runs."""
-    monkeypatch.setitem(formats.BACKBONES, version, BACKBONES[version])
+    monkeypatch.setitem(tables.BACKBONES, version, BACKBONES[version])
     place.mkdir()
     tensors = {
         published_name(name, version): value for name, value in model(version).state_dict().items()

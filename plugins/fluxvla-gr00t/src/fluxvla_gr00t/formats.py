@@ -6,27 +6,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-import torch
-
-from fluxvla_core import build_vla_from_cfg
 from fluxvla_core.errors import CheckpointError, FluxError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_gr00t.names import is_unread, published_name
-from fluxvla_gr00t.robots import Robot, n15_robot, n17_robot
+from fluxvla_gr00t.robots import n15_robot, n17_robot
+from fluxvla_gr00t.tables import (
+    checkpoint,
+    model_table,
+    n15_transforms,
+    n17_transforms,
+    resize_table,
+)
 
-BACKBONES: dict[str, dict[str, Any]] = {
-    "n1.5": {"type": "EagleBackbone"},
-    "n1.7": {"type": "Qwen3VLBackbone"},
-}
-"""The backbones, whose sizes the files do not say."""
-TOKENIZERS = {
-    "n1.5": "lerobot/eagle2hg-processor-groot-n1p5",
-    "n1.7": "nvidia/Cosmos-Reason2-2B",
-}
-"""Where the tokenizers are published; the checkpoints have none."""
-_WORDS = 132
-"""Tokens of a prompt besides the places of pictures: 900 in all for three pictures."""
 _FIXED = {
     "add_pos_embed": True,
     "use_vlln": True,
@@ -78,22 +69,9 @@ class GR00TN15Format(CheckpointFormat):
             "action_dim": settings.count("action_dim"),
             "future_tokens": settings.count("num_target_vision_tokens"),
         }
-        model = _model("n1.5", backbone.count("select_layer"), head, robot)
-        count = len(robot.img_keys)
-        transforms: list[dict[str, Any]] = [
-            {"type": "ListInstruction"},
-            {
-                "type": "ProcessPromptsWithImage",
-                "max_len": count * _places(model) + _WORDS,
-                "num_images": count,
-                "fixed_img_tokens": _places(model),
-                "tokenizer": _tokenizer("n1.5", tokenizer),
-            },
-            {"type": "ResizeImages", "height": _side(model), "width": _side(model)},
-            {"type": "SimpleNormalizeImages"},
-            _normalize(robot, head),
-        ]
-        return _checkpoint("n1.5", folder, model, transforms, robot)
+        model = model_table("n1.5", head, robot, backbone.count("select_layer"))
+        transforms = n15_transforms(model, robot, tokenizer)
+        return checkpoint("n1.5", safetensors_in(folder), model, transforms, robot, str(folder))
 
 
 class GR00TN17Format(CheckpointFormat):
@@ -134,24 +112,18 @@ class GR00TN17Format(CheckpointFormat):
             else None,
             "state_dropout": float(settings.get("state_dropout_prob", 0.0)),
         }
-        model = _model("n1.7", settings.count("select_layer"), head, robot)
-        resize = _resize({**settings.values, **kwargs}, str(processing))
-        places = (resize["size"] // 32) ** 2
-        transforms: list[dict[str, Any]] = [
-            resize,
-            {
-                "type": "ProcessQwenPrompts",
-                # Pictures that keep their aspect take more places than square ones.
-                "max_len": len(robot.img_keys) * 2 * places + _WORDS,
-                "formalize": bool(kwargs.get("formalize_language", True)),
-                "tokenizer": _tokenizer("n1.7", tokenizer),
-            },
-            {"type": "SimpleNormalizeImages"},
-            _normalize(robot, head),
-        ]
-        if kwargs.get("clip_outliers", True):
-            transforms.append({"type": "ClipNormalized"})
-        return _checkpoint("n1.7", folder, model, transforms, robot)
+        model = model_table("n1.7", head, robot, settings.count("select_layer"))
+        both = {**settings.values, **kwargs}
+        _Settings(both, str(processing)).square("image_target_size")
+        transforms = n17_transforms(
+            model,
+            robot,
+            tokenizer,
+            resize_table(both),
+            bool(kwargs.get("formalize_language", True)),
+            bool(kwargs.get("clip_outliers", True)),
+        )
+        return checkpoint("n1.7", safetensors_in(folder), model, transforms, robot, str(folder))
 
 
 class _Settings:
@@ -176,6 +148,11 @@ class _Settings:
 
     def table(self, name: str) -> _Settings:
         return _Settings(self.values.get(name), self.where)
+
+    def square(self, name: str) -> None:
+        value = self.values.get(name)
+        if value is not None and (len(value) != 2 or value[0] != value[1]):
+            raise CheckpointError(f"{name} {value} is not square", where=self.where)
 
     def require(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
@@ -211,63 +188,6 @@ def _head(settings: _Settings) -> dict[str, Any]:
     }
 
 
-def _model(version: str, layers: int, head: dict[str, Any], robot: Robot) -> dict[str, Any]:
-    """The config's ``model`` table."""
-    actions = robot.statistics.get("action")
-    if actions is not None:
-        head["ori_action_dim"] = int(_width(actions["mean"]))
-    return {
-        "type": "GR00T",
-        "vlm_backbone": {**BACKBONES[version], "text_layers": layers},
-        "vla_head": head,
-        "embodiment_id": robot.embodiment_id,
-    }
-
-
-def _checkpoint(
-    version: str,
-    folder: Path,
-    model: dict[str, Any],
-    transforms: list[dict[str, Any]],
-    robot: Robot,
-) -> ForeignCheckpoint:
-    horizon = int(model["vla_head"]["horizon"])
-    notes = list(robot.notes)
-    if robot.horizon is not None and robot.horizon < horizon:
-        notes.append(
-            f"of the {horizon} actions of a chunk {robot.horizon} were trained: execute no more"
-        )
-    statistics = {key: _padded(entry, horizon) for key, entry in robot.statistics.items()}
-    with torch.device("meta"):
-        own = build_vla_from_cfg(model).state_dict()
-    stored = safetensors_in(folder)
-    read = {name: stored[name] for name in stored if not is_unread(name, version)}
-    return ForeignCheckpoint(
-        model=model,
-        tensors=renamed(read, {name: published_name(name, version) for name in own}, str(folder)),
-        img_keys=robot.img_keys,
-        transforms=transforms if statistics else (),
-        statistics={"private": statistics},
-        horizon=horizon,
-        action_rate_hz=robot.rate,
-        notes=tuple(notes),
-    )
-
-
-def _padded(entry: Mapping[str, list[Any]], horizon: int) -> dict[str, list[Any]]:
-    """Statistics of one row a step, as long as a chunk: the last row is repeated."""
-    return {
-        name: values + [values[-1]] * (horizon - len(values))
-        if values and isinstance(values[0], list)
-        else values
-        for name, values in entry.items()
-    }
-
-
-def _width(values: list[Any]) -> int:
-    return len(values[0]) if isinstance(values[0], list) else len(values)
-
-
 def _model_type(folder: Path) -> str | None:
     """``model_type`` of ``config.json``; None if there is none, or it is LeRobot's config."""
     try:
@@ -276,43 +196,3 @@ def _model_type(folder: Path) -> str | None:
         return None
     kind = config.get("model_type")
     return kind if isinstance(kind, str) and "type" not in config else None
-
-
-def _tokenizer(version: str, place: str | None) -> dict[str, Any]:
-    return {"type": "PretrainedTokenizer", "model_path": place or TOKENIZERS[version]}
-
-
-def _normalize(robot: Robot, head: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "NormalizeStatesAndActions",
-        "state_dim": head["state_dim"],
-        "action_dim": head["action_dim"],
-        "norm_type": robot.norm_type,
-    }
-
-
-def _side(model: Mapping[str, Any]) -> int:
-    return int(model["vlm_backbone"].get("image_size", 224))
-
-
-def _places(model: Mapping[str, Any]) -> int:
-    return (_side(model) // int(model["vlm_backbone"].get("patch_size", 14))) ** 2
-
-
-def _resize(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The transform of pictures, by N1.7's settings."""
-    target, crop = settings.get("image_target_size"), settings.get("image_crop_size")
-    target = [256, 256] if target is None else target
-    fraction = settings.get("crop_fraction")
-    if fraction is None:
-        fraction = 1.0 if crop is None else crop[0] / target[0]
-    if target[0] != target[1]:
-        raise CheckpointError(f"image_target_size {target} is not square", where=where)
-    return {
-        "type": "ResizeCropImages",
-        "size": int(target[0]),
-        "shortest_edge": settings.get("shortest_image_edge"),
-        "crop_fraction": float(fraction),
-        "method": "area" if settings.get("use_albumentations") else "bicubic",
-        "letter_box": bool(settings.get("letter_box_transform", False)),
-    }

@@ -116,12 +116,35 @@ def n17_robot(folder: Path, settings: Mapping[str, Any]) -> Robot:
     if tag is None:
         return Robot(notes=(_several(configs),))
     ids = read_json(folder / "embodiment_id.json", dict[str, Any], CheckpointError)
+    number = _number(ids, tag, str(folder / "embodiment_id.json"))
     config, statistics = _table(configs, tag, where), _table(known, tag, str(file))
+    return grouped_robot(tag, number, config, statistics, settings, where)
+
+
+def grouped_robot(
+    tag: str,
+    number: int,
+    config: Mapping[str, Any],
+    statistics: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    where: str,
+) -> Robot:
+    """One robot of N1.7.
+
+    Args:
+        config: its table of ``modality_configs``.
+        statistics: its table of ``statistics.json``.
+        settings: ``processor_kwargs``.
+        where: the file, for messages.
+
+    Raises:
+        CheckpointError: the tables are damaged.
+    """
     video = _table(config, "video", where)
     action = _table(config, "action", where)
     robot = Robot(
         tag=tag,
-        embodiment_id=_number(ids, tag, str(folder / "embodiment_id.json")),
+        embodiment_id=number,
         img_keys=tuple(_names(video, where)),
         norm_type="mean_std"
         if settings.get("use_mean_std")
@@ -135,13 +158,13 @@ def n17_robot(folder: Path, settings: Mapping[str, Any]) -> Robot:
     relative = _relative(action, settings)
     entries = {
         "proprio": _joined(
-            [_group(_table(statistics, "state", str(file)), n, str(file)) for n in states],
-            str(file),
+            [_group(_table(statistics, "state", where), n, where) for n in states],
+            where,
         ),
-        "action": _actions(statistics, _names(action, where), relative, str(file)),
+        "action": _actions(statistics, _names(action, where), relative, where),
     }
     if relative:
-        flags = _from_state(statistics, states, _names(action, where), relative, str(file))
+        flags = _from_state(statistics, states, _names(action, where), relative, where)
         if flags is None:
             refusal = (
                 "its relative actions are counted from states in another order: it can be trained "

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from fluxvla_gr00t import tables
+from fluxvla_gr00t import lerobot_format, tables
 from fluxvla_gr00t.gr00t import GR00T
 from fluxvla_gr00t.names import published_name
 from safetensors.torch import save_file
@@ -109,6 +109,52 @@ def folder(version: str, place: Path, monkeypatch, tags=("new_embodiment",)) -> 
     tensors |= {name: torch.zeros(2, 2) for name in UNREAD[version]}
     save_file(tensors, place / "model.safetensors")
     (_write_n15 if version == "n1.5" else _write_n17)(place, tags)
+    return place
+
+
+def lerobot_folder(version: str, place: Path, monkeypatch, **pack: object) -> Path:
+    """The tiny model as LeRobot saves it: by 0.4.4 N1.5, by 0.6.1 N1.7; ``pack`` adds settings."""
+    monkeypatch.setitem(tables.BACKBONES, version, BACKBONES[version])
+    monkeypatch.setitem(lerobot_format.HEADS, version, HEADS[version])
+    head = HEADS[version]
+    place.mkdir()
+    tensors = {
+        f"_groot_model.{published_name(name, version)}": value
+        for name, value in model(version).state_dict().items()
+    }
+    tensors |= {f"_groot_model.{name}": torch.zeros(2, 2) for name in UNREAD[version]}
+    save_file(tensors, place / "model.safetensors")
+    images = {f"observation.images.{camera}": {"type": "VISUAL"} for camera in CAMERAS}
+    state = {"observation.state": {"type": "STATE", "shape": [5]}}
+    write(place / "config.json", {"type": "groot", "input_features": {**images, **state}})
+    name = {"n1.5": "groot_pack_inputs_v3", "n1.7": "groot_n1_7_pack_inputs_v1"}[version]
+    file = f"policy_preprocessor_step_2_{name}.safetensors"
+    config = {
+        "max_state_dim": head["state_dim"],
+        "max_action_dim": head["action_dim"],
+        "formalize_language": version == "n1.7",
+        "embodiment_tag": "new_embodiment",
+        "embodiment_mapping": {"new_embodiment": 2, "gr1": 1},
+        "normalize_min_max": True,
+        **({"clip_outliers": True, "use_percentiles": False} if version == "n1.7" else {}),
+        **pack,
+    }
+    encode = {"image_target_size": [64, 64], "image_crop_size": [64, 64]}
+    steps = [
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
+        {"registry_name": "to_batch_processor", "config": {}},
+        {"registry_name": name, "config": config, "state_file": file},
+        {"registry_name": "groot_n1_7_vlm_encode_v1", "config": encode},
+    ]
+    write(place / "policy_preprocessor.json", {"name": "policy_preprocessor", "steps": steps})
+    undo = {"registry_name": "groot_action_unpack_unnormalize_v2", "config": {"env_action_dim": 5}}
+    write(place / "policy_postprocessor.json", {"name": "policy_postprocessor", "steps": [undo]})
+    numbers = {
+        f"{feature}.{name}": torch.from_numpy(joined(kind, name))
+        for feature, kind in (("observation.state", "state"), ("action", "action"))
+        for name in ("min", "max", "mean", "std")
+    }
+    save_file(numbers, place / file)
     return place
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from fluxvla_gr00t import robots
 from fluxvla_gr00t.formats import GR00TN15Format, GR00TN17Format
+from fluxvla_gr00t.lerobot_format import LeRobotGR00TFormat
 from safetensors.torch import load_file, save_file
 
 from fluxvla_core.cli.main import main
@@ -27,6 +28,9 @@ TASK = "Lift the cup"
 def numbers(monkeypatch):
     """The tiny head has layers for three robots."""
     monkeypatch.setitem(robots.N15_EMBODIMENTS, "new_embodiment", 2)
+
+
+SAVED = {"gr00t": published.folder, "lerobot": published.lerobot_folder}
 
 
 def chat(version, places):
@@ -48,14 +52,17 @@ def scaled(kind, low, high, values, back=False):
     return 2 * (values - low) / (high - low) - 1
 
 
+@pytest.mark.parametrize("project", SAVED)
 @pytest.mark.parametrize("version", ["n1.5", "n1.7"])
-def test_an_imported_checkpoint_acts_as_the_model_does(version, tmp_path, monkeypatch, capsys):
+def test_an_imported_checkpoint_acts_as_the_model_does(
+    version, project, tmp_path, monkeypatch, capsys
+):
     side = SIDES[version]
-    source = published.folder(version, tmp_path / "theirs", monkeypatch)
+    source = SAVED[project](version, tmp_path / "theirs", monkeypatch)
     words = published.tokenizer(version, tmp_path / "words")
     (tmp_path / "arm.json").write_text(json.dumps(published.robot(side).to_dict()))
     options = ["--tokenizer", str(words), "--embodiment", str(tmp_path / "arm.json")]
-    rate = [] if version == "n1.5" else ["--rate", "20"]
+    rate = [] if (version, project) == ("n1.5", "gr00t") else ["--rate", "20"]
     out = tmp_path / "ours"
 
     assert main(["import-checkpoint", str(source), str(out), *options, *rate]) == 0
@@ -75,7 +82,8 @@ def test_an_imported_checkpoint_acts_as_the_model_does(version, tmp_path, monkey
     ids = Tokenizer.from_file(str(words / "tokenizer.json")).encode(chat(version, 4)).ids
     assert ids.count(PLACE) == 8
     planes = np.concatenate([pictures[c].transpose(2, 0, 1) for c in CAMERAS])
-    low, high = ("min", "max") if version == "n1.5" else ("q01", "q99")
+    percentiles = (version, project) == ("n1.7", "gr00t")
+    low, high = ("q01", "q99") if percentiles else ("min", "max")
     state = scaled("state", low, high, states)
     if version == "n1.7":
         state = np.clip(state, -1, 1)
@@ -108,11 +116,14 @@ def test_each_format_knows_its_own_folders(version, tmp_path, monkeypatch):
     source = published.folder(version, tmp_path / "theirs", monkeypatch)
     assert [v for v, kind in FORMATS.items() if kind().recognizes(source)] == [version]
     config = json.loads((source / "config.json").read_text())
+    assert not LeRobotGR00TFormat().recognizes(source)
     (source / "config.json").write_text(json.dumps({**config, "type": "groot"}))
     assert not any(kind().recognizes(source) for kind in FORMATS.values())
+    assert LeRobotGR00TFormat().recognizes(source)
     (source / "config.json").write_text("[")
-    assert not any(kind().recognizes(source) for kind in FORMATS.values())
-    assert not any(kind().recognizes(tmp_path / "none") for kind in FORMATS.values())
+    every = (*FORMATS.values(), LeRobotGR00TFormat)
+    assert not any(kind().recognizes(source) for kind in every)
+    assert not any(kind().recognizes(tmp_path / "none") for kind in every)
 
 
 def test_actions_counted_from_the_state_are_read(tmp_path, monkeypatch):
@@ -162,6 +173,58 @@ def relative_to_state(source, config, states=("arm", "grip")):
     group = {"min": lows, "max": rows, "mean": rows, "std": rows, "q01": rows, "q99": rows}
     content["new_embodiment"]["relative_action"] = {"arm": group}
     file.write_text(json.dumps(content))
+
+
+def test_what_lerobot_knows_of_groups_of_joints_is_read(tmp_path, monkeypatch):
+    groups = {"state": published.statistics("state"), "action": published.statistics("action")}
+    modalities = {
+        "video": {"modality_keys": ["wrist_image", "front"], "delta_indices": [0]},
+        "state": {"modality_keys": ["arm", "grip"]},
+        "action": {"modality_keys": ["arm", "grip"], "action_configs": [{}, {}]},
+    }
+    pack = {
+        "raw_stats": groups,
+        "modality_config": modalities,
+        "use_percentiles": True,
+        "video_modality_keys": ["wrist", "front"],
+    }
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch, **pack)
+    decode = {"registry_name": "groot_n1_7_action_decode_v1", "config": {}}
+    published.write(source / "policy_postprocessor.json", {"steps": [decode]})
+    found = LeRobotGR00TFormat().read(source)
+    assert found.img_keys == ("wrist", "front")
+    assert found.model["embodiment_id"] == 2
+    entry = found.statistics["private"]["action"]
+    np.testing.assert_allclose(entry["q99"], joined("action", "q99"))
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (
+            {
+                "registry_name": "groot_action_unpack_unnormalize_v2",
+                "config": {"libero_gripper_action": True},
+            },
+            "turns its gripper's actions into LIBERO's",
+        ),
+        ({"registry_name": "absolute_actions_processor"}, "counts its actions from the state"),
+    ],
+)
+def test_what_lerobot_does_to_actions_and_is_not_done_here(step, words, tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
+    published.write(source / "policy_postprocessor.json", {"steps": [step]})
+    found = LeRobotGR00TFormat().read(source)
+    assert found.statistics == {"private": {}}
+    assert words in found.notes[-1]
+
+
+def test_a_processor_of_another_policy_is_refused(tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
+    steps = [{"registry_name": "normalizer_processor"}]
+    published.write(source / "policy_preprocessor.json", {"steps": steps})
+    with pytest.raises(CheckpointError, match="has the steps normalizer_processor; one of groot_p"):
+        LeRobotGR00TFormat().read(source)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
     "fluxvla-gr00t": {
-        "checkpoint_formats": ("GR00TN15Format", "GR00TN17Format"),
+        "checkpoint_formats": ("GR00TN15Format", "GR00TN17Format", "LeRobotGR00TFormat"),
         "heads": ("GR00TActionHead",),
         "transforms": (
             "ClipNormalized",

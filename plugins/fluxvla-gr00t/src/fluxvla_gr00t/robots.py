@@ -177,6 +177,31 @@ def grouped_robot(
     return replace(robot, statistics=widened)
 
 
+def flat_robot(tag: str, number: int, values: Mapping[str, Any], where: str) -> Robot:
+    """One robot whose statistics are not in groups.
+
+    Args:
+        values: ``observation.state.<statistic>`` and ``action.<statistic>`` -> numbers.
+
+    Raises:
+        CheckpointError: they are damaged.
+    """
+    tables: dict[str, dict[str, Any]] = {"observation.state": {}, "action": {}}
+    for name, numbers in values.items():
+        feature, _, statistic = name.rpartition(".")
+        if feature in tables:
+            tables[feature][statistic] = numbers
+    robot = Robot(tag=tag, embodiment_id=number)
+    if not all(tables.values()):
+        return replace(robot, notes=(_NO_STATISTICS,))
+    entries = {
+        "proprio": _joined([_group(tables, "observation.state", where)], where),
+        "action": _joined([_group(tables, "action", where)], where),
+    }
+    widened = {key: _widened(entry, ("min", "max")) for key, entry in entries.items()}
+    return replace(robot, statistics=widened)
+
+
 _NO_STATISTICS = "it has no statistics of a robot: it can be trained on, and drives none"
 
 

@@ -140,6 +140,13 @@ def test_actions_counted_from_the_state_are_read(tmp_path, monkeypatch):
     assert found.transforms
 
 
+def test_grippers_of_libero_are_not_converted(tmp_path, monkeypatch):
+    source = published.folder("n1.7", tmp_path / "theirs", monkeypatch, ("libero_sim",))
+    found = GR00TN17Format().read(source)
+    assert found.statistics == {"private": {}}
+    assert "those of LIBERO's simulator 1 to -1" in found.notes[0]
+
+
 def test_relative_poses_of_a_hand_are_to_train_on(tmp_path, monkeypatch):
     source = published.folder("n1.7", tmp_path / "theirs", monkeypatch)
     relative_to_state(source, {"rep": "RELATIVE", "type": "EEF", "format": "XYZ_ROT6D"})
@@ -206,7 +213,7 @@ def test_what_lerobot_knows_of_groups_of_joints_is_read(tmp_path, monkeypatch):
                 "registry_name": "groot_action_unpack_unnormalize_v2",
                 "config": {"libero_gripper_action": True},
             },
-            "turns its gripper's actions into LIBERO's",
+            "its gripper's actions are 0 to 1, and those of LIBERO's",
         ),
         ({"registry_name": "absolute_actions_processor"}, "counts its actions from the state"),
     ],

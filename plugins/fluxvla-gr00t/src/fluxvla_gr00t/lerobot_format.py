@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_gr00t.robots import Robot, flat_robot, grouped_robot
+from fluxvla_gr00t.robots import GRIPPER, Robot, flat_robot, grouped_robot
 from fluxvla_gr00t.tables import (
     checkpoint,
     model_table,
@@ -132,19 +132,17 @@ def _robot(folder: Path, packing: Mapping[str, Any], config: Mapping[str, Any]) 
         robot = grouped_robot(tag, number, *tables, settings, where)
     else:
         robot = flat_robot(tag, number, _state_of(folder, packing), where)
-    robot = replace(robot, img_keys=_cameras(config, pack))
+    trained = pack.get("valid_action_horizon")
+    horizon = trained if isinstance(trained, int) else robot.horizon
+    robot = replace(robot, img_keys=_cameras(config, pack), horizon=horizon)
     changed = ("libero_gripper_action", "action_decode_transform")
     if any(step.get(name) for step in post.values() for name in changed):
-        return replace(robot, statistics={}, notes=(*robot.notes, _GRIPPER))
+        return replace(robot, statistics={}, notes=(GRIPPER,))
     if "absolute_actions_processor" in post:
         return replace(robot, statistics={}, notes=(*robot.notes, _RELATIVE))
     return robot
 
 
-_GRIPPER = (
-    "LeRobot turns its gripper's actions into LIBERO's, which is not done here: it can be trained "
-    "on, and drives no robot"
-)
 _RELATIVE = (
     "LeRobot counts its actions from the state by a step of its own, which is not done here: it "
     "can be trained on, and drives no robot"

@@ -151,7 +151,7 @@ def grouped_robot(
         else ("quantile" if settings.get("use_percentiles") else "min_max"),
         horizon=len(action.get("delta_indices") or []) or None,
     )
-    refusal = _refusal(video, action, settings)
+    refusal = _refusal(tag, video, action, settings)
     if refusal:
         return replace(robot, notes=(refusal,))
     states = _names(_table(config, "state", where), where)
@@ -202,6 +202,10 @@ def flat_robot(tag: str, number: int, values: Mapping[str, Any], where: str) -> 
     return replace(robot, statistics=widened)
 
 
+GRIPPER = (
+    "its gripper's actions are 0 to 1, and those of LIBERO's simulator 1 to -1, to which they are "
+    "not converted here: it can be trained on, and drives no robot"
+)
 _NO_STATISTICS = "it has no statistics of a robot: it can be trained on, and drives none"
 
 
@@ -220,9 +224,11 @@ def _chosen(tags: Mapping[str, Any]) -> str | None:
 
 
 def _refusal(
-    video: Mapping[str, Any], action: Mapping[str, Any], settings: Mapping[str, Any]
+    tag: str, video: Mapping[str, Any], action: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> str | None:
     """Why the robot cannot be driven, if so."""
+    if tag == "libero_sim":
+        return GRIPPER
     if len(video.get("delta_indices") or [0]) != 1:
         return "it looks at several frames at once: it can be trained on, and drives no robot"
     poses = [

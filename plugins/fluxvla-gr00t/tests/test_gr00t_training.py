@@ -37,15 +37,13 @@ MODELS = {"n1.5": TINY_N15, "n1.7": TINY_N17}
 SIDES = {"n1.5": 28, "n1.7": 16}
 # Runner, version, settings of the model and of the runner.
 RUNS = {
-    "fsdp-n1.5": ("FSDPTrainRunner", "n1.5", {"freeze_vlm_backbone": False}, {}),
-    "fsdp-n1.7": ("FSDPTrainRunner", "n1.7", {"freeze_vlm_backbone": False}, {}),
-    "fsdp-n1.7-frozen": ("FSDPTrainRunner", "n1.7", {}, {}),
-    "fsdp-n1.5-recomputed": (
+    "fsdp-n1.5": (
         "FSDPTrainRunner",
         "n1.5",
         {"freeze_vlm_backbone": False},
         {"enable_gradient_checkpointing": True},
     ),
+    "fsdp-n1.7-frozen": ("FSDPTrainRunner", "n1.7", {}, {}),
     "ddp-n1.5-frozen": ("DDPTrainRunner", "n1.5", {}, {}),
     "ddp-n1.7": ("DDPTrainRunner", "n1.7", {"freeze_vlm_backbone": False}, {}),
 }
@@ -81,7 +79,7 @@ def run(name, kind, batch, work_dir, resume=None, head=None, **more):
     _, version, model, settings = RUNS[name]
     table = {
         "type": kind,
-        "max_steps": 4,
+        "max_steps": 3,
         "max_grad_norm": 1.0,
         "learning_rate": 1e-3,
         "collator": {"type": "DictCollator", "keys": list(KEYS)},
@@ -129,7 +127,7 @@ def test_two_processes_train_as_one_does(trained, name, tmp_path):
 
 def test_it_goes_on_bit_for_bit_with_its_dropout(tmp_path):
     head = {"dropout": 0.2, "state_dropout": 0.3}
-    both = {"head": head, "save_iter_interval": 2, "max_keep_ckpts": 0}
+    both = {"head": head, "save_iter_interval": 2, "max_keep_ckpts": 0, "max_steps": 4}
     run("fsdp-n1.5", "OneProcessRunner", 4, tmp_path / "whole", **both)
     first, last = sorted((tmp_path / "whole" / "checkpoints").glob("step-*"))
     run("fsdp-n1.5", "OneProcessRunner", 4, tmp_path / "on", resume=str(first), **both)
@@ -147,7 +145,7 @@ def test_it_learns_a_batch_and_only_what_is_not_frozen_moves(version, frozen):
     batch = {k: torch.from_numpy(np.stack([sample[k] for sample in samples])) for k in KEYS}
     optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], 3e-3)
     losses = []
-    for _ in range(100):
+    for _ in range(70):
         optimizer.zero_grad()
         loss = model(**batch)["loss"]
         loss.backward()

@@ -10,6 +10,7 @@ import pytest
 from fluxvla_gr00t import robots
 
 from fluxvla_core.cli.main import main
+from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
 from fluxvla_core.operators import Camera, Continuation, EmbodimentSpec, Joint
 
@@ -139,3 +140,72 @@ def aloha(tmp_path, words, monkeypatch):
     options = ["--tokenizer", str(words), "--embodiment", str(tmp_path / "aloha.json")]
     assert main(["import-checkpoint", str(source), str(out), *options]) == 0
     return out
+
+
+@pytest.mark.parametrize(
+    ("version", "name"), [("n1.5", "gr00t_n15_aloha"), ("n1.7", "gr00t_n17_libero")]
+)
+def test_a_config_trains_from_a_published_checkpoint_and_acts(version, name, tmp_path, monkeypatch):
+    words = published.tokenizer(version, tmp_path / "words")
+    backbone = {**published.BACKBONES[version], "image_size": 224}
+    size = {"n1.5": (64, 32), "n1.7": (132, 132)}[version]
+    head = {**published.HEADS[version], "state_dim": size[0], "action_dim": size[1]}
+    if version == "n1.7":
+        backbone.pop("image_size")
+    monkeypatch.setitem(published.BACKBONES, version, backbone)
+    monkeypatch.setitem(published.HEADS, version, head)
+    source = published.folder(version, tmp_path / "theirs", monkeypatch, ("gr1", "so100"))
+    cameras = {
+        "n1.5": ("cam_high", "cam_left_wrist", "cam_right_wrist"),
+        "n1.7": ("agentview", "robot0_eye_in_hand"),
+    }[version]
+    record(tmp_path / "data", cameras)
+    model = {
+        "_delete_": True,
+        "type": "GR00T",
+        "vlm_backbone": backbone,
+        "vla_head": {**head, "ori_action_dim": 3},
+        "pretrained_name_or_path": str(source),
+    }
+    base = str(CONFIGS / f"{name}.py")
+    (tmp_path / "tiny.py").write_text(f"_base_ = {base!r}\nmodel = {model!r}\n")
+    place = 1 if version == "n1.7" else 0
+    transform = f"train_dataloader.dataset.transforms.{place}"
+    settings = [
+        f"train_dataloader.dataset.data_root_path={str(tmp_path / 'data')!r}",
+        "train_dataloader.dataset.action_window_size=6",
+        "train_dataloader.dataset.embodiment_id=1",
+        "train_dataloader.per_device_batch_size=2",
+        "train_dataloader.per_device_num_workers=0",
+        f"{transform}.tokenizer.model_path={str(words)!r}",
+        f"{transform}.max_len=1000",
+        "runner.max_steps=2",
+        "runner.enable_mixed_precision_training=false",
+    ]
+    words_of = [word for setting in settings for word in ("--set", setting)]
+    run = ["run", "--config", str(tmp_path / "tiny.py"), "--section", "runner"]
+    assert main([*run, "--work-dir", str(tmp_path / "work"), *words_of]) == 0
+    policy = load_policy(tmp_path / "work")
+    policy.reset(0)
+    observation = {
+        "qpos": np.zeros(3, np.float32),
+        "images": {camera: np.zeros((32, 48, 3), np.uint8) for camera in cameras},
+        "task_description": "lift the cup",
+    }
+    chunk = policy.predict_action(observation)
+    assert chunk.shape == (6, 3)
+    assert np.isfinite(chunk).all()
+
+
+def record(folder, cameras):
+    """Two short episodes of three joints."""
+    joints = tuple(Joint(f"j{i}", "rad", -3.0, 3.0, 1.0, 1.0) for i in range(3))
+    robot = EmbodimentSpec("arm", joints, tuple(Camera(c, 32, 48) for c in cameras), 10.0)
+    rng = np.random.default_rng(0)
+    with LeRobotWriter(folder, 10, robot) as writer:
+        for _ in range(2):
+            for _ in range(8):
+                images = {c: rng.integers(0, 256, (32, 48, 3), dtype=np.uint8) for c in cameras}
+                values = rng.normal(size=(2, 3)).astype(np.float32)
+                writer.add_frame(images, values[0], values[1], "lift the cup")
+            writer.save_episode()

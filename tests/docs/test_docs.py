@@ -56,6 +56,7 @@ NO_INDEX = (
 )
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+PUBLISHED = "fetches published weights of several GB; the plugin's tests run it on tiny ones"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
@@ -85,6 +86,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
         ],
         NO_INDEX: [
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
+            ("plugins/fluxvla-gr00t/README.md", "pip install fluxvla-gr00t 'fluxvla-core[hub]'"),
             (
                 "plugins/fluxvla-gymnasium/README.md",
                 "pip install fluxvla-gymnasium gym-aloha        "
@@ -138,6 +140,18 @@ NOT_RUN: dict[tuple[str, str], str] = {
             (
                 "plugins/fluxvla-pi/README.md",
                 "fluxvla export work_dirs/pi05 exported --format lerobot",
+            ),
+        ],
+        PUBLISHED: [
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_gr00t policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 20",
+            ),
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla run --config configs/gr00t_n15_aloha.py --section runner --nproc 8 "
+                "--set model.pretrained_name_or_path=hf:nvidia/GR00T-N1.5-3B",
             ),
         ],
         EXAMPLE: [

@@ -17,6 +17,18 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-gr00t": {
+        "checkpoint_formats": ("GR00TN15Format", "GR00TN17Format", "LeRobotGR00TFormat"),
+        "heads": ("GR00TActionHead",),
+        "transforms": (
+            "ClipNormalized",
+            "ListInstruction",
+            "ProcessQwenPrompts",
+            "ResizeCropImages",
+        ),
+        "vlas": ("GR00T",),
+        "vlm_backbones": ("EagleBackbone", "Qwen3VLBackbone"),
+    },
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-latency": {"hooks": ("LatencyLog",)},
     "fluxvla-libero": {

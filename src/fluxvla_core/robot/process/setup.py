@@ -22,6 +22,7 @@ from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.safety import SafetySettings
 from fluxvla_core.robot.episode import EpisodeSettings
+from fluxvla_core.robot.process.whole_robot import WholeRobot
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -45,6 +46,8 @@ class ControlSetup:
         registered: of the operator and the filters those that the main process registered itself:
             registry, name and import path.
         plugin_files: of ``--plugin``, which register their classes; those of this process.
+        cameras: of an operator that runs as a whole in the control process: names of the cameras
+            that the main process is shown. None where it is divided.
     """
 
     config: Mapping[str, Any]
@@ -60,6 +63,7 @@ class ControlSetup:
     python_path: Sequence[str] = ()
     registered: Sequence[tuple[str, str, str]] = ()
     plugin_files: Sequence[str] = field(default_factory=plugin_files)
+    cameras: Sequence[str] | None = None
 
     def to_json(self) -> str:
         """As JSON.
@@ -86,6 +90,8 @@ class ControlSetup:
         """
         self._import_registered()
         built = build_operator_from_cfg(self.operator, self._context(reporter))
+        if self.cameras is not None:
+            return WholeRobot(built, self._spec())
         return Robot(Operator.adapt(built).without_cameras() or built, self._spec())
 
     def make_filters(self, reporter: Reporter) -> list[ActionFilter]:

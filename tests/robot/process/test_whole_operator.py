@@ -1,0 +1,299 @@
+"""An operator that cannot be divided, as a whole in a real control process."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fluxvla_core.build import RunContext
+from fluxvla_core.errors import FluxError, NotReady, SafetyStop
+from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.robot.runner import BaseInferenceRunner
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+
+pytestmark = pytest.mark.realtime
+
+MODULE = '''
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.errors import NotReady
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+
+class OldArm(Operator):
+    """State and pictures in one; counts its frames in the first pixel. Its folder has the log."""
+
+    api = "1.0"
+
+    def __init__(self, folder, spec, fault=None):
+        self.embodiment = EmbodimentSpec.from_dict(spec)
+        self._folder, self._fault, self._frames = Path(folder), fault, 0
+
+    def _log(self, name, *numbers):
+        with open(self._folder / name, "a") as log:
+            log.write(" ".join(map(repr, map(float, numbers))) + "\\n")
+
+    def connect(self):
+        self._log("connected", os.getpid())
+        self._state = np.zeros(2)
+
+    def get_frame(self):
+        self._frames += 1
+        if self._fault == "late" and self._frames < 4:
+            raise NotReady("the camera warms up")
+        if self._fault == "raises" and self._frames > 4:
+            raise RuntimeError("cable pulled")
+        if self._fault == "size" and self._frames > 4:
+            return self._frame(np.zeros((48, 64, 3), np.uint8))
+        if self._fault == "slow":
+            time.sleep(0.15)
+        image = np.zeros((24, 32, 3), np.uint8)
+        image[0, 0] = self._frames % 256, 2, 3
+        image[1:] = image[0, 0]
+        return self._frame(image)
+
+    def _frame(self, image):
+        now = time.monotonic()
+        return Frame(self._state.copy(), {"front": image, "unused": image},
+                     {"state": now, "front": now})
+
+    def send_action(self, action):
+        self._log("sent", time.monotonic(), *action)
+        if self._fault != "blocked" or self._frames < 4:
+            self._state = np.array(action)
+
+    def stop(self):
+        self._log("stopped", time.monotonic())
+
+    def close(self): ...
+
+    def task_success(self):
+        return True
+
+    def episode_facts(self):
+        return {"frames": self._frames}
+
+
+class SpecArm:
+    """As the specification writes it: the constructor connects, the config knows the robot."""
+
+    def __init__(self, folder):
+        self._arm = OldArm(folder, json.loads((Path(folder) / "spec.json").read_text()))
+        self._arm.connect()
+
+    def get_frame(self):
+        return self._arm.get_frame()
+
+    def send_action(self, action):
+        self._arm.send_action(action)
+
+    def stop(self):
+        self._arm.stop()
+'''
+SPEC = EmbodimentSpec(
+    "testarm",
+    (
+        Joint("shoulder", "rad", -1.0, 1.5, 2.0, 10.0),
+        Joint("elbow", "rad", -2.0, 2.0, 3.0, 20.0),
+    ),
+    (Camera("front", 24, 32), Camera("unused", 24, 32)),
+    50.0,
+)
+
+
+class Looking:
+    """Moves on, and remembers what it saw."""
+
+    embodiment = SPEC
+    action_rate_hz = 10.0
+    horizon = 5
+    cameras = ("front",)
+
+    def __init__(self):
+        self.seen, self.thinks_s = [], 0.02
+
+    def reset(self, seed): ...
+
+    def predict_action(self, observation):
+        self.seen.append(observation["images"])
+        time.sleep(self.thinks_s)
+        pose = np.asarray(observation["qpos"], dtype=np.float64)
+        chunk = np.repeat(pose[None], 5, axis=0)
+        chunk[:, 0] = np.minimum(pose[0] + 0.1 * np.arange(1, 6), 1.4)
+        return chunk
+
+
+class Notes:
+    def __init__(self):
+        self.lines = []
+
+    def info(self, text):
+        self.lines.append(text)
+
+    warn = info
+
+    def progress(self, *what): ...
+
+    def metric(self, *what): ...
+
+    def artifact(self, *what): ...
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    (tmp_path / "users_arms.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    made = importlib.import_module("users_arms")
+    OPERATORS.register_module()(made.OldArm)
+    OPERATORS.register_module()(made.SpecArm)
+    yield made
+    for name in ("OldArm", "SpecArm"):
+        OPERATORS.unregister(name)
+    del sys.modules["users_arms"]
+
+
+class Run:
+    """A run of an arm, and what it left behind."""
+
+    def __init__(self, folder, kind="OldArm", **changed):
+        self._folder = folder
+        self.policy, self.notes = Looking(), Notes()
+        table = {"type": kind, "folder": str(folder)}
+        if kind == "OldArm":
+            table |= {"spec": SPEC.to_dict(), "fault": changed.pop("fault", None)}
+        context = RunContext(section="inference", work_dir=folder, task="1", reporter=self.notes)
+        self.runner = BaseInferenceRunner(
+            context=context, operator=table, policy=self.policy, task_descriptions={"1": "wave"},
+            record_fps=None, **{"max_publish_step": 60, "async_execution": True, **changed},
+        )  # fmt: skip
+        self.runner.run_setup()
+
+    @property
+    def episode(self):
+        folder = self._folder / "inference" / "001-1"
+        return json.loads((folder / "episode.json").read_text())
+
+    def log(self, name):
+        return np.loadtxt(self._folder / name, ndmin=2)
+
+    def assert_within_limits(self):
+        path = np.vstack([np.zeros((2, 2)), self.log("sent")[:, 1:]])
+        speed = np.diff(path, axis=0) * 50.0
+        push = np.diff(speed, axis=0) * 50.0
+        assert (np.abs(speed).max(axis=0) <= [2.0 + 1e-9, 3.0 + 1e-9]).all()
+        assert (np.abs(push).max(axis=0) <= [10.0 + 1e-6, 20.0 + 1e-6]).all()
+        assert np.abs(speed[-1]).max() < 1e-9
+
+
+def test_an_episode_with_pictures_of_the_process_that_commands(tmp_path, module):
+    run = Run(tmp_path)
+
+    result = run.runner.run()
+
+    assert run.runner.divided
+    assert (result["outcome"], result["success"]) == ("max_steps", True)
+    assert "OldArm is not divided: the control process reads its pictures too" in run.notes.lines
+    (connected,) = run.log("connected")
+    assert connected[0] != os.getpid()
+    run.assert_within_limits()
+    # Each picture is of a look of its own, and only the camera that the policy looks at is there.
+    counts = []
+    for images in run.policy.seen:
+        assert set(images) == {"front"}
+        assert images["front"].shape == (24, 32, 3)
+        np.testing.assert_array_equal(images["front"][-1, -1], images["front"][0, 0])
+        counts.append(int(images["front"][0, 0, 0]))
+    assert counts == sorted(set(counts))
+    assert run.runner.episode_facts()["frames"] == counts[-1]
+    assert len(run.log("sent")) >= 60
+
+
+def test_a_constructor_that_connects_is_called_in_the_control_process_alone(tmp_path, module):
+    (tmp_path / "spec.json").write_text(json.dumps(SPEC.to_dict()))
+    run = Run(tmp_path, "SpecArm", embodiment=SPEC)
+
+    assert run.runner.robot.name == "SpecArm"
+    assert not (tmp_path / "connected").exists()
+    run.runner.run()
+
+    (connected,) = run.log("connected")
+    assert connected[0] != os.getpid()
+    run.assert_within_limits()
+
+
+def test_one_that_nobody_describes_is_built_here(tmp_path, module):
+    (tmp_path / "spec.json").write_text(json.dumps(SPEC.to_dict()))
+
+    with pytest.raises(FluxError, match="SpecArm has no embodiment"):
+        Run(tmp_path, "SpecArm")
+
+
+def test_a_camera_that_warms_up_is_waited_for(tmp_path, module):
+    run = Run(tmp_path, fault="late")
+
+    assert run.runner.run()["outcome"] == "max_steps"
+    assert run.policy.seen[0]["front"][0, 0, 0] == 5
+
+
+def test_a_slow_get_frame_makes_no_command_late(tmp_path, module):
+    run = Run(tmp_path, fault="slow", max_publish_step=100)
+
+    run.runner.run()
+
+    gaps = np.diff(run.log("sent")[:, 0])
+    assert len(run.policy.seen) >= 5
+    # Several looks of 0.15 s: a thread that waited for one would miss seven commands.
+    assert np.quantile(gaps, 0.95) < 0.03
+    run.assert_within_limits()
+
+
+@pytest.mark.parametrize(
+    ("fault", "rule", "said"),
+    [
+        ("raises", "frame", r"OldArm\.get_frame\(\) raised RuntimeError: cable pulled"),
+        ("size", "frame", r"camera front gives \(48, 64, 3\) uint8, the embodiment says"),
+        # There is no get_state: what frames say of the arm is compared with its commands.
+        ("blocked", "tracking", "shoulder is .* away from its command"),
+    ],
+)
+def test_what_goes_wrong_stops_the_arm_and_is_named(tmp_path, module, fault, rule, said):
+    run = Run(tmp_path, fault=fault, max_publish_step=500)
+    # A policy that sees at once that an arm is blocked would not go on.
+    run.policy.thinks_s = 0.4 if fault == "blocked" else 0.02
+
+    with pytest.raises(SafetyStop, match=said):
+        run.runner.run()
+
+    assert [trip["rule"] for trip in run.episode["trips"]] == [rule]
+    assert run.log("stopped")[0, 0] > run.log("sent")[-1, 0]
+    if fault != "blocked":
+        run.assert_within_limits()
+
+
+def test_a_robot_whose_first_frame_never_comes(tmp_path, module):
+    spec = SPEC.to_dict()
+    Path(tmp_path / "users_arms.py").write_text(MODULE.replace("self._frames < 4", "True"))
+    context = RunContext(section="inference", work_dir=tmp_path, task="1")
+    runner = BaseInferenceRunner(
+        context=context, policy=Looking(), task_descriptions={"1": "wave"}, ready_timeout=0.5,
+        operator={"type": "OldArm", "folder": str(tmp_path), "spec": spec, "fault": "late"},
+    )  # fmt: skip
+    runner.run_setup()
+
+    with pytest.raises(NotReady, match=r"no complete reading within 0\.5 s: the camera warms up"):
+        runner.run()
+    assert not (tmp_path / "sent").exists()

@@ -124,9 +124,10 @@ class Looking:
     cameras = ("front",)
 
     def __init__(self):
-        self.seen, self.thinks_s = [], 0.02
+        self.seen, self.thinks_s, self.resets_s = [], 0.02, 0.0
 
-    def reset(self, seed): ...
+    def reset(self, seed):
+        time.sleep(self.resets_s)
 
     def predict_action(self, observation):
         self.seen.append(observation["images"])
@@ -175,7 +176,8 @@ class Run:
         table = {"type": kind, "folder": str(folder)}
         if kind == "OldArm":
             table |= {"spec": SPEC.to_dict(), "fault": changed.pop("fault", None)}
-        context = RunContext(section="inference", work_dir=folder, task="1", reporter=self.notes)
+        tasks = {"task_file": changed.pop("task_file")} if "task_file" in changed else {"task": "1"}
+        context = RunContext(section="inference", work_dir=folder, reporter=self.notes, **tasks)
         self.runner = BaseInferenceRunner(
             context=context, operator=table, policy=self.policy, task_descriptions={"1": "wave"},
             record_fps=None, **{"max_publish_step": 60, "async_execution": True, **changed},
@@ -258,6 +260,22 @@ def test_a_slow_get_frame_makes_no_command_late(tmp_path, module):
     assert len(run.policy.seen) >= 5
     # Several looks of 0.15 s: a thread that waited for one would miss seven commands.
     assert np.quantile(gaps, 0.95) < 0.03
+    run.assert_within_limits()
+
+
+def test_a_held_arm_hears_commands_while_the_next_episode_begins(tmp_path, module):
+    """Some drivers stop an arm that hears nothing."""
+    (tmp_path / "tasks.txt").write_text("1\n1\n")
+    run = Run(tmp_path, task_file=str(tmp_path / "tasks.txt"), max_publish_step=25)
+    run.policy.resets_s = 1.0
+
+    assert run.runner.run()["episodes"] == 2
+
+    sent = run.log("sent")
+    assert np.diff(sent[:, 0]).max() < 0.5
+    # Three resets of a second, of the second episode, in which the arm is held.
+    rests = np.abs(np.diff(sent[:, 1:], axis=0)).max(axis=1) == 0.0
+    assert rests.sum() > 100
     run.assert_within_limits()
 
 

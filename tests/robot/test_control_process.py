@@ -153,13 +153,13 @@ def local_arm():
 @pytest.mark.parametrize(
     ("operator", "cls", "why"),
     [
-        ({"type": "Arm"}, OwnObservation, "Arm cannot be divided, and OwnObservation reads it"),
+        ({"type": "Arm"}, OwnObservation, "OwnObservation reads the robot by a method of its own"),
         ({"type": "Recorded"}, BaseInferenceRunner, "Recorded follows no commands"),
         ({"type": "OwnClock"}, BaseInferenceRunner, "OwnClock .* has a clock of its own"),
         ({"type": "Connecting"}, BaseInferenceRunner, "Connecting connects in its constructor"),
         (DividedArm(), BaseInferenceRunner, "DividedArm is an object, not a table"),
         ({"type": "Simulated"}, BaseInferenceRunner, "stands still between commands"),
-        ({"type": "DividedArm"}, OwnSending, "OwnSending has an _execute_actions of its own"),
+        ({"type": "DividedArm"}, OwnSending, "OwnSending sends commands by a method of its own"),
         (local_arm, BaseInferenceRunner, "Local is defined where no other process can import it"),
     ],
 )

@@ -12,9 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from fluxvla_core.build import RunContext, parameters
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.robot import Operator
-from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS
+from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS, RUNNERS
 from fluxvla_core.robot.control.clock import MonotonicClock, clock_of, in_lockstep
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import import_path, not_plain
@@ -49,6 +50,7 @@ class Division:
         tables: what the other process builds its part from; None where there is no other.
         obstacle: why there is none; None where there is.
         frames: ``operator``, where the other process has all of the robot.
+        runner: the table of the runner, where that process needs its methods too.
     """
 
     operator: Any
@@ -56,6 +58,7 @@ class Division:
     tables: Tables | None = None
     obstacle: str | None = None
     frames: RemoteOperator | None = None
+    runner: Mapping[str, Any] | None = None
 
     @property
     def remark(self) -> str | None:
@@ -67,6 +70,12 @@ class Division:
         return f"no control process: {self.obstacle}"
 
 
+_SENDING = ("_execute_actions",)
+_OBSERVING = ("get_ros_observation", "update_observation_window")
+# Of every class.
+_USUAL = ("_abc_impl", "api")
+
+
 @dataclass(frozen=True)
 class RunnersOwn:
     """What a runner does with its operator by methods of its own.
@@ -75,21 +84,50 @@ class RunnersOwn:
         runner: the name of its class.
         sends, observes: whether it has an ``_execute_actions``, or a ``get_ros_observation`` or
             ``update_observation_window``.
+        table: what it is built from, without its policy; None where nobody knows.
+        obstacle: why another process cannot have these methods; None where it can.
     """
 
     runner: str
-    sends: bool = False
-    observes: bool = False
+    sends: bool
+    observes: bool
+    table: Mapping[str, Any] | None
+    obstacle: str | None
 
     @classmethod
-    def of(cls, runner: type, base: type) -> RunnersOwn:
-        """Of a class that is derived from ``BaseInferenceRunner``."""
+    def of(cls, runner: type, base: type, context: RunContext) -> RunnersOwn:
+        """Of a class that is derived from ``BaseInferenceRunner``; ``context`` is the run's."""
+        derived = runner.__mro__[: runner.__mro__.index(base)]
+        defined = {name for each in derived for name in vars(each)}
+        known = {*_SENDING, *_OBSERVING, *_USUAL}
+        changed = sorted(defined & set(vars(base)) - known)
+        more = [name for name in changed if not name.startswith("__")]
+        said = context.config.get(context.section)
+        table, name = None, runner.__name__
+        if isinstance(said, Mapping) and said.get("type") in RUNNERS:
+            found = RUNNERS.get(said["type"])
+            left = {key: value for key, value in said.items() if key != "policy"}
+            table = {**left, "control_process": False} if found is runner else None
+        obstacle = None
+        if table is None:
+            obstacle = f"{name} was not built from the config"
+        elif "control_process" not in parameters(runner):
+            obstacle = f"{name} takes no control_process"
+        elif RUNNERS.registered(table["type"]) is not None and import_path(runner) is None:
+            obstacle = f"{name} is defined where no other process can import it"
+        elif more:
+            obstacle = f"{name} also has a {more[0]} of its own"
+        return cls(
+            name, bool(defined & {*_SENDING}), bool(defined & {*_OBSERVING}), table, obstacle
+        )
 
-        def has(*methods: str) -> bool:
-            return any(getattr(runner, name) is not getattr(base, name) for name in methods)
-
-        observes = has("get_ros_observation", "update_observation_window")
-        return cls(runner.__name__, has("_execute_actions"), observes)
+    @property
+    def keeps_here(self) -> str | None:
+        """Why its methods keep the operator in this process; None if they do not."""
+        if self.obstacle is None or not (self.sends or self.observes):
+            return None
+        method = "sends commands" if self.sends else "reads the robot"
+        return f"{self.runner} {method} by a method of its own, and {self.obstacle}"
 
 
 def divide(
@@ -114,34 +152,39 @@ def divide(
     Raises:
         ConfigError, PluginError: the operator cannot be built, or lacks something.
     """
-    if own.sends:
-        obstacle = f"{own.runner} has an _execute_actions of its own"
-    obstacle = obstacle or _obstacle(tables, config)
+    obstacle = obstacle or _obstacle(tables, config) or (own.keeps_here if own.sends else None)
     cls = None if obstacle else OPERATORS.get(tables.operator["type"])
     known = None if cls is None else _known_before(cls, embodiment)
-    if cls is not None and known is not None and not own.observes:
-        return _whole(RemoteOperator(cls.__name__, known), embodiment, cls, tables)
+    if cls is not None and known is not None and own.keeps_here is None:
+        return _whole(RemoteOperator(cls.__name__, known), embodiment, cls, tables, own)
     made = build()
     operator = Operator.adapt(made)
     if obstacle is None and in_lockstep(clock_of(operator)):
         obstacle = "the time of this simulation stands still between commands"
     if obstacle is not None:
         return Division(made, Robot(made, embodiment, own.sends), obstacle=obstacle)
-    if implements(made, Operator, "without_cameras"):
+    if implements(made, Operator, "without_cameras") and not own.sends:
         part = operator.without_commands()
         if part is not None:
             return Division(part, Robot(part, embodiment), tables)
     # All that is wrong with it is found here, before another process is started.
-    robot = Robot(made, embodiment)
-    obstacle = _keeps_here(robot, operator, own)
+    robot = Robot(made, embodiment, own.sends)
+    obstacle = own.keeps_here or _keeps_here(robot, operator)
     if obstacle is not None:
         return Division(made, robot, obstacle=obstacle)
     stand_in = RemoteOperator(robot.name, robot.embodiment, operator.domain_id)
-    return _whole(stand_in, None, type(made), tables)
+    return _whole(stand_in, None, type(made), tables, own)
 
 
-def _whole(frames: RemoteOperator, embodiment: Embodiment, cls: type, tables: Tables) -> Division:
-    return Division(frames, Robot(frames, embodiment, kind=cls), tables, frames=frames)
+def _whole(
+    frames: RemoteOperator, embodiment: Embodiment, cls: type, tables: Tables, own: RunnersOwn
+) -> Division:
+    runner = None
+    if own.table is not None and (own.sends or own.observes):
+        given = {"operator": tables.operator} if "operator" in own.table else {}
+        runner = {**own.table, **given}
+    robot = Robot(frames, embodiment, own.sends, kind=cls)
+    return Division(frames, robot, tables, frames=frames, runner=runner)
 
 
 def _known_before(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
@@ -154,11 +197,9 @@ def _known_before(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
     return EmbodimentSpec.from_dict(embodiment) if isinstance(embodiment, Mapping) else embodiment
 
 
-def _keeps_here(robot: Robot, operator: Operator, own: RunnersOwn) -> str | None:
+def _keeps_here(robot: Robot, operator: Operator) -> str | None:
     """Why an operator that cannot be divided does not run as a whole in another process."""
     name = robot.name
-    if own.observes:
-        return f"{name} cannot be divided, and {own.runner} reads it by a method of its own"
     if not robot.follows:
         return f"{name} follows no commands"
     if not isinstance(robot.clock, MonotonicClock):

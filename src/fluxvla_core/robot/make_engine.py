@@ -79,11 +79,15 @@ def make_engine(
         parts.settings.safety,
     )
 
+    observe = parts.observe
+    if division.frames is not None and division.runner is not None:
+        observe = division.frames.observe
+
     def make_source(
         task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
     ) -> LocalSource:
         reader = ObservationReader(
-            robot, parts.observe, task.instruction, parts.cameras, safety, parts.ready_s,
+            robot, observe, task.instruction, parts.cameras, safety, parts.ready_s,
             tracking, thread, interrupts, emit,
         )  # fmt: skip
         caller = PolicyCaller(policy, robot.embodiment, safety, robot.delays, seed)
@@ -104,8 +108,9 @@ def make_engine(
             settings=settings,
             before=history.commanded,
             python_path=sys.path,
-            registered=registered_here(tables.operator, tables.filters),
+            registered=registered_here(tables.operator, tables.filters, division.runner),
             cameras=None if frames is None else parts.cameras,
+            runner=division.runner,
         )
         return RemoteEngine(setup, robot, make_source, latch, interrupts, reporter, history, frames)
     joiner, filters = make_joiner(*parts.joining), parts.filters

@@ -8,7 +8,7 @@ specification's shape overrides ``get_ros_observation``, ``update_observation_wi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,7 +34,7 @@ from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.control.sender import check_pose
+from fluxvla_core.robot.control.sender import Execute, check_pose
 from fluxvla_core.robot.division import RunnersOwn, Tables, divide
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import EpisodeSettings
@@ -45,6 +45,7 @@ from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
+from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.session import RobotSession
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -188,7 +189,7 @@ class BaseInferenceRunner(Runner):
             tables,
             self.context.config,
             embodiment,
-            RunnersOwn.of(type(self), BaseInferenceRunner),
+            RunnersOwn.of(type(self), BaseInferenceRunner, self.context),
             "control_process is False" if control_process is False else None,
         )
         if control_process and self._division.obstacle is not None:
@@ -337,6 +338,18 @@ class BaseInferenceRunner(Runner):
     def _execute_actions(self, actions: Array, rate: Any) -> None:
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
         self.robot.play(actions, rate)
+
+    def commanding_side(
+        self, robot: Robot, cameras: Sequence[str]
+    ) -> tuple[Execute, Callable[[], tuple[dict[str, Any], Frame | None]]]:
+        """In the control process, where there is no policy: what sends commands, and observes.
+
+        Args:
+            robot: takes the place of this runner's.
+            cameras: names of the cameras that the policy looks at.
+        """
+        self.robot, self._cameras = robot, tuple(cameras)
+        return self._execute_actions, self._observe
 
     def _run_episode(self, task: Task) -> dict[str, Any]:
         """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""

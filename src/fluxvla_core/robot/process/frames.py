@@ -14,7 +14,7 @@ import mmap
 import os
 import select
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ _NUMBERS = 64
 _ALIGNED = 64
 # Room for the JSON values: names, stamps, or an error's message.
 _TEXT = 64 * 1024
-_PICTURE = "picture "
+_PICTURE, _MORE, _MEASURED = "picture ", "more ", "measured"
 
 
 class FrameMemory(NamedTuple):
@@ -185,8 +185,66 @@ def frame_of(look: Look) -> Frame:
     return Frame(look.arrays[STATE], pictures, look.fields["stamps"])
 
 
+def look_of_window(
+    window: Mapping[str, Any], frame: Frame | None, cameras: Iterable[str], source: str
+) -> Look:
+    """What a runner's ``update_observation_window`` made of one look at the robot.
+
+    Args:
+        window: ``qpos`` and ``images``; None for what has not come yet. What else it has is arrays
+            of numbers or JSON values.
+        frame: that it was made of, where the operator has frames: state and stamps are sent.
+        cameras: the ones that are asked for.
+        source: what gave it, for messages.
+
+    Raises:
+        BadFrame: it has something that is neither an array of numbers nor a JSON value.
+    """
+    images = window.get("images")
+    if not isinstance(images, Mapping):
+        return Look({"window": None if images is None else repr(images)[:200]})
+    shown = Frame(window.get("qpos"), images, {} if frame is None else frame.stamps)  # type: ignore[arg-type]
+    more = {key: value for key, value in window.items() if key not in ("qpos", "images")}
+    arrays = {_MORE + k: _numbers(v, f"{k} of {source}") for k, v in more.items() if _is_array(v)}
+    values = {key: value for key, value in more.items() if _MORE + key not in arrays}
+    try:
+        json.dumps(values)
+    except (TypeError, ValueError) as error:
+        raise BadFrame(
+            f"{source} has something that no other process can be given: {error}",
+            next="--set <section>.control_process=false keeps it in one process",
+        ) from error
+    waits = [name for name in cameras if name in images and images[name] is None]
+    if window.get("qpos") is None:
+        shown = replace(shown, state=np.empty(0))
+        waits.append(STATE)
+    look = look_of(shown, cameras, source)
+    if frame is not None:
+        arrays[_MEASURED] = _numbers(frame.state, f"the state of {source}")
+    fields = {"window": values, "waits": waits, "frame": frame is not None}
+    return Look({**look.fields, **fields}, {**look.arrays, **arrays})
+
+
+def window_of(look: Look) -> tuple[dict[str, Any], Frame | None]:
+    """The window of ``look_of_window``, and the frame with the window's pictures."""
+    values = look.fields["window"]
+    if not isinstance(values, dict):
+        return {"images": values}, None
+    shown = frame_of(look)
+    more = {k.removeprefix(_MORE): a for k, a in look.arrays.items() if k.startswith(_MORE)}
+    waits = look.fields["waits"]
+    images = {**shown.images, **{name: None for name in waits if name != STATE}}
+    window = {"qpos": None if STATE in waits else shown.state, "images": images, **values, **more}
+    frame = replace(shown, state=look.arrays[_MEASURED]) if look.fields["frame"] else None
+    return window, frame
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, (np.ndarray, np.generic))
+
+
 def _numbers(value: Any, source: str) -> AnyArray:
-    found = np.asarray(value) if isinstance(value, (np.ndarray, list, tuple)) else None
+    found = np.asarray(value) if isinstance(value, (np.ndarray, np.generic, list, tuple)) else None
     if found is None or found.dtype.kind not in "biuf":
         raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
     return found

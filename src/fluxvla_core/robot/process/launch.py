@@ -71,7 +71,10 @@ def stop_through_new_connection(
         try:
             robot = setup.make_robot(reporter)
             robot.connect()
-            found[:] = [text for text in (robot.stop(), robot.close()) if text]
+            failures = [robot.stop(), robot.close()]
+            if not robot.can_stop:
+                failures = [f"{robot.name} has no stop(): use the robot's emergency stop"]
+            found[:] = [text for text in failures if text]
         except (Exception, SystemExit) as error:  # noqa: BLE001 - reported by the caller
             found[:] = [f"the robot could not be stopped through a fresh connection: {error}"]
 

@@ -16,6 +16,7 @@ from fluxvla_core.robot.process.frames import (
     frame_bytes,
     frame_of,
     make_frame_memory,
+    window_of,
 )
 from fluxvla_core.robot.process.messages import error_of
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -74,6 +75,10 @@ class RemoteOperator(Operator):
         """
         return frame_of(self.look())
 
+    def observe(self) -> tuple[dict[str, Any], Frame | None]:
+        """What the runner in the control process makes of one look; raises as ``get_frame``."""
+        return window_of(self.look())
+
     def look(self) -> Look:
         """What the control process makes of one look at the robot; raises as ``get_frame``."""
         with self._lock:
@@ -106,6 +111,12 @@ class RemoteOperator(Operator):
             # Who waits for a frame gives up soon.
             with self._lock:
                 channel.close()
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"{vars(self).get('name')} runs in the control process; here are its frames, and no "
+            f"{name} (--set <section>.control_process=false keeps it in one process)"
+        )
 
     def _gone(self) -> NotReady:
         return NotReady(f"{self.name} gives no frames: the control process does not run")

@@ -72,6 +72,8 @@ class Division:
 
 _SENDING = ("_execute_actions",)
 _OBSERVING = ("get_ros_observation", "update_observation_window")
+# What the control process has no use for, or builds itself.
+_BUILT_APART = ("policy", "action_filters")
 # Of every class.
 _USUAL = ("_abc_impl", "api")
 
@@ -84,7 +86,7 @@ class RunnersOwn:
         runner: the name of its class.
         sends, observes: whether it has an ``_execute_actions``, or a ``get_ros_observation`` or
             ``update_observation_window``.
-        table: what it is built from, without its policy; None where nobody knows.
+        table: what it is built from, without its policy and filters; None where nobody knows.
         obstacle: why another process cannot have these methods; None where it can.
     """
 
@@ -106,7 +108,7 @@ class RunnersOwn:
         table, name = None, runner.__name__
         if isinstance(said, Mapping) and said.get("type") in RUNNERS:
             found = RUNNERS.get(said["type"])
-            left = {key: value for key, value in said.items() if key != "policy"}
+            left = {key: value for key, value in said.items() if key not in _BUILT_APART}
             table = {**left, "control_process": False} if found is runner else None
         obstacle = None
         if table is None:

@@ -6,6 +6,7 @@ import ctypes
 import importlib
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -361,6 +362,26 @@ def test_what_goes_wrong_stops_the_arm_and_is_named(tmp_path, module, fault, rul
     assert run.log("stopped")[0, 0] > run.log("sent")[-1, 0]
     if fault != "blocked":
         run.assert_within_limits()
+
+
+def test_after_a_rearm_a_new_control_process_shows_its_frames(tmp_path, module):
+    run = Run(tmp_path)
+
+    def kill(observation, answer=run.policy.predict_action):
+        if len(run.policy.seen) == 4:
+            os.kill(run.runner._session.engine._process.pid, signal.SIGKILL)
+        return answer(observation)
+
+    run.policy.predict_action = kill
+    with pytest.raises(SafetyStop, match="the control process was killed by SIGKILL"):
+        run.runner.run()
+    # The operator's own stop through a new connection was this process's.
+    assert run.log("connected")[:, 0].tolist()[1:] == [os.getpid()]
+    run.runner.latch.rearm()
+
+    assert run.runner.run()["outcome"] == "max_steps"
+    assert len(run.policy.seen) > 5
+    assert len(set(run.log("connected")[:, 0])) == 3
 
 
 def test_a_robot_whose_first_frame_never_comes(tmp_path, module):

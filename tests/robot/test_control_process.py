@@ -126,6 +126,15 @@ def test_one_that_cannot_be_divided_runs_there_as_a_whole(tmp_path):
     assert isinstance(alone.ros_operator, Arm)
 
 
+@pytest.mark.parametrize("table", [{}, {"type": "Nobody"}, {"type": 3}])
+def test_an_operator_that_is_none_is_an_error_as_ever(tmp_path, table):
+    with pytest.raises(FluxError) as caught:
+        runner(tmp_path, table)
+    with pytest.raises(type(caught.value)) as alone:
+        runner(tmp_path, table, control_process=False)
+    assert str(caught.value) == str(alone.value)
+
+
 def test_one_that_cannot_be_divided_may_be_a_simulation(tmp_path):
     assert runner(tmp_path, {"type": "Placed"}).robot.simulated
     assert not runner(tmp_path, {"type": "Arm"}).robot.simulated

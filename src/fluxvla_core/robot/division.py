@@ -155,7 +155,9 @@ def divide(
         ConfigError, PluginError: the operator cannot be built, or lacks something.
     """
     obstacle = obstacle or _obstacle(tables, config) or (own.keeps_here if own.sends else None)
-    cls = None if obstacle else OPERATORS.get(tables.operator["type"])
+    # What is not there is an error of ``build``.
+    name = None if obstacle else tables.operator.get("type")
+    cls = OPERATORS.get(name) if name in OPERATORS else None
     known = None if cls is None else _known_before(cls, embodiment)
     if cls is not None and known is not None and own.keeps_here is None:
         return _whole(RemoteOperator(cls.__name__, known), embodiment, cls, tables, own)
@@ -218,7 +220,7 @@ def _obstacle(tables: Tables, config: Mapping[str, Any]) -> str | None:
         for each in built:
             if not isinstance(each, Mapping):
                 return f"{type(each).__name__} is an object, not a table"
-            cls = registry.registered(each["type"])
+            cls = registry.registered(each.get("type", ""))
             if cls is not None and import_path(cls) is None:
                 return f"{each['type']} is defined where no other process can import it"
     values = {

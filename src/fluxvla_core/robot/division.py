@@ -156,7 +156,7 @@ def divide(
     """
     obstacle = obstacle or _obstacle(tables, config) or (own.keeps_here if own.sends else None)
     # What is not there is an error of ``build``.
-    name = None if obstacle else tables.operator.get("type")
+    name: str = "" if obstacle else tables.operator.get("type", "")
     cls = OPERATORS.get(name) if name in OPERATORS else None
     known = None if cls is None else _known_before(cls, embodiment)
     if cls is not None and known is not None and own.keeps_here is None:

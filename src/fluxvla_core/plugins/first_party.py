@@ -34,6 +34,21 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vision_backbones": ("ConvEncoder",),
         "vlas": ("CompactVLA",),
     },
+    "fluxvla-openvla": {
+        "checkpoint_formats": ("OpenVLAFormat",),
+        "commands": ("openvla-oft",),
+        "transforms": (
+            "CenterCropOpenVLAImages",
+            "DenormalizeOpenVLA",
+            "JitterOpenVLAColors",
+            "NormalizeOpenVLA",
+            "ProcessOpenVLAPrompts",
+            "RandomCropOpenVLAImages",
+            "ResizeOpenVLAImages",
+            "SampleDiffusionSteps",
+        ),
+        "vlas": ("OpenVLA", "OpenVLAOFT"),
+    },
     "fluxvla-report": {"commands": ("report",)},
     "fluxvla-sim": {
         "commands": ("collect", "sim"),
@@ -46,6 +61,11 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         ),
         "policies": ("SimExpert",),
         "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
+    },
+    "fluxvla-smolvla": {
+        "checkpoint_formats": ("LeRobotSmolVLA",),
+        "transforms": ("SmolVLAImages", "SmolVLANormalize", "SmolVLAPrompt"),
+        "vlas": ("SmolVLA",),
     },
     "fluxvla-ur": {
         "action_filters": ("URWorkspaceBox",),

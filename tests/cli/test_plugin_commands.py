@@ -106,8 +106,8 @@ def test_show(fluxvla: Fluxvla, arm: Install) -> None:
             "  defined at   acme_arm.py:5\n"
             "  contract     operators 1.0\n"
             "  about        Moves things.\n"
-            "  process      runs in one process with the policy: a policy that keeps the "
-            "interpreter's lock delays commands\n"
+            "  process      runs as a whole in a process of its own, which sends commands and also "
+            "copies its images: its own code that keeps the interpreter's lock delays commands\n"
             "  keys\n"
             "    port: str   [required]\n"
             "    rate: int = 30\n"
@@ -186,7 +186,7 @@ def make(): ...
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Whole", "runs in one process with the policy: a policy that keeps"),
+        ("Whole", "runs as a whole in a process of its own, which sends commands and also copies"),
         ("Divided", "can be divided: commands are sent from a process of its own\n"),
         ("Inherits", "can be divided: "),
         ("Duck", "can be divided: "),

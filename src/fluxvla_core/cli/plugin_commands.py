@@ -174,8 +174,8 @@ def _process(plugin: Plugin) -> str:
     if divided:
         return "can be divided: commands are sent from a process of its own"
     return (
-        "runs in one process with the policy: a policy that keeps the interpreter's lock delays "
-        "commands"
+        "runs as a whole in a process of its own, which sends commands and also copies its images: "
+        "its own code that keeps the interpreter's lock delays commands"
     )
 
 

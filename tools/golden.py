@@ -1,0 +1,104 @@
+"""Golden files: what other implementations computed, and whether they would compute it again.
+
+A program ``plugins/fluxvla-NAME/tests/oracles/make_REFERENCE.py``
+
+- says at top level which environment it runs in: ``ENVIRONMENT = "lerobot061"``, one of
+  ``tools.oracle_env.ENVIRONMENTS``;
+- is run from the repository's root, which is on ``PYTHONPATH``, with one thread and off the net,
+  as ``python PROGRAM [FOLDER]``; FOLDER is ``plugins/fluxvla-NAME/tests/golden`` if it is left out;
+- writes ``FOLDER/*.safetensors`` with the versions of what it compares with in the metadata;
+- takes weights and inputs from ``tests.oracles.fill``, and nothing from a clock or an unseeded
+  generator, so that it writes the same again.
+
+Every file in a ``tests/golden`` is written by one of the programs beside it.
+
+    python -m tools.golden FOLDER COMMITTED     compares; needs numpy and safetensors
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tools import project
+
+TOLERANCE = 1e-5
+"""Of a tensor's largest magnitude: processors differ in the order of sums."""
+_ENVIRONMENT = re.compile(r"^ENVIRONMENT = \"(\w+)\"$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program that writes golden files, and the name of the environment it runs in."""
+
+    path: Path
+    environment: str
+
+    @property
+    def golden(self) -> Path:
+        """The folder of the committed files."""
+        return self.path.parent.parent / "golden"
+
+
+def programs(root: Path = project.ROOT) -> list[Program]:
+    """All programs of the repository, in a fixed order.
+
+    Raises:
+        ValueError: one does not say its environment.
+    """
+    found = []
+    for path in sorted(root.glob("plugins/*/tests/oracles/make_*.py")):
+        named = _ENVIRONMENT.search(path.read_text(encoding="utf-8"))
+        if named is None:
+            raise ValueError(f'{path}: no line ENVIRONMENT = "NAME"')
+        found.append(Program(path, named[1]))
+    return found
+
+
+def differences(made: Path, committed: Path) -> list[str]:
+    """What differs between two folders of golden files, a line each; empty if they agree."""
+    names = {folder: {p.name for p in folder.glob("*.safetensors")} for folder in (made, committed)}
+    lines = [f"{name}: no program wrote it" for name in sorted(names[committed] - names[made])]
+    lines += [f"{name}: not in {committed}" for name in sorted(names[made] - names[committed])]
+    for name in sorted(names[made] & names[committed]):
+        found = compared(_tensors(made / name), _tensors(committed / name))
+        lines += [f"{name}: {line}" for line in found]
+    return lines
+
+
+def compared(made: Mapping[str, Any], committed: Mapping[str, Any]) -> list[str]:
+    """What differs between two files' arrays, a line each."""
+    lines = [f"{name}: only in one of them" for name in sorted(set(made) ^ set(committed))]
+    for name in sorted(set(made) & set(committed)):
+        ours, theirs = made[name], committed[name]
+        if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
+            told = f"{ours.dtype} {ours.shape}, committed {theirs.dtype} {theirs.shape}"
+            lines.append(f"{name}: {told}")
+            continue
+        apart = float(abs(ours.astype("float64") - theirs.astype("float64")).max(initial=0.0))
+        largest = float(abs(theirs.astype("float64")).max(initial=0.0))
+        bound = TOLERANCE * largest if theirs.dtype.kind == "f" else 0.0
+        if not apart <= bound:
+            lines.append(f"{name}: {apart:.3g} apart, at most {bound:.3g} expected")
+    return lines
+
+
+def _tensors(path: Path) -> Mapping[str, Any]:
+    from safetensors.numpy import load_file
+
+    return load_file(path)
+
+
+def main() -> int:
+    made, committed = map(Path, sys.argv[1:])
+    lines = differences(made, committed)
+    print(*lines, sep="\n", end="\n" if lines else "")
+    return 1 if lines else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,6 +15,7 @@ copy whose syntax is new are rewritten. What they say stays the same.
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,8 +31,8 @@ NEEDS = (
     "av<16",
     "datasets>=4.8,<5",
     "deepdiff",
-    "diffusers==0.42.1",
-    "draccus==0.10.0",
+    "diffusers>=0.38,<0.40",
+    "draccus>=0.11.6,<0.12",
     "einops",
     "gymnasium",
     "huggingface-hub<2",
@@ -115,6 +116,9 @@ def prepare(log: Callable[[str], None], root: Path = ORACLES / "lerobot061") -> 
 def adapt(env: Env) -> None:
     """Let the installed LeRobot and torchvision be imported here; done again, no more."""
     lerobot_env.declare_operators(env)
+    # draccus brings its tests as a package of that name, which would hide this repository's.
+    for package in env.root.glob("lib/python*/site-packages/tests"):
+        shutil.rmtree(package)
     if sys.version_info >= (3, 12):
         return
     for module in env.root.glob("lib/python*/site-packages/lerobot/**/*.py"):

@@ -6,7 +6,7 @@ A program ``plugins/fluxvla-NAME/tests/oracles/make_REFERENCE.py``
   ``tools.oracle_env.ENVIRONMENTS``;
 - is run from the repository's root, which is on ``PYTHONPATH``, with one thread and off the net,
   as ``python PROGRAM [FOLDER]``; FOLDER is ``plugins/fluxvla-NAME/tests/golden`` if it is left out;
-- writes ``FOLDER/*.safetensors`` with the versions of what it compares with in the metadata;
+- writes ``FOLDER/**/*.safetensors`` with the versions of what it compares with in the metadata;
 - takes weights and inputs from ``tests.oracles.fill``, and nothing from a clock or an unseeded
   generator, so that it writes the same again.
 
@@ -61,7 +61,10 @@ def programs(root: Path = project.ROOT) -> list[Program]:
 
 def differences(made: Path, committed: Path) -> list[str]:
     """What differs between two folders of golden files, a line each; empty if they agree."""
-    names = {folder: {p.name for p in folder.glob("*.safetensors")} for folder in (made, committed)}
+    names = {
+        folder: {p.relative_to(folder).as_posix() for p in folder.rglob("*.safetensors")}
+        for folder in (made, committed)
+    }
     lines = [f"{name}: no program wrote it" for name in sorted(names[committed] - names[made])]
     lines += [f"{name}: not in {committed}" for name in sorted(names[made] - names[committed])]
     for name in sorted(names[made] & names[committed]):

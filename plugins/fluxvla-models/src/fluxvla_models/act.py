@@ -38,6 +38,7 @@ class ACT(VLA, nn.Module):
             0.6 on; else over all, those beyond the end counting as zero, as in the authors' code
             and LeRobot before. With it the mean of two processes' losses is not the whole
             batch's where chunks go beyond an episode's end.
+        pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
     """
 
     def __init__(
@@ -62,8 +63,10 @@ class ACT(VLA, nn.Module):
         n_vae_encoder_layers: int = 4,
         kl_weight: float = 10.0,
         masked_mean: bool = False,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
+        self.pretrained_name_or_path = pretrained_name_or_path
         if dim_model % n_heads or dim_model % 4:
             raise ConfigError(
                 f"ACT: dim_model {dim_model} must be a multiple of n_heads {n_heads} and of 4, "

@@ -105,9 +105,7 @@ class ConditionalUNet(nn.Module):
         super().__init__()
         widths = list(down_dims)
         if not widths or any(width % n_groups for width in widths):
-            raise ConfigError(
-                f"down_dims {tuple(widths)} must be multiples of n_groups {n_groups}"
-            )
+            raise ConfigError(f"down_dims {tuple(widths)} must be multiples of n_groups {n_groups}")
         self.diffusion_step_encoder = nn.Sequential(
             StepEmbedding(step_dim),
             nn.Linear(step_dim, 4 * step_dim),
@@ -148,7 +146,7 @@ class ConditionalUNet(nn.Module):
         )
 
     def forward(self, x: Tensor, timesteps: Tensor, condition: Tensor) -> Tensor:
-        """``x`` ``(B, T, D)``, ``timesteps`` ``(B,)``, ``condition`` ``(B, C)`` -> ``(B, T, D)``."""
+        """``(B, T, D)``, steps ``(B,)`` and condition ``(B, C)`` -> ``(B, T, D)``."""
         known = torch.cat([self.diffusion_step_encoder(timesteps), condition], dim=-1)
         y = x.transpose(1, 2)
         skips: list[Tensor] = []

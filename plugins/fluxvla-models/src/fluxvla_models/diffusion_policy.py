@@ -46,6 +46,7 @@ class DiffusionPolicy(VLA, nn.Module):
         masked_mean: the loss is a mean over the actions of the episode only; else over all, also
             those that repeat the last action beyond the end. With it the mean of two processes'
             losses is not the whole batch's where chunks go beyond an episode's end.
+        pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
     """
 
     def __init__(
@@ -76,8 +77,10 @@ class DiffusionPolicy(VLA, nn.Module):
         prediction_type: str = "epsilon",
         clip_sample_range: float | None = 1.0,
         masked_mean: bool = False,
+        pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
+        self.pretrained_name_or_path = pretrained_name_or_path
         factor = 2 ** len(down_dims)
         if horizon < 1 or horizon % factor:
             raise ConfigError(

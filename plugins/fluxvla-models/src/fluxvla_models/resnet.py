@@ -100,9 +100,7 @@ class ResNet(nn.Module):
         ConfigError: another name or norm.
     """
 
-    def __init__(
-        self, name: str = "resnet18", norm: str = "frozen_batch", width: int = 64
-    ) -> None:
+    def __init__(self, name: str = "resnet18", norm: str = "frozen_batch", width: int = 64) -> None:
         super().__init__()
         for what, value, known in (("backbone", name, BLOCKS), ("norm", norm, NORMS)):
             if value not in known:

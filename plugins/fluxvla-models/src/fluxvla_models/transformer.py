@@ -28,18 +28,14 @@ class FeedForward(nn.Module):
     ) -> None:
         super().__init__()
         if activation not in ACTIVATIONS:
-            raise ConfigError(
-                f"activation {activation!r} is not one of {', '.join(ACTIVATIONS)}"
-            )
+            raise ConfigError(f"activation {activation!r} is not one of {', '.join(ACTIVATIONS)}")
         self.linear1 = nn.Linear(width, hidden)
         self.linear2 = nn.Linear(hidden, width)
         self.activation = ACTIVATIONS[activation]
         self.pre_norm = pre_norm
         self.dropout = nn.Dropout(dropout)
 
-    def residual(
-        self, x: Tensor, norm: nn.Module, sublayer: Callable[[Tensor], Tensor]
-    ) -> Tensor:
+    def residual(self, x: Tensor, norm: nn.Module, sublayer: Callable[[Tensor], Tensor]) -> Tensor:
         """``x`` and what ``sublayer`` makes of it, normalised before or after."""
         if self.pre_norm:
             return x + self.dropout(sublayer(norm(x)))
@@ -70,9 +66,7 @@ class EncoderLayer(FeedForward):
 
         def attend(y: Tensor) -> Tensor:
             where = y + positions
-            return self.self_attn(
-                where, where, y, key_padding_mask=ignored, need_weights=False
-            )[0]
+            return self.self_attn(where, where, y, key_padding_mask=ignored, need_weights=False)[0]
 
         return self.residual(self.residual(x, self.norm1, attend), self.norm2, self.feed)
 

@@ -15,7 +15,7 @@ from tools import golden, oracle_env, project
 def test_every_golden_file_of_the_repository_has_a_program_with_an_environment() -> None:
     found = golden.programs()
     assert {p.environment for p in found} <= set(oracle_env.ENVIRONMENTS)
-    folders = {path.parent for path in project.ROOT.glob("plugins/*/tests/golden")}
+    folders = set(project.ROOT.glob("plugins/*/tests/golden"))
     assert folders == {p.golden for p in found}
 
 

@@ -183,7 +183,7 @@ def test_a_missing_statistic_and_a_missing_file(folder: Path) -> None:
         LeRobotACT().read(folder)
     for path in folder.glob("policy_*"):
         path.unlink()
-    with pytest.raises(CheckpointError, match="neither policy_pre.* nor statistics"):
+    with pytest.raises(CheckpointError, match=r"neither policy_pre.* nor statistics"):
         LeRobotACT().read(folder)
 
 

@@ -106,9 +106,15 @@ class DecoderLayer(FeedForward):
         self.norm3 = nn.LayerNorm(width)
 
     def forward(
-        self, x: Tensor, memory: Tensor, positions: Tensor, memory_positions: Tensor
+        self,
+        x: Tensor,
+        memory: Tensor,
+        positions: Tensor,
+        memory_positions: Tensor,
+        ignored: Tensor | None = None,
     ) -> Tensor:
-        """``x`` ``(B, T, C)``, ``memory`` ``(B, L, C)`` and the positions of both."""
+        """``x`` ``(B, T, C)``, ``memory`` ``(B, L, C)``, the positions of both, and what of
+        ``memory`` is ignored, ``(B, L)`` bool."""
 
         def attend(y: Tensor) -> Tensor:
             where = y + positions
@@ -116,7 +122,9 @@ class DecoderLayer(FeedForward):
 
         def look(y: Tensor) -> Tensor:
             keys = memory + memory_positions
-            return self.multihead_attn(y + positions, keys, memory, need_weights=False)[0]
+            return self.multihead_attn(
+                y + positions, keys, memory, key_padding_mask=ignored, need_weights=False
+            )[0]
 
         x = self.residual(x, self.norm1, attend)
         x = self.residual(x, self.norm2, look)
@@ -134,10 +142,15 @@ class Decoder(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(
-        self, x: Tensor, memory: Tensor, positions: Tensor, memory_positions: Tensor
+        self,
+        x: Tensor,
+        memory: Tensor,
+        positions: Tensor,
+        memory_positions: Tensor,
+        ignored: Tensor | None = None,
     ) -> Tensor:
         for layer in self.layers:
-            x = layer(x, memory, positions, memory_positions)
+            x = layer(x, memory, positions, memory_positions, ignored)
         return self.norm(x)
 
 

@@ -85,7 +85,7 @@ class LanguageBackbone(nn.Module):
                     where=str(folder),
                 )
             config.num_hidden_layers = num_layers
-            if getattr(config, "layer_types", None):
+            if config.to_dict().get("layer_types"):
                 config.layer_types = config.layer_types[:num_layers]
         from transformers import AutoModel
 
@@ -220,6 +220,8 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
     from transformers.utils import logging
 
     logging.disable_progress_bar()
+    verbosity = logging.get_verbosity()
+    logging.set_verbosity_error()  # heads that are left out are no news
     try:
         model, info = kind.from_pretrained(
             str(folder),
@@ -236,6 +238,8 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
             where=str(folder),
             next="pretrained=False, where a checkpoint has them",
         ) from error
+    finally:
+        logging.set_verbosity(verbosity)
     wrong = _listed(info, ("missing_keys", "mismatched_keys"))
     if wrong:
         raise ConfigError(

@@ -81,6 +81,9 @@ COMMANDS: Mapping[str, Entry] = {
     "import-checkpoint": Entry(
         "fluxvla_core.cli.policy_commands:ImportCheckpoint", "import another project's checkpoint"
     ),
+    "bench-policy": Entry(
+        "fluxvla_core.cli.bench_command:BenchPolicy", "measure how long a policy takes to answer"
+    ),
     "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
 }
 """Name -> where the command is and its help line, so that only one is imported."""

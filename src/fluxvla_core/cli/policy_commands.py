@@ -6,6 +6,7 @@ import argparse
 
 from fluxvla_core.atomic import json_text
 from fluxvla_core.cli.parser import Parser
+from fluxvla_core.cli.reporters import heartbeat
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import UsageError
 
@@ -31,7 +32,8 @@ class Compare:
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.evaluation.compare import compare, describe, read
 
-        found = compare(read(args.a, args.group_a), read(args.b, args.group_b), args.common)
+        with heartbeat(f"comparing {args.a} with {args.b}"):
+            found = compare(read(args.a, args.group_a), read(args.b, args.group_b), args.common)
         say(json_text(found, indent=1) if args.json else "\n".join(describe(found)))
         return 0
 
@@ -60,12 +62,14 @@ class Export:
         if args.format is not None:
             from fluxvla_core.training.foreign import export_foreign
 
-            path = export_foreign(args.checkpoint, args.folder, args.format)
+            with heartbeat(f"exporting {args.checkpoint}"):
+                path = export_foreign(args.checkpoint, args.folder, args.format)
             say(f"{path}: as {args.format} saves one")
             return 0
         from fluxvla_core.training.export import export
 
-        path = export(args.checkpoint, args.folder)
+        with heartbeat(f"exporting {args.checkpoint}"):
+            path = export(args.checkpoint, args.folder)
         size = (path / "model.safetensors").stat().st_size
         say(f"{path}: model.safetensors of {size / 1e6:.1f} MB and what it needs to act")
         return 0
@@ -109,20 +113,23 @@ class ImportCheckpoint:
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.training.foreign import embodiment_in, import_checkpoint
 
-        path, found = import_checkpoint(
-            args.source,
-            args.folder,
-            format=args.format,
-            tokenizer=args.tokenizer,
-            embodiment=None if args.embodiment is None else embodiment_in(args.embodiment),
-            action_rate_hz=_rate(args.rate),
-            cameras=dict(_pair(text) for text in args.camera),
-        )
-        robot = "no robot" if found.embodiment is None else found.embodiment.name
+        rate_hz, cameras = _rate(args.rate), dict(_pair(text) for text in args.camera)
+        robot = None if args.embodiment is None else embodiment_in(args.embodiment)
+        with heartbeat(f"importing {args.source}"):
+            path, found = import_checkpoint(
+                args.source,
+                args.folder,
+                format=args.format,
+                tokenizer=args.tokenizer,
+                embodiment=robot,
+                action_rate_hz=rate_hz,
+                cameras=cameras,
+            )
+        name = "no robot" if found.embodiment is None else found.embodiment.name
         rate = "an unknown rate" if not found.action_rate_hz else f"{found.action_rate_hz:g} Hz"
         say(
             f"{path}: {found.model['type']}, {len(found.tensors)} tensors; cameras "
-            f"{', '.join(found.img_keys)}; chunks of {found.horizon} actions at {rate}; {robot}"
+            f"{', '.join(found.img_keys)}; chunks of {found.horizon} actions at {rate}; {name}"
         )
         for note in found.notes:
             say(f"note: {note}")

@@ -55,6 +55,7 @@ NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
@@ -80,6 +81,12 @@ NOT_RUN: dict[tuple[str, str], str] = {
         STRATEGY: [
             ("plugins/fluxvla-ddp/README.md", "fluxvla run --config FILE --nproc 2"),
             ("plugins/fluxvla-fsdp/README.md", "fluxvla run --config FILE --nproc 2"),
+        ],
+        FOLDER: [
+            (
+                "plugins/fluxvla-models/README.md",
+                "fluxvla import-checkpoint FOLDER work/imported --embodiment arm.json --rate 50",
+            ),
         ],
         NO_INDEX: [
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -56,17 +57,27 @@ def shapes(case: str) -> dict[str, list[int]]:
         return json.loads(file.metadata()["names"])
 
 
+@lru_cache
+def tensors(case: str) -> dict[str, torch.Tensor]:
+    """LeRobot's tensors, by its names."""
+    return {
+        name: torch.zeros(shape) if name.endswith(CONSTANTS) else filled(name, shape)
+        for name, shape in shapes(case).items()
+    }
+
+
 def our_name(case: str, name: str) -> str | None:
     return (act_name if case.startswith("lerobot_act") else diffusion_name)(name)
 
 
+@lru_cache
 def model_of(case: str) -> ACT | DiffusionPolicy:
     config = json.loads((GOLDEN / case / "config.json").read_text())
     act = case.startswith("lerobot_act")
     table = (LeRobotACT() if act else LeRobotDiffusion()).model(config, case)
     assert table.pop("type") == ("ACT" if act else "DiffusionPolicy")
     model = (ACT if act else DiffusionPolicy)(**table)
-    named = {our_name(case, n): filled(n, s) for n, s in shapes(case).items()}
+    named = {our_name(case, name): tensor for name, tensor in tensors(case).items()}
     named.pop(None, None)
     model.load_state_dict(named)
     return model
@@ -143,11 +154,7 @@ def test_actions(case: str) -> None:
 def published(case: str, folder: Path) -> Path:
     """The folder as LeRobot saves it, with the weights, which are too many to be stored."""
     shutil.copytree(GOLDEN / case, folder)
-    tensors = {
-        name: torch.zeros(shape) if name.endswith(CONSTANTS) else filled(name, shape)
-        for name, shape in shapes(case).items()
-    }
-    save_file(tensors, folder / "model.safetensors")
+    save_file(tensors(case), folder / "model.safetensors")
     return folder
 
 

@@ -88,7 +88,7 @@ class LeRobotACT(_LeRobotFormat):
         if coefficient is None:
             return super().notes(config)
         return (
-            "LeRobot averages chunks: joiner=dict(type='temporal_ensemble', "
+            "LeRobot averages chunks: chunk_joining=dict(method='temporal_ensemble', "
             f"coefficient={coefficient})",
         )
 

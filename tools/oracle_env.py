@@ -8,8 +8,8 @@ anywhere. ``nox -s oracles`` makes the environments, runs all these programs aga
 
     python -m tools.oracle_env [NAME]     prints the Python of an environment (lerobot061)
 
-LeRobot 0.6.1 is written for Python 3.12: where an older one runs, the few lines of its installed
-copy whose syntax is new are rewritten. What they say stays the same.
+LeRobot 0.6.1 is written for Python 3.12: with 3.11, the few lines of its installed copy whose
+syntax is new are rewritten. What they say stays the same.
 """
 
 from __future__ import annotations

@@ -17,8 +17,11 @@ from fluxvla_models.lerobot_format import LeRobotACT, LeRobotDiffusion
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from safetensors.torch import load_file, save_file
 
+from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.cli.main import main
+from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.testing import training  # noqa: F401 - registers OneProcessRunner
 
 TESTS = Path(__file__).parent
 ACT_FOLDER = TESTS / "golden" / "lerobot_act"
@@ -73,7 +76,8 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     table = format.model(config, str(folder))
     torch.manual_seed(0)
     model = {"ACT": ACT, "DiffusionPolicy": DiffusionPolicy}[table.pop("type")](**table)
-    return {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
+    # None is what a new model would have.
+    return {f"model.{name}": tensor + 0.125 for name, tensor in model.state_dict().items()}
 
 
 @pytest.fixture
@@ -175,6 +179,44 @@ def test_earlier_observations_are_refused_in_words(tmp_path: Path) -> None:
         LeRobotDiffusion().read(made)
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"input_features": [1]}, "input_features is no table"),
+        (
+            {"output_features": {"action": {"shape": "6"}}},
+            r"output_features\.action is .* not a sh",
+        ),
+        ({"output_features": {"action": {"shape": [2, 3]}}}, r"action is \(2, 3\), a vector is"),
+        ({"chunk_size": "long"}, "chunk_size"),
+        ({"normalization_mapping": 3}, "normalization_mapping is no table"),
+    ],
+)
+def test_a_config_that_nobody_wrote(folder: Path, values: dict, told: str) -> None:
+    change(folder / "config.json", **values)
+    with pytest.raises(CheckpointError, match=told):
+        LeRobotACT().read(folder)
+
+
+def test_processors_that_nobody_wrote(folder: Path) -> None:
+    file = folder / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    for values, told in (
+        ({"config": 3}, "config is no table"),
+        ({"config": {"eps": "x"}}, "eps is 'x', no number"),
+        ({"state_file": "../x.safetensors"}, "not a file next to it"),
+        ({"state_file": "x.safetensors"}, r"x\.safetensors"),
+    ):
+        steps = [{**step, **values} if "state_file" in step else step for step in content["steps"]]
+        change(file, steps=steps)
+        with pytest.raises(CheckpointError, match=told):
+            LeRobotACT().read(folder)
+    for text in ("[]", "{", '{"steps": 3}'):
+        file.write_text(text)
+        with pytest.raises(CheckpointError, match=r"policy_preprocessor\.json"):
+            LeRobotACT().read(folder)
+
+
 def test_a_missing_statistic_and_a_missing_file(folder: Path) -> None:
     stats = load_file(folder / NORMALIZER)
     for path in folder.glob("policy_*_processor.safetensors"):
@@ -199,6 +241,35 @@ def test_missing_extra_and_misshapen_tensors_are_listed(
     told = capsys.readouterr().err
     for words in ("action_head.bias", "surplus", "decoder_pos_embed.weight: (9, 32)"):
         assert words in told
+
+
+@pytest.mark.parametrize("by_model", [True, False])
+def test_a_training_starts_from_lerobots_weights(
+    folder: Path, tmp_path: Path, by_model: bool
+) -> None:
+    model = LeRobotACT().model(json.loads((folder / "config.json").read_text()), str(folder))
+    runner = {"type": "OneProcessRunner", "max_steps": 1, "learning_rate": 1e-3}
+    keys = ["images", "states", "actions", "action_masks", "latent_noise"]
+    runner["collator"] = {"type": "DictCollator", "keys": keys}
+    place = {"pretrained_name_or_path": str(folder)} if by_model else {}
+    config = {
+        "model": {**model, **place},
+        "train_dataloader": {"per_device_batch_size": 2},
+        "runner": runner if by_model else {**runner, "init_from": str(folder)},
+    }
+    context = RunContext(
+        config=config,
+        section="runner",
+        work_dir=tmp_path / "work",
+        resume=None,
+        reporter=SilentReporter(),
+    )
+    built = build_runner_from_cfg(config["runner"], context)
+    built.run_setup(4)
+    found = {f"model.{name}": tensor for name, tensor in built.vla.state_dict().items()}
+    expected = weights(folder)
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
 
 
 def test_folders_of_other_things_are_not_recognised(tmp_path: Path, folder: Path) -> None:

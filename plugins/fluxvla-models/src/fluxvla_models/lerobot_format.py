@@ -81,7 +81,7 @@ class LeRobotACT(_LeRobotFormat):
     our_name = staticmethod(act_name)
 
     def horizon(self, config: Mapping[str, Any]) -> int:
-        return int(config["chunk_size"])
+        return _count(config, "chunk_size")
 
     def notes(self, config: Mapping[str, Any]) -> Sequence[str]:
         coefficient = config.get("temporal_ensemble_coeff")
@@ -126,7 +126,7 @@ class LeRobotDiffusion(_LeRobotFormat):
     our_name = staticmethod(diffusion_name)
 
     def horizon(self, config: Mapping[str, Any]) -> int:
-        return int(config["horizon"])
+        return _count(config, "horizon")
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
@@ -174,40 +174,63 @@ class LeRobotDiffusion(_LeRobotFormat):
         }
 
 
+def features_of(
+    config: Mapping[str, Any], section: str, where: str
+) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """The policy's inputs or outputs: feature -> its type (``VISUAL``, ``STATE``, …) and shape.
+
+    Raises:
+        CheckpointError: the section is not what LeRobot writes.
+    """
+    found = _value(config, section, where)
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{section} is no table", where=where)
+    features: dict[str, tuple[str, tuple[int, ...]]] = {}
+    for name, entry in found.items():
+        shape = entry.get("shape") if isinstance(entry, dict) else None
+        sizes = shape if isinstance(shape, list) else []
+        if not sizes or not all(isinstance(n, int) and n > 0 for n in sizes):
+            raise CheckpointError(f"{section}.{name} is {entry!r}, not a shape", where=where)
+        features[name] = (str(entry.get("type")), tuple(sizes))
+    return features
+
+
 def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
     """The policy's cameras, by feature, and the height and width of their pictures.
 
     Raises:
-        CheckpointError: it has none, or their sizes differ.
+        CheckpointError: it has none, their sizes differ, or it takes what no robot has.
     """
-    features = _value(config, "input_features", where)
-    found = {name: f["shape"] for name, f in features.items() if f.get("type") == "VISUAL"}
-    sizes = {tuple(shape[1:]) for shape in found.values()}
-    if len(sizes) != 1:
+    features = features_of(config, "input_features", where)
+    found = {name: shape for name, (kind, shape) in features.items() if kind == "VISUAL"}
+    sizes = set(found.values())
+    if len(sizes) != 1 or any(len(shape) != 3 or shape[0] != 3 for shape in sizes):
         told = ", ".join(f"{name} {shape}" for name, shape in found.items()) or "none"
         raise CheckpointError(
             f"cameras with pictures of one size are expected, the policy has {told}", where=where
         )
-    other = [n for n, f in features.items() if f.get("type") not in ("VISUAL", "STATE")]
+    other = [name for name, (kind, _) in features.items() if kind not in ("VISUAL", "STATE")]
     if other:
         raise CheckpointError(f"the policy takes {other[0]}, which no robot has here", where=where)
-    ((height, width_),) = sizes
-    return list(found), (int(height), int(width_))
+    ((_, height, width_),) = sizes
+    return list(found), (height, width_)
 
 
 def width(config: Mapping[str, Any], section: str, feature: str, where: str) -> int:
     """The length of a feature's vector.
 
     Raises:
-        CheckpointError: the policy has no such feature.
+        CheckpointError: the policy has no such feature, or it is no vector.
     """
-    features = _value(config, section, where)
+    features = features_of(config, section, where)
     if feature not in features:
         raise CheckpointError(
             f"{section} has no {feature}; it has {', '.join(features) or 'nothing'}", where=where
         )
-    (length,) = features[feature]["shape"]
-    return int(length)
+    shape = features[feature][1]
+    if len(shape) != 1:
+        raise CheckpointError(f"{feature} is {shape}, a vector is expected", where=where)
+    return shape[0]
 
 
 def action_dim(config: Mapping[str, Any], where: str) -> int:
@@ -234,6 +257,13 @@ def _value(config: Mapping[str, Any], name: str, where: str) -> Any:
             f"there is no {name!r}", where=where, cause="it was saved by another version of LeRobot"
         )
     return config[name]
+
+
+def _count(config: Mapping[str, Any], name: str) -> int:
+    found = config.get(name)
+    if not isinstance(found, int) or found < 1:
+        raise CheckpointError(f"{name} is {found!r}, no number of actions", where=CONFIG)
+    return found
 
 
 def _refuse(config: Mapping[str, Any], where: str, **only: object) -> None:

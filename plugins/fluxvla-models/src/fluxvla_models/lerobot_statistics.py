@@ -163,13 +163,15 @@ def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
         if not (folder / file).is_file():
             continue
         for step in _steps(folder / file):
-            settings = step.get("config") or {}
+            settings = _table(step, "config", folder / file)
             if step.get("registry_name") == "rename_observations_processor":
-                names = dict(settings.get("rename_map") or {})
+                names = dict(_table(settings, "rename_map", folder / file))
             if step.get("registry_name") != kind:
                 continue
-            modes = {**modes, **(settings.get("norm_map") or {})}
-            eps = float(settings.get("eps", eps))
+            modes = {**modes, **_table(settings, "norm_map", folder / file)}
+            eps = settings.get("eps", eps)
+            if not isinstance(eps, float):
+                raise CheckpointError(f"eps is {eps!r}, no number", where=str(folder / file))
             state = step.get("state_file")
             if state is None:
                 continue
@@ -184,8 +186,15 @@ def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
 
 
 def _modes(config: Mapping[str, Any]) -> dict[str, str]:
-    found = config.get("normalization_mapping") or {}
+    found = _table(config, "normalization_mapping", Path(CONFIG))
     return {str(kind): str(mode) for kind, mode in found.items()}
+
+
+def _table(values: Mapping[str, Any], name: str, where: Path) -> Mapping[str, Any]:
+    found = values.get(name) or {}
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{name} is no table", where=str(where))
+    return found
 
 
 def _steps(path: Path) -> list[Mapping[str, Any]]:

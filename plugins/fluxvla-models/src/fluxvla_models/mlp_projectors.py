@@ -23,6 +23,10 @@ class LinearProjector(nn.Module):
         """``(B, L, in_dim)`` -> ``(B, L, out_dim)``."""
         return self.projector(features)
 
+    def fsdp_units(self) -> list[nn.Module]:
+        """None: it is small beside what it joins."""
+        return []
+
 
 class FusedMLPProjector(nn.Module):
     """Three matrices, the first four times as wide (Karamcheti et al. 2024, Prismatic VLMs).
@@ -50,6 +54,10 @@ class FusedMLPProjector(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """``(B, L, in_dim)`` -> ``(B, L, out_dim)``."""
         return self.projector(features)
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """None: it is small beside what it joins."""
+        return []
 
 
 def _known(part: nn.Module, in_dim: int | None, out_dim: int | None) -> tuple[int, int]:

@@ -190,3 +190,13 @@ def test_the_noise_of_the_latent_follows_from_the_generator() -> None:
     assert not np.array_equal(first, other)
     with pytest.raises(ConfigError, match="dim must be at least 1, got 0"):
         SampleLatentNoise(0)
+
+
+def test_in_mixed_precision() -> None:
+    model, batch = make(), batch_of()
+    expected = model(**batch)["loss"].item()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = model(**batch)["loss"]
+    loss.backward()
+    assert loss.item() == pytest.approx(expected, rel=0.05)
+    assert all(p.grad.dtype == torch.float32 for p in model.parameters())

@@ -216,3 +216,13 @@ def test_a_schedule_begins_with_little_noise_and_ends_with_nearly_nothing_else()
     assert shares[0] > 0.999
     assert shares[-1] < 1e-3
     assert (shares.diff() < 0).all()
+
+
+def test_in_mixed_precision() -> None:
+    model, batch = make(), batch_of()
+    expected = model(**batch)["loss"].item()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = model(**batch)["loss"]
+    loss.backward()
+    assert loss.item() == pytest.approx(expected, rel=0.05)
+    assert all(p.grad.dtype == torch.float32 for p in model.parameters())

@@ -299,3 +299,14 @@ def test_missing_weights_are_not_drawn_in_silence(folders, tmp_path: Path) -> No
     save_file(tensors, tmp_path / "model.safetensors", {"format": "pt"})
     with pytest.raises(ConfigError, match=r"not all there: layers\.1\.mlp\.up_proj\.weight"):
         Qwen3Backbone(str(tmp_path))
+
+
+@pytest.mark.parametrize("make", [halves, whole])
+def test_in_mixed_precision(folders, make) -> None:
+    model, batch = make(folders).train(), batch_of()
+    expected = model(**batch)["loss"].item()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = model(**batch)["loss"]
+    loss.backward()
+    assert loss.item() == pytest.approx(expected, rel=0.05)
+    assert all(p.grad.dtype == torch.float32 for p in model.parameters())

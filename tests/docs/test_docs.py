@@ -54,9 +54,11 @@ CLUSTER = "needs several machines, or a scheduler"
 NO_INDEX = (
     "installs from a package index, which has no FluxVLA yet; nox installs the same from here"
 )
+HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
 FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
+WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
     for why, lines in {
@@ -105,7 +107,30 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "pip install 'fluxvla-metaworld[metaworld]'        "
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
+            ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
+            ),
+        ],
+        HUB: [
+            (
+                "plugins/fluxvla-smolvla/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_smolvla policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 30 \\",
+            ),
+        ],
+        WEIGHTS: [
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla import-checkpoint models/openvla-7b-oft-finetuned-libero-spatial policy "
+                "--embodiment libero.json",
+            ),
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla openvla-oft models/openvla-7b models/openvla-oft-libero --robot libero",
+            ),
         ],
         EXAMPLE: [
             (

@@ -37,6 +37,21 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vlas": ("ACT", "CompactVLA", "DiffusionPolicy", "LlavaVLA"),
         "vlm_backbones": ("PaliGemmaBackbone",),
     },
+    "fluxvla-openvla": {
+        "checkpoint_formats": ("OpenVLAFormat",),
+        "commands": ("openvla-oft",),
+        "transforms": (
+            "CenterCropOpenVLAImages",
+            "DenormalizeOpenVLA",
+            "JitterOpenVLAColors",
+            "NormalizeOpenVLA",
+            "ProcessOpenVLAPrompts",
+            "RandomCropOpenVLAImages",
+            "ResizeOpenVLAImages",
+            "SampleDiffusionSteps",
+        ),
+        "vlas": ("OpenVLA", "OpenVLAOFT"),
+    },
     "fluxvla-report": {"commands": ("report",)},
     "fluxvla-sim": {
         "commands": ("collect", "sim"),
@@ -49,6 +64,11 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         ),
         "policies": ("SimExpert",),
         "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
+    },
+    "fluxvla-smolvla": {
+        "checkpoint_formats": ("LeRobotSmolVLA",),
+        "transforms": ("SmolVLAImages", "SmolVLANormalize", "SmolVLAPrompt"),
+        "vlas": ("SmolVLA",),
     },
     "fluxvla-ur": {
         "action_filters": ("URWorkspaceBox",),

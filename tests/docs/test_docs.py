@@ -57,6 +57,7 @@ NO_INDEX = (
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
 PUBLISHED = "fetches published weights of several GB; the plugin's tests run it on tiny ones"
+FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
@@ -83,6 +84,12 @@ NOT_RUN: dict[tuple[str, str], str] = {
         STRATEGY: [
             ("plugins/fluxvla-ddp/README.md", "fluxvla run --config FILE --nproc 2"),
             ("plugins/fluxvla-fsdp/README.md", "fluxvla run --config FILE --nproc 2"),
+        ],
+        FOLDER: [
+            (
+                "plugins/fluxvla-models/README.md",
+                "fluxvla import-checkpoint FOLDER work/imported --embodiment arm.json --rate 50",
+            ),
         ],
         NO_INDEX: [
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),

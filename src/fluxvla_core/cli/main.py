@@ -58,6 +58,9 @@ COMMANDS: Mapping[str, Entry] = {
     "plugins doctor": Entry(
         "fluxvla_core.cli.plugin_commands:Doctor", "look for broken and colliding installations"
     ),
+    "new-plugin": Entry(
+        "fluxvla_core.cli.new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"
+    ),
     "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
     "data validate": Entry(
         "fluxvla_core.cli.data_commands:Validate", "read every row, decode every frame"

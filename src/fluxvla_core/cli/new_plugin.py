@@ -86,8 +86,11 @@ def _refuse_taken(plugin: Plugin, kind: Kind) -> None:
 def _next_steps(folder: Path, plugin: Plugin, kind: Kind, files: int, todo: list[str]) -> list[str]:
     from string import Template
 
+    from fluxvla_core.cli.scaffold import class_name
+
     place = shlex.quote(str(folder))
-    run = Template(kind.run).substitute(short=plugin.short, dist=plugin.dist)
+    name = class_name(plugin, kind.parts[0])
+    run = Template(kind.run).substitute(short=plugin.short, type=name)
     return [
         f"{folder}: {files} files. Next:",
         f"  pip install -e {shlex.quote(f'{folder}[testing]')}",

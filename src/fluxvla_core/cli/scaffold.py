@@ -21,7 +21,7 @@ SUFFIX = ".tmpl"
 COMMON = "common"
 # PEP 508's rule for names.
 _NAME = re.compile(r"[A-Za-z0-9]|[A-Za-z0-9][A-Za-z0-9._-]*[A-Za-z0-9]")
-_LONGEST = 40
+_LONGEST = 32
 """Characters of a name: paths and class names stay readable."""
 
 
@@ -54,6 +54,7 @@ class Kind:
 
 
 RUN = "fluxvla run --config configs/${short}.toml"
+RUN_STAND_IN = f"{RUN} --plugin configs/stand_in.py"
 KINDS: Mapping[str, Kind] = {
     "operator": Kind(
         (
@@ -64,7 +65,73 @@ KINDS: Mapping[str, Kind] = {
         ("operator",),
         "A robot for FluxVLA",
         (),
-        RUN + " --task 1",
+        f"{RUN} --task 1",
+    ),
+    "policy": Kind(
+        (Part("policies", "Policy", "policy"),),
+        ("policy",),
+        "A policy for FluxVLA",
+        (),
+        RUN_STAND_IN,
+    ),
+    "model": Kind(
+        (Part("vlas", "VLA", "model"),),
+        ("training", "model"),
+        "A model for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
+    ),
+    "environment": Kind(
+        (
+            Part("environments", "Environment", "environment"),
+            Part("policies", "Expert", "expert"),
+        ),
+        ("environment",),
+        "An environment for FluxVLA",
+        (),
+        RUN,
+    ),
+    "dataset": Kind(
+        (Part("datasets", "Dataset", "dataset"),),
+        ("training", "dataset"),
+        "A dataset for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
+    ),
+    "transform": Kind(
+        (Part("transforms", "Transform", "transform"),),
+        ("training", "transform"),
+        "A transform for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
+    ),
+    "hook": Kind(
+        (Part("hooks", "Hook", "hook"),),
+        ("training", "hook"),
+        "A hook for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
+    ),
+    "metric": Kind(
+        (Part("metrics", "Metric", "metric"),),
+        ("training", "metric"),
+        "A metric for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
+    ),
+    "command": Kind(
+        (Part("commands", "Command", "command"),),
+        ("command",),
+        "A command for FluxVLA",
+        (),
+        "fluxvla ${type}",
+    ),
+    "train-runner": Kind(
+        (Part("runners", "TrainRunner", "runner"),),
+        ("training", "train-runner"),
+        "A training strategy for FluxVLA",
+        ("train",),
+        RUN_STAND_IN,
     ),
 }
 
@@ -181,7 +248,7 @@ def _values(plugin: Plugin, kind: Kind) -> dict[str, str]:
         "entry_points": entry_points,
         "about": kind.about,
         "type": class_name(plugin, kind.parts[0]),
-        **{part.suffix: class_name(plugin, part) for part in kind.parts},
+        **{part.suffix: _attribute(plugin, part) for part in kind.parts},
     }
 
 

@@ -50,6 +50,9 @@ class TrainRunnerConformance:
     """Further settings of the runner."""
     modules: ClassVar[Mapping[str, Any]] = {}
     """Settings of ``TinyVLA`` in all tests."""
+    reference: ClassVar[str] = "OneProcessRunner"
+    """The runner that trains the same on one process: another one for a strategy that changes the
+    gradients or the optimizer, which may be its own."""
     scalars: ClassVar[tuple[str, ...]] = SCALARS
     """Which parameters without dimensions a model may have; it has to refuse the others."""
 
@@ -133,9 +136,10 @@ class TrainRunnerConformance:
         plain: dict[str, Any] = {"dropout": 0.0, "centred": False}
         length = {**plain, "max_steps": 9, "save_iter_interval": 4}
         many = self.config(batch=2, **length)
-        one = self.config(batch=2 * self.ranks, **length, type="OneProcessRunner")
-        for key in self.settings:
-            del one["runner"][key]
+        one = self.config(batch=2 * self.ranks, **length, type=self.reference)
+        if self.reference != self.entry_point:
+            for key in self.settings:
+                del one["runner"][key]
         assert self.start({"config": many, "work_dir": str(tmp_path / "many")}) == [0] * self.ranks
         train({"config": one, "work_dir": str(tmp_path / "one")})
         moved = tmp_path / "many"

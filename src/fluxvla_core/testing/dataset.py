@@ -12,6 +12,7 @@ processes and workers sees the same samples, follows from what they check.
 
 from __future__ import annotations
 
+import copy
 import random
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -156,8 +157,8 @@ class DatasetConformance(Conformance):
             )
 
     def test_samples_belong_to_the_caller(self, dataset: Dataset) -> None:
-        first, second = (self.sample(dataset, 0, 0) for _ in range(2))
-        for key, value in first.items():
+        second = copy.deepcopy(self.sample(dataset, 0, 0))
+        for key, value in self.sample(dataset, 0, 0).items():
             array = as_array(value)
             if isinstance(array, np.ndarray) and array.size and array.flags.writeable:
                 array[...] = 0

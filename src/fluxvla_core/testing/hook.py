@@ -28,7 +28,7 @@ from fluxvla_core.contracts.runner import Hook
 from fluxvla_core.errors import nearest
 from fluxvla_core.hooks import NAMES, HookCaller
 from fluxvla_core.plugins.registry import HOOKS
-from fluxvla_core.testing._conformance import Conformance, capability
+from fluxvla_core.testing._conformance import Conformance
 
 Call = tuple[str, Mapping[str, Any]]
 _NEAR = 0.75
@@ -50,10 +50,6 @@ class HookConformance(Conformance):
     def make_in(self, context: RunContext) -> Any:
         """A new hook, as the run builds it: with the context, if it asks for that."""
         return build_from_cfg({"type": self.entry_point, **self.arguments}, HOOKS, context)
-
-    def brought(self) -> list[str]:
-        """The hooks that the class has methods for."""
-        return [name for name in NAMES if name in dir(self.component())]
 
     def test_every_method_is_a_hook(self) -> None:
         own = [n for n, f in vars(self.component()).items() if callable(f) and n[:1] != "_"]
@@ -102,13 +98,6 @@ class HookConformance(Conformance):
             f"after run_finished() the threads {', '.join(left)} still run, expected them ended: "
             "the process would never end"
         )
-
-    def test_two_runs_do_not_share_anything(self, watched: Watched, tmp_path: Path) -> None:
-        capability(bool(self.brought()), "it has no method that is a hook")
-        second = Watched(self.entry_point, self.make_in, tmp_path / "second")
-        watched.calls(robot(), "ok")
-        second.calls(robot(), "ok")
-        assert not second.problems, second.told("a second run of the same process")
 
 
 class Watched:

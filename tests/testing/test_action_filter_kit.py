@@ -61,7 +61,8 @@ FAULTS = {
     ),
     "each its own": Fault(
         "another_object_does_the_same",
-        '    api = "1.0"\n    def __init__(self, joint: str = "joint_1"):\n        self.joint = joint\n',
+        '    api = "1.0"\n    def __init__(self, joint: str = "joint_1"):\n'
+        "        self.joint = joint\n",
         '    api = "1.0"\n    made = []\n    def __init__(self, joint: str = "joint_1"):\n'
         "        self.joint = joint\n        self.made.append(0.1)\n        self.bias = "
         "sum(self.made)\n"

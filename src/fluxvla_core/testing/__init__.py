@@ -37,6 +37,7 @@ if "pytest" in sys.modules:
     import pytest
 
     # Assertions of the kits then show their values, besides what they say.
-    pytest.register_assert_rewrite("fluxvla_core.testing._conformance", *_KITS)
+    _shared = ("fluxvla_core.testing._conformance", "fluxvla_core.testing._operator_parts")
+    pytest.register_assert_rewrite(*_shared, *_KITS)
 
 __getattr__, __dir__, __all__ = _lazy.attach(__name__, _KITS)

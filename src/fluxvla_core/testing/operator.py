@@ -18,7 +18,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 from unittest import mock
 
@@ -27,17 +27,13 @@ import pytest
 
 from fluxvla_core.config.runtime_signature import inspect_signature
 from fluxvla_core.contracts.check import missing_operator_methods
-from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.testing._operator_parts import STEP, Array, DividedOperatorChecks
 
-# No command in this time means that no more are under way.
-_QUIET_S = 0.3
-# How far a joint of an arm at rest may be read apart by two who read it at different times, and how
-# far one is commanded to see whether it moves, in its unit: small enough for any servo.
-_APART, _STEP = 0.01, 0.03
 # Commands for an arm to come to rest.
 _STILL = 5
 # How far a stamp may lie ahead of a clock that was read after it: none, but for rounding.
@@ -61,7 +57,7 @@ print(json.dumps([sorted({m.partition(".")[0] for m in sys.modules}), threading.
 """
 
 
-class OperatorConformance:
+class OperatorConformance(DividedOperatorChecks):
     """Inherit, set ``entry_point`` and ``arguments``, and run pytest."""
 
     entry_point: ClassVar[str]
@@ -88,85 +84,6 @@ class OperatorConformance:
         operator.connect()
         self.first_frame(operator)
         return operator
-
-    @pytest.fixture
-    def parts(self) -> Iterator[tuple[Any, Any]]:
-        """The part without cameras and the one without commands, not connected; closed at the end.
-
-        Each is of an operator of its own, as in the two processes that share a robot. Tests that
-        use it are skipped for an operator that cannot be divided.
-        """
-        first, second = (
-            Operator.adapt(OPERATORS.get(self.entry_point)(**self.arguments)) for _ in range(2)
-        )
-        control, cameras = first.without_cameras(), second.without_commands()
-        made = [part for part in (cameras, control) if part is not None]
-        try:
-            assert len(made) != 1, (
-                f"without_cameras() gave {control!r} and without_commands() {cameras!r}: a robot "
-                "is divided into both parts, or not at all"
-            )
-            if not made:
-                needs = "without_cameras() and without_commands()"
-                pytest.skip(f"this operator cannot be divided: it would define {needs}")
-            yield Operator.adapt(control), Operator.adapt(cameras)
-        finally:
-            for part in [*made, first, second]:
-                Operator.adapt(part).close()
-
-    def frame(self, operator: Any) -> Frame:
-        """One reading.
-
-        Override it for an operator of the specification's shape, whose ``get_frame`` gives what its
-        own runner understands: make a ``Frame`` of that, and raise NotReady where there is none.
-        """
-        frame: Frame = operator.get_frame()
-        return frame
-
-    def first_frame(self, operator: Any) -> Frame:
-        """Wait for the first frame; NotReady is the one error that means 'try again'."""
-        deadline = time.monotonic() + self.ready_within_s
-        while True:
-            try:
-                return self.frame(operator)
-            except NotReady:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.02)
-
-    def hold(self, operator: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The command that keeps the arm where it is, inside the limits."""
-        return self._held(operator.embodiment, self.frame(operator).state)
-
-    def _held(
-        self, embodiment: EmbodimentSpec, state: np.ndarray[Any, np.dtype[np.float64]]
-    ) -> np.ndarray[Any, np.dtype[np.float64]]:
-        joints = embodiment.joints
-        where = dict(zip(embodiment.state_names, state, strict=True))
-        target = [np.clip(where.get(j.name, j.lower), j.lower, j.upper) for j in joints]
-        return np.array(target, dtype=np.float64)
-
-    def commands_heard(self, operator: Any) -> int | None:
-        """The number of commands the arm, or its stand-in, has received; override to count them.
-
-        None, where nobody does: then a stop that throws an arm back goes unnoticed here.
-        """
-        return None
-
-    def settled(self, operator: Any) -> int | None:
-        """``commands_heard`` once no more come; fails if they continue for ``ready_within_s``."""
-        deadline = time.monotonic() + self.ready_within_s
-        heard = self.commands_heard(operator)
-        while heard is not None:
-            time.sleep(_QUIET_S)
-            before, heard = heard, self.commands_heard(operator)
-            if heard == before:
-                break
-            assert time.monotonic() < deadline, (
-                f"commands still arrive after {self.ready_within_s:g} s without a send_action, "
-                f"{heard} by now: what sends them does not end"
-            )
-        return heard
 
     def test_is_complete(self, operator: Any) -> None:
         lacks = missing_operator_methods(operator)
@@ -205,7 +122,12 @@ class OperatorConformance:
         )
 
     def test_constructor_does_no_io(self) -> None:
-        refuse = mock.Mock(side_effect=AssertionError("the constructor does I/O"))
+        refuse = mock.Mock(
+            side_effect=AssertionError(
+                f"{self.entry_point}() opens a socket, starts a thread or a process, expected no "
+                "I/O before connect(): a config is checked without a robot"
+            )
+        )
         with (
             mock.patch("socket.socket.connect", refuse),
             mock.patch("socket.socket.bind", refuse),
@@ -340,16 +262,14 @@ class OperatorConformance:
             if joint.name in spec.state_names:
                 self._nudge(connected, base, index)
 
-    def _nudge(
-        self, connected: Any, base: np.ndarray[Any, np.dtype[np.float64]], index: int
-    ) -> None:
+    def _nudge(self, connected: Any, base: Array, index: int) -> None:
         """Joint ``index`` goes a small way from ``base`` and back."""
         spec = connected.embodiment
         joint, column = spec.joints[index], spec.state_names.index(spec.joints[index].name)
         for _ in range(_STILL):  # an arm gives way to its weight first
             self._send(connected, base)
         before = self.frame(connected).state
-        step = min(_STEP, (joint.upper - joint.lower) / 4.0)
+        step = min(STEP, (joint.upper - joint.lower) / 4.0)
         step = step if joint.upper - base[index] > base[index] - joint.lower else -step
         target = base.copy()
         target[index] += step
@@ -367,7 +287,7 @@ class OperatorConformance:
         for _ in range(_STILL):
             self._send(connected, base)
 
-    def _send(self, connected: Any, action: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+    def _send(self, connected: Any, action: Array) -> None:
         """One command, at the rate of the robot."""
         connected.send_action(action)
         if Operator.adapt(connected).clock is None:
@@ -407,13 +327,24 @@ class OperatorConformance:
         )
 
     def test_stop_works_in_any_state(self, operator: Any) -> None:
-        operator.stop()
+        self._stop(operator, "before connect()")
         operator.connect()
         self.first_frame(operator)
-        operator.stop()
-        operator.stop()
+        self._stop(operator, "after connect()")
+        self._stop(operator, "after a stop()")
         operator.close()
-        operator.stop()
+        self._stop(operator, "after close()")
+
+    def _stop(self, operator: Any, when: str) -> None:
+        problem = ""
+        try:
+            operator.stop()
+        except Exception as error:  # noqa: BLE001 - said in the assertion
+            problem = f"{type(error).__name__}: {error}"
+        assert not problem, (
+            f"stop() {when} raised {problem}; expected it to work in any state: whatever has gone "
+            "wrong, a stop follows"
+        )
 
     def test_a_later_stop_sends_the_arm_nothing(self, connected: Any) -> None:
         before = self.settled(connected)
@@ -472,124 +403,8 @@ class OperatorConformance:
             "send_action() took a command after close(), expected NotReady: nobody would stop it"
         )
 
-    # -- the two parts of an operator that can be divided ----------------------------------------
 
-    def test_both_parts_read_the_robot_at_the_same_time(self, parts: tuple[Any, Any]) -> None:
-        control, cameras = parts
-        self._connect(parts)
-        spec = cameras.embodiment
-        assert control.embodiment == spec, (
-            "without_cameras().embodiment and without_commands().embodiment differ: each is that "
-            "of the whole robot"
-        )
-        images = self.frame(cameras).images
-        assert set(images) == set(spec.camera_names), (
-            f"get_frame() of the part without commands has the images {sorted(images)}, expected "
-            f"{sorted(spec.camera_names)}: the policy is asked with these frames"
-        )
-        assert self._refused(control.get_frame, NotReady), (
-            "get_frame() of the part without cameras gave a frame, expected NotReady: it would "
-            "keep the process waiting that commands the robot"
-        )
-        self._until(
-            lambda: np.allclose(self._state(control), self._state(cameras), rtol=0.0, atol=_APART),
-            lambda: (
-                f"get_state() of the part without cameras gave {self._state(control)}, that of the "
-                f"part without commands {self._state(cameras)}; expected at most {_APART} apart, "
-                "because both read one robot, which nobody commands"
-            ),
-        )
-
-    def test_a_command_of_one_part_is_seen_by_the_other(self, parts: tuple[Any, Any]) -> None:
-        control, cameras = parts
-        self._connect(parts)
-        spec = control.embodiment
-        before = self._state(cameras)
-        target = self._held(spec, before)
-        names = spec.state_names
-        index = next(i for i, j in enumerate(spec.joints) if j.name in names)
-        joint, column = spec.joints[index], names.index(spec.joints[index].name)
-        step = min(_STEP, (joint.upper - joint.lower) / 4.0)
-        upwards = joint.upper - target[index] > target[index] - joint.lower
-        target[index] += step if upwards else -step
-
-        def seen() -> bool:
-            control.send_action(target)
-            return bool(abs(self._state(cameras)[column] - before[column]) > step / 2.0)
-
-        self._until(
-            seen,
-            lambda: (
-                f"send_action() of the part without cameras moves {joint.name} from "
-                f"{before[column]:.4g} to {target[index]:.4g}, and get_state() of the part without "
-                f"commands gives {self._state(cameras)[column]:.4g} after "
-                f"{self.ready_within_s:g} s: expected the robot that the other part commands"
-            ),
-        )
-
-    def test_the_part_without_commands_sends_nothing(self, parts: tuple[Any, Any]) -> None:
-        control, cameras = parts
-        self._connect(parts)
-        # So that there is a command to repeat, if only by mistake.
-        held = self._held(control.embodiment, self._state(control))
-        control.send_action(held)
-        before = self.settled(cameras)
-        assert self._refused(lambda: cameras.send_action(held), Rejected), (
-            "send_action() of the part without commands took a command, expected Rejected: "
-            "another process commands the robot"
-        )
-        cameras.stop()
-        cameras.close()
-        cameras.stop()
-        after = self.settled(cameras)
-        assert after == before, (
-            f"commands_heard() was {before} before send_action(), stop() and close() of the part "
-            f"without commands, and is {after} now, expected {before}: that part sends nothing, "
-            "because the arm has the commands of the other one"
-        )
-        control.send_action(held)  # nor did closing take the robot from the other part
-
-    def _connect(self, parts: tuple[Any, Any]) -> None:
-        """Both, the one without commands first: it needs nobody who commands."""
-        control, cameras = parts
-        cameras.connect()
-        self.first_frame(cameras)
-        control.connect()
-        self._until(lambda: self._state(control) is not None, lambda: "")
-
-    def _state(self, part: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-        state = part.get_state()
-        assert state is not None, (
-            "get_state() of a part gave None, expected the state: the process without cameras has "
-            "no other reading, and both must read the same"
-        )
-        return np.asarray(state, dtype=np.float64)
-
-    def _refused(self, call: Callable[[], object], error: type[OperatorError]) -> bool:
-        try:
-            call()
-        except error:
-            return True
-        return False
-
-    def _until(self, condition: Callable[[], bool], failure: Callable[[], str]) -> None:
-        """Wait for ``condition``; NotReady is forgiven, as of a stream that is late once."""
-        deadline = time.monotonic() + self.ready_within_s
-        while True:
-            late = time.monotonic() > deadline
-            try:
-                if condition():
-                    return
-                assert not late, failure()
-            except NotReady:
-                if late:
-                    raise
-            time.sleep(0.02)
-
-
-def _not_followed(
-    spec: EmbodimentSpec, column: int, step: float, moved: np.ndarray[Any, np.dtype[np.float64]]
-) -> str:
+def _not_followed(spec: EmbodimentSpec, column: int, step: float, moved: Array) -> str:
     """What a state that did not follow a command to ``step`` of its ``column`` looks like."""
     name = spec.state_names[column]
     told = f"send_action() moves {name} by {step:.4g}, and "

@@ -58,6 +58,9 @@ COMMANDS: Mapping[str, Entry] = {
     "plugins doctor": Entry(
         "fluxvla_core.cli.plugin_commands:Doctor", "look for broken and colliding installations"
     ),
+    "plugins check": Entry(
+        "fluxvla_core.cli.check_plugin:CheckPlugin", "run the conformance kit of one class"
+    ),
     "new-plugin": Entry(
         "fluxvla_core.cli.new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"
     ),

@@ -250,7 +250,7 @@ class EnvironmentConformance:
         starts = [environment.state]
         environment.reset(1, task.name)
         starts.append(environment.state)
-        assert np.array_equal(*starts), (
+        assert np.array_equal(starts[0], starts[1]), (
             f"reset(1, {task.name!r}) gave the state {starts[0].tolist()} and then "
             f"{starts[1].tolist()}, expected the same: everything random follows from the seed"
         )

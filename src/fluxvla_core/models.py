@@ -1,4 +1,5 @@
-"""Models and policies: what a model family is written with, and how a trained policy is loaded."""
+"""Models and policies: what a model family is written with, how a trained policy is loaded, and how
+checkpoints of other projects are read."""
 
 from __future__ import annotations
 
@@ -12,6 +13,11 @@ if TYPE_CHECKING:
     from fluxvla_core.build import build_projector_from_cfg as build_projector_from_cfg
     from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
     from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
+    from fluxvla_core.checkpoints.foreign import renamed as renamed
+    from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
+    from fluxvla_core.checkpoints.parts import Stored as Stored
+    from fluxvla_core.contracts.checkpoint_format import CheckpointFormat as CheckpointFormat
+    from fluxvla_core.contracts.checkpoint_format import ForeignCheckpoint as ForeignCheckpoint
     from fluxvla_core.contracts.frame import Observation as Observation
     from fluxvla_core.contracts.policy import Policy as Policy
     from fluxvla_core.contracts.training import VLA as VLA
@@ -29,6 +35,9 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "build_vision_backbone_from_cfg",
             "build_vlm_backbone_from_cfg",
         ],
+        "fluxvla_core.checkpoints.foreign": ["renamed", "safetensors_in"],
+        "fluxvla_core.checkpoints.parts": ["Stored"],
+        "fluxvla_core.contracts.checkpoint_format": ["CheckpointFormat", "ForeignCheckpoint"],
         "fluxvla_core.contracts.frame": ["Observation"],
         "fluxvla_core.contracts.policy": ["Policy"],
         "fluxvla_core.contracts.training": ["VLA"],

@@ -20,6 +20,7 @@ _POLICY = "fluxvla_core.contracts.policy"
 _TRAINING = "fluxvla_core.contracts.training"
 _ENVIRONMENT = "fluxvla_core.contracts.environment"
 _RUNNER = "fluxvla_core.contracts.runner"
+_FORMAT = "fluxvla_core.contracts.checkpoint_format"
 
 
 class RegistryRow(NamedTuple):
@@ -82,6 +83,12 @@ ROWS = (
         "environment: a simulator",
     ),
     RegistryRow("policies", "policy", f"{_POLICY}:Policy", "policy"),
+    RegistryRow(
+        "checkpoint_formats",
+        None,
+        f"{_FORMAT}:CheckpointFormat",
+        "checkpoint format of another project",
+    ),
     RegistryRow("commands", None, f"{_RUNNER}:Command", "command of the CLI"),
 )
 

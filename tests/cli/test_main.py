@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -178,7 +179,7 @@ def test_a_plugins_command_is_listed_without_importing_and_run_by_name(
         entry_points="[fluxvla.commands]\ngreet = acme_greet:Greet\n",
         files={"acme_greet.py": COMMAND},
     )
-    assert "greet           Greets (from acme-greet 1.0)" in fluxvla("--help").out
+    assert re.search(r"greet +Greets \(from acme-greet 1\.0\)", fluxvla("--help").out)
     assert "acme_greet" not in sys.modules
     assert "no command 'gret'; did you mean 'fluxvla greet'?" in fluxvla("gret").err
     ended = fluxvla("greet", "--name", "you")

@@ -156,7 +156,7 @@ def test_a_silence_is_broken_and_a_person_who_types_is_left_alone() -> None:
 
 def test_nobody_waits_longer_than_five_seconds_for_a_word() -> None:
     assert EVERY_S <= 5.0
-    assert KeepAliveReporter.__init__.__defaults__ == (EVERY_S,)
+    assert KeepAliveReporter.__init__.__defaults__ == (EVERY_S, "start")
 
 
 def test_a_silence_for_machines() -> None:

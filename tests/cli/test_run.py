@@ -69,7 +69,7 @@ def test_a_hint_names_the_tables_of_the_config(run: Fluxvla) -> None:
 def test_a_section_that_is_silent_is_said_to_be_working(
     run: Fluxvla, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1,))
+    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1, "start"))
     ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode=silent")
     assert ended.code == 0
     assert "s since: train 1/2" in ended.out

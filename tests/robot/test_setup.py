@@ -79,7 +79,7 @@ def test_a_base_among_the_joints(bench, make_arm):
     bench.arm = make_arm(embodiment=replace(arm, joints=(*arm.joints, *wheels)))
 
     error = refused(bench, SpecMismatch, "speeds by their names: base_linear, base_angular; a mob")
-    assert "is not supported yet among the joints of a policy" in str(error)
+    assert "Joint.base(name, unit, speed, acceleration)" in str(error)
     assert error.exit_code == 2
 
 

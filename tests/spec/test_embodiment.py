@@ -85,7 +85,7 @@ def test_all_differences_are_named_at_once():
         ({"unit": "m/s"}, "joint elbow: unit 'm/s' is a speed's; a mobile base, or another joint"),
         ({"unit": "rad/s"}, "unit 'rad/s' is a speed's"),
         ({"unit": "rpm"}, "unit 'rpm' is a speed's"),
-        ({"kind": "velocity"}, "kind 'velocity' is a speed's; .* is not supported yet among"),
+        ({"kind": "wheel"}, "kind 'wheel' is a speed's; a mobile base, .* has kind 'velocity'"),
         ({"kind": "base"}, "kind 'base' is a speed's"),
         ({"open": float("nan")}, "open and closed must be finite"),
         ({"jerk": 0.0}, "jerk must be positive, got 0"),

@@ -362,6 +362,39 @@ class TestCobotMagic:
         with pytest.raises(NotReady, match="aloha is not connected"):
             operator.drive(0.1, 0.0)
 
+    def test_a_policy_drives_the_base_within_its_limits(self, connect, drivers):
+        streams, sinks = robot(base=True)
+        driver = drivers([*streams[:-1], streams[-1] | {"data": [0.0, 0.0]}], sinks)
+        operator = connect(policy_drives_base=True)
+
+        def speeds():
+            return [(m["linear"]["x"], m["angular"]["z"]) for m in driver.on("/cmd_vel")]
+
+        spec = operator.embodiment
+        assert spec.joint_names[14:] == ("base_forward", "base_turn")
+        assert [j.unit for j in spec.joints[14:]] == ["m/s", "rad/s"]
+        np.testing.assert_array_equal(operator.get_frame().state[14:], [0.0, 0.0])
+        with pytest.raises(Rejected, match="the policy drives the base"):
+            operator.drive(0.1, 0.0)
+        with pytest.raises(Rejected, match=r"base_forward: the command 0.4 m/s is outside"):
+            operator.send_action([*START_POSE, 0.4, 0.0])
+        for place in range(1, 11):
+            operator.send_action([*START_POSE, 0.02 * place, -0.02 * place])
+            time.sleep(1 / spec.rate_hz)
+        operator.stop()
+        wait_for(lambda: speeds() and speeds()[-1] == (0.0, 0.0))
+        sent = np.array(speeds())
+        assert sent[9:].max() == pytest.approx(0.2)
+        assert np.abs(np.diff(sent[:, 0])).max() <= 0.5 / spec.rate_hz + 0.0101
+
+    def test_a_base_that_a_policy_drives_stops_when_nobody_commands(self, connect, drivers):
+        streams, sinks = robot(base=True)
+        driver = drivers([*streams[:-1], streams[-1] | {"data": [0.0, 0.0]}], sinks)
+        connect(policy_drives_base=True).send_action([*START_POSE, 0.1, 0.0])
+        wait_for(lambda: len(driver.on("/cmd_vel")) >= 2)
+        first, second = driver.on("/cmd_vel")[:2]
+        assert [m["linear"]["x"] for m in (first, second)] == [0.1, 0.0]
+
     def test_only_the_part_with_commands_drives_the_base(self, ros_domain, drivers):
         driver = drivers(*robot(base=True))
         with ExitStack() as stack:

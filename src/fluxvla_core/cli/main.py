@@ -84,6 +84,12 @@ COMMANDS: Mapping[str, Entry] = {
         "fluxvla_core.cli.policy_commands:Compare", "compare two evaluations, pair by pair"
     ),
     "export": Entry("fluxvla_core.cli.policy_commands:Export", "export a checkpoint for inference"),
+    "import-checkpoint": Entry(
+        "fluxvla_core.cli.policy_commands:ImportCheckpoint", "import another project's checkpoint"
+    ),
+    "bench-policy": Entry(
+        "fluxvla_core.cli.bench_command:BenchPolicy", "measure how long a policy takes to answer"
+    ),
     "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
 }
 """Name -> where the command is and its help line, so that only one is imported."""

@@ -1,4 +1,4 @@
-"""Commands for trained policies: ``fluxvla eval compare`` and ``fluxvla export``."""
+"""Commands for trained policies: ``eval compare``, ``export`` and ``import-checkpoint``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import argparse
 
 from fluxvla_core.atomic import json_text
 from fluxvla_core.cli.parser import Parser
+from fluxvla_core.cli.reporters import heartbeat
 from fluxvla_core.cli.terminal import say
+from fluxvla_core.errors import UsageError
 
 
 class Compare:
@@ -30,7 +32,8 @@ class Compare:
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.evaluation.compare import compare, describe, read
 
-        found = compare(read(args.a, args.group_a), read(args.b, args.group_b), args.common)
+        with heartbeat(f"comparing {args.a} with {args.b}"):
+            found = compare(read(args.a, args.group_a), read(args.b, args.group_b), args.common)
         say(json_text(found, indent=1) if args.json else "\n".join(describe(found)))
         return 0
 
@@ -49,11 +52,98 @@ class Export:
             help="a checkpoint's folder, or a work dir for its newest one",
         )
         parser.add_argument("folder", metavar="DIR", help="the folder to make")
+        parser.once(
+            "--format",
+            metavar="NAME",
+            help="write it as another project saves one: lerobot, openpi, … (a plugin's format)",
+        )
 
     def run(self, args: argparse.Namespace) -> int:
+        if args.format is not None:
+            from fluxvla_core.training.foreign import export_foreign
+
+            with heartbeat(f"exporting {args.checkpoint}"):
+                path = export_foreign(args.checkpoint, args.folder, args.format)
+            say(f"{path}: as {args.format} saves one")
+            return 0
         from fluxvla_core.training.export import export
 
-        path = export(args.checkpoint, args.folder)
+        with heartbeat(f"exporting {args.checkpoint}"):
+            path = export(args.checkpoint, args.folder)
         size = (path / "model.safetensors").stat().st_size
         say(f"{path}: model.safetensors of {size / 1e6:.1f} MB and what it needs to act")
         return 0
+
+
+class ImportCheckpoint:
+    api = "1.0"
+    help = (
+        "Make a checkpoint of FluxVLA from one of another project (openpi, LeRobot, GR00T, …), by "
+        "the format that an installed plugin has for its model family."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument(
+            "source",
+            metavar="SRC",
+            help="the checkpoint's folder, or hf:OWNER/NAME[@REVISION] on the Hugging Face hub",
+        )
+        parser.add_argument("folder", metavar="OUT", help="the folder to make")
+        parser.once("--format", metavar="NAME", help="the project; by default it is found out")
+        parser.once(
+            "--tokenizer", metavar="DIR", help="the tokenizer's folder, if the checkpoint has none"
+        )
+        parser.once(
+            "--embodiment",
+            metavar="FILE",
+            help="the robot: an embodiment.json, or a dataset's or checkpoint's folder with one; "
+            "without it, the result can be trained on but drives no robot",
+        )
+        parser.once(
+            "--rate", metavar="HZ", type=float, help="actions a second, if the checkpoint says none"
+        )
+        parser.add_argument(
+            "--camera",
+            metavar="THEIRS=OURS",
+            action="append",
+            default=[],
+            help="the robot's name of a camera; may be repeated",
+        )
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.training.foreign import embodiment_in, import_checkpoint
+
+        rate_hz, cameras = _rate(args.rate), dict(_pair(text) for text in args.camera)
+        robot = None if args.embodiment is None else embodiment_in(args.embodiment)
+        with heartbeat(f"importing {args.source}"):
+            path, found = import_checkpoint(
+                args.source,
+                args.folder,
+                format=args.format,
+                tokenizer=args.tokenizer,
+                embodiment=robot,
+                action_rate_hz=rate_hz,
+                cameras=cameras,
+            )
+        name = "no robot" if found.embodiment is None else found.embodiment.name
+        rate = "an unknown rate" if not found.action_rate_hz else f"{found.action_rate_hz:g} Hz"
+        say(
+            f"{path}: {found.model['type']}, {len(found.tensors)} tensors; cameras "
+            f"{', '.join(found.img_keys)}; chunks of {found.horizon} actions at {rate}; {name}"
+        )
+        for note in found.notes:
+            say(f"note: {note}")
+        return 0
+
+
+def _rate(hz: float | None) -> float | None:
+    if hz is not None and not 0 < hz < float("inf"):
+        raise UsageError(f"--rate {hz:g} is not a rate")
+    return hz
+
+
+def _pair(text: str) -> tuple[str, str]:
+    theirs, equals, ours = text.partition("=")
+    if not (theirs and equals and ours):
+        raise UsageError(f"--camera {text!r} is not THEIRS=OURS")
+    return theirs, ours

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -36,13 +37,17 @@ class KeepAliveReporter(RunReporter):
 
     Loading a model, or an episode that is long, are silent by themselves. After :meth:`settle`,
     when a person is waited for, it says nothing before the next progress.
+
+    Args:
+        every: seconds of silence before the first heartbeat, and between two.
+        what: what goes on before the first report.
     """
 
-    def __init__(self, inner: RunReporter, every: float = EVERY_S) -> None:
+    def __init__(self, inner: RunReporter, every: float = EVERY_S, what: str = "start") -> None:
         self._inner = inner
         self._every = every
         self._lock = threading.RLock()
-        self._what = "start"
+        self._what = what
         self._last_report = self._last_line = time.monotonic()
         self._quiet = False
         self._ended = threading.Event()
@@ -98,6 +103,19 @@ class KeepAliveReporter(RunReporter):
                     self._inner.still_working(self._what, now - self._last_report)
                 except (OSError, ValueError):  # nobody reads any more: the next report fails
                     return
+
+
+@contextmanager
+def heartbeat(what: str, every: float = EVERY_S) -> Iterator[None]:
+    """Lines on stderr as long as the block takes, for commands that print their result alone.
+
+    A block that takes less than ``every`` seconds prints none.
+    """
+    reporter = KeepAliveReporter(LineReporter(sys.stderr), every, what)
+    try:
+        yield
+    finally:
+        reporter.close()
 
 
 class Throttle:

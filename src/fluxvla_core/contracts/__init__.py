@@ -1,5 +1,6 @@
 """The contracts between the core and its plugins, as base classes."""
 
+from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
 from fluxvla_core.contracts.part import Part
@@ -24,6 +25,7 @@ __all__ = [
     "VLA",
     "ActionFilter",
     "Actor",
+    "CheckpointFormat",
     "Clock",
     "Collator",
     "Command",
@@ -31,6 +33,7 @@ __all__ = [
     "Dataset",
     "Environment",
     "EnvironmentSpec",
+    "ForeignCheckpoint",
     "Frame",
     "Hook",
     "InferenceDataset",

@@ -58,6 +58,13 @@ class VLA(Contract):
         """
         return None
 
+    @attribute
+    def pretrained_name_or_path(self) -> str | None:
+        """The weights that a training starts from: what ``runner.init_from`` takes, for instance
+        another project's checkpoint. The trainer reads them, not the constructor; what a checkpoint
+        of the training holds comes after it."""
+        return None
+
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.
 

@@ -28,7 +28,7 @@ from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joi
 from fluxvla_core.data.transforms.images import join_planes, split_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
 
 Floats = npt.NDArray[np.float32]
 
@@ -393,7 +393,7 @@ def _relative(
     spec = dataset.embodiment
     if wanted is True:
         kinds = [j.kind for j in spec.joints] if spec is not None else ["revolute"] * width
-        wanted = [kind != "gripper" for kind in kinds]
+        wanted = [kind not in ("gripper", VELOCITY) for kind in kinds]
     mask = np.asarray(wanted, np.bool_)
     if mask.shape != (width,):
         raise ConfigError(

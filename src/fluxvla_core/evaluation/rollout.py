@@ -23,7 +23,7 @@ from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
 from fluxvla_core.robot.control.limits import CommandLimiter, PassThrough
 from fluxvla_core.robot.control.sender import CommandFormer
-from fluxvla_core.robot.control.tracking import action_columns
+from fluxvla_core.robot.control.tracking import action_columns, action_values
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]
@@ -64,7 +64,7 @@ class ChunkCommands:
         body = spec.embodiment
         self._rate = body.rate_hz
         self._action_rate = action_rate_hz or self._rate
-        self._columns = action_columns(body) if spec.limited else None
+        self._columns = action_columns(body) if spec.limited else np.arange(0)
         self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
         self._former = CommandFormer(self._limiter or PassThrough(body))
 
@@ -72,7 +72,7 @@ class ChunkCommands:
         """Begin an episode where the robot is."""
         self.clamped = 0
         if self._limiter is not None:
-            self._limiter.start(state[self._columns])
+            self._limiter.start(action_values(self._columns, state))
 
     def targets(self, chunk: Array) -> Array:
         """``(N, dim)``, one for each control step; limited only when they are taken."""

@@ -124,6 +124,7 @@ if TYPE_CHECKING:  # the names that the table makes; a test compares them
     HOOKS: Registry
     ENVIRONMENTS: Registry
     POLICIES: Registry
+    CHECKPOINT_FORMATS: Registry
     COMMANDS: Registry
 else:
     globals().update({row.constant: BY_NAME[row.name] for row in ROWS})

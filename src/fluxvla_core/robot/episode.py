@@ -24,7 +24,7 @@ from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
 from fluxvla_core.robot.control.sender import CommandSender, Execute, Sent, come_to_rest, ramp
 from fluxvla_core.robot.control.source import ChunkSource
-from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
+from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.control_loop import ControlLoop
 from fluxvla_core.robot.events import (
     EpisodeEnded,
@@ -155,7 +155,6 @@ class Episode:
             self._emit,
         )  # fmt: skip
         self._source = parts.source(task, seed, self._tracking, self._emit)
-        self._columns = action_columns(robot.embodiment)
         self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
         self._trips = len(parts.latch.trips)
         self._executing = False
@@ -275,13 +274,13 @@ class Episode:
             state = measured.state
         commanded = self._robot.commanded(self._before)
         if commanded is None:
-            return state[self._columns]
+            return self._tracking.positions(state)
         kept = self._grippers
         if self._held:
             kept = kept | self._tracking.follows(commanded, state)
         elif self._robot.tells_hold:
             kept = kept | self._tracking.stayed(commanded, state)
-        return np.where(kept, commanded, state[self._columns])
+        return np.where(kept, commanded, self._tracking.positions(state))
 
     def _execute(self, actions: Array, rate: Rate) -> None:
         self._executing = True

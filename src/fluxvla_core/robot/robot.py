@@ -69,9 +69,10 @@ class Robot:
             raise SpecMismatch(
                 f"{self.embodiment.name} has joints that are speeds by their names: "
                 f"{', '.join(moving)}; {NO_SPEEDS}",
-                next="leave them out of the embodiment and drive the base by a method of the "
-                "operator's own, as AlohaOperator.drive does; a joint that is commanded by its "
-                "position needs another name",
+                next="describe them with Joint.base(name, unit, speed, acceleration), or leave "
+                "them out and drive the base by a method of the operator's own, as "
+                "AlohaOperator.drive does; a joint that is commanded by its position needs "
+                "another name",
             )
         lacks = missing_operator_methods(operator)
         self.complete = not lacks

@@ -116,7 +116,7 @@ def hold_target(embodiment: EmbodimentSpec, last: Array, state: Array, moved: Ar
     target = last.copy()
     for index, joint in enumerate(embodiment.joints):
         column = where.get(joint.name)
-        if column is None:
+        if column is None or joint.by_speed:
             continue
         way = last[index] - state[column]
         nearer = max(moved[column] * np.sign(way), 0.0)
@@ -130,8 +130,9 @@ def braking_commands(
 ) -> Array:
     """Commands from the last one to rest, within the limits of the embodiment.
 
-    Joints whose target is the last command brake. One that is to be held elsewhere does not obey:
-    its command halts at once, and goes from there to its target.
+    Joints whose target is the last command brake; those that are commanded by their speed come to
+    0. One that is to be held elsewhere does not obey: its command halts at once, and goes from
+    there to its target.
 
     Args:
         embodiment: whose limits, and whose rate.
@@ -144,7 +145,7 @@ def braking_commands(
         ``(N, dim)``, one at least: to repeat the last command is to hold.
     """
     if embodiment.action_mode != "absolute":
-        return target[None]
+        return np.where([joint.by_speed for joint in embodiment.joints], 0.0, target)[None]
     limiter = CommandLimiter(embodiment, 1.0 / embodiment.rate_hz)
     limiter.resume(last, before, seconds)
     blocked = target != last

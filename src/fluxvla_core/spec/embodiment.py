@@ -16,12 +16,15 @@ from typing import Any
 from fluxvla_core.errors import SpecMismatch
 from fluxvla_core.untrusted import checked
 
-JOINT_KINDS = ("revolute", "prismatic", "gripper")
+VELOCITY = "velocity"
+JOINT_KINDS = ("revolute", "prismatic", "gripper", VELOCITY)
 UNITS = ("rad", "m", "normalized")
+SPEED_UNITS = ("m/s", "rad/s")
+"""Of joints of kind ``velocity``."""
 ACTION_MODES = ("absolute", "delta")
 # A joint of such a unit or kind is commanded by its speed.
 _SPEED_UNITS = re.compile(r".+/\s*s(ec)?(ond)?s?|rpm|hz", re.IGNORECASE)
-_SPEED_KINDS = ("base", "continuous", "floating", "planar", "speed", "velocity", "wheel")
+_SPEED_KINDS = ("base", "continuous", "floating", "planar", "speed", "wheel")
 # So is one with such a word in its name, or with two words of these pairs.
 _SPEED_WORDS = {"rpm", "speed", "speeds", "twist", "vel", "vels", "velocity", "velocities"}
 _SPEED_WORDS |= {"vx", "vy", "vz", "vyaw", "vtheta", "wheel", "wheels", "cmdvel"}
@@ -30,8 +33,8 @@ _SPEED_PAIRS = (
     ({"angular", "linear"}, {"x", "y", "z"}),
 )
 NO_SPEEDS = (
-    "a mobile base, or another joint that is commanded by its speed, is not supported yet among "
-    "the joints of a policy: the arm is held by repeating its last command, and a speed that is "
+    "a mobile base, or another joint that is commanded by its speed, has kind 'velocity' and unit "
+    "'m/s' or 'rad/s': any other joint is held by repeating its last command, and a speed that is "
     "repeated rolls on"
 )
 LARGEST_SIDE = 16384
@@ -45,15 +48,19 @@ class Joint:
 
     Args:
         name: the joint's name in messages and logs, for example ``left_waist``.
-        unit: ``rad``, ``m``, or ``normalized`` (grippers scaled to a range of their own). A joint
-            is commanded by its position: there are no units of speed.
-        lower, upper: position limits, in ``unit``.
-        velocity: largest speed, in ``unit``/s.
-        acceleration: largest acceleration, in ``unit``/s^2.
-        kind: ``revolute``, ``prismatic`` or ``gripper``.
+        unit: ``rad``, ``m``, or ``normalized`` (grippers scaled to a range of their own); ``m/s``
+            or ``rad/s`` of kind ``velocity``.
+        lower, upper: position limits, in ``unit``; of kind ``velocity`` limits of the speed.
+        velocity: largest speed, in ``unit``/s; of kind ``velocity`` the larger of its two limits,
+            in ``unit``.
+        acceleration: largest acceleration, in ``unit``/s^2; of kind ``velocity`` in ``unit``/s.
+        kind: ``revolute``, ``prismatic``, ``gripper``, or ``velocity``: an axis of a mobile base,
+            or another joint that is commanded by its speed (see :meth:`base`). To hold it is to
+            bring it to 0.
         open, closed: a gripper's values at its ends; together they state its polarity.
-        jerk: largest change of acceleration, in ``unit``/s^3, where the maker states one; None does
-            not limit it. Left out of ``to_dict`` then, as descriptions from before it have it.
+        jerk: largest change of acceleration, in ``unit``/s^3 (of kind ``velocity`` in
+            ``unit``/s^2), where the maker states one; None does not limit it. Left out of
+            ``to_dict`` then, as descriptions from before it have it.
     """
 
     name: str
@@ -70,11 +77,13 @@ class Joint:
     def __post_init__(self) -> None:
         if self.kind in _SPEED_KINDS:
             raise ValueError(f"joint {self.name}: kind {self.kind!r} is a speed's; {NO_SPEEDS}")
-        if _SPEED_UNITS.fullmatch(self.unit):
-            raise ValueError(f"joint {self.name}: unit {self.unit!r} is a speed's; {NO_SPEEDS}")
         if self.kind not in JOINT_KINDS:
             raise ValueError(f"joint {self.name}: kind {self.kind!r} is not one of {JOINT_KINDS}")
-        if self.unit not in UNITS:
+        if self.by_speed:
+            self._check_speed()
+        elif _SPEED_UNITS.fullmatch(self.unit):
+            raise ValueError(f"joint {self.name}: unit {self.unit!r} is a speed's; {NO_SPEEDS}")
+        elif self.unit not in UNITS:
             raise ValueError(f"joint {self.name}: unit {self.unit!r} is not one of {UNITS}")
         numbers = (self.lower, self.upper, self.velocity, self.acceleration)
         if not all(math.isfinite(n) for n in numbers):
@@ -90,6 +99,57 @@ class Joint:
             raise ValueError(f"joint {self.name}: jerk must be positive, got {self.jerk}")
         if self.kind == "gripper" and (self.open is None or self.closed is None):
             raise ValueError(f"gripper {self.name}: open and closed state its polarity; give both")
+
+    def _check_speed(self) -> None:
+        if self.unit not in SPEED_UNITS:
+            raise ValueError(
+                f"joint {self.name}: kind {VELOCITY!r} has unit m/s or rad/s, not {self.unit!r}"
+            )
+        if not self.lower <= 0.0 <= self.upper:
+            raise ValueError(
+                f"joint {self.name}: a speed of 0 is not in [{self.lower}, {self.upper}], and it "
+                "could not be held"
+            )
+        if self.velocity != max(-self.lower, self.upper):
+            raise ValueError(
+                f"joint {self.name}: velocity {self.velocity} is not the larger of its limits "
+                f"{self.lower} and {self.upper}; Joint.base(...) fills it in"
+            )
+
+    @classmethod
+    def base(
+        cls,
+        name: str,
+        unit: str,
+        speed: float,
+        acceleration: float,
+        jerk: float | None = None,
+        backward: float | None = None,
+    ) -> Joint:
+        """An axis of a mobile base, or another joint that is commanded by its speed.
+
+        Args:
+            name: for example ``base_forward`` or ``base_turn``.
+            unit: ``m/s`` or ``rad/s``.
+            speed: largest speed, in ``unit``.
+            acceleration: largest change of the speed, in ``unit``/s.
+            jerk: largest change of the acceleration, in ``unit``/s^2.
+            backward: largest speed in the other direction; ``speed`` by default.
+        """
+        back = speed if backward is None else backward
+        return cls(
+            name, unit, -back, speed, max(back, speed), acceleration, kind=VELOCITY, jerk=jerk
+        )
+
+    @property
+    def by_speed(self) -> bool:
+        """Whether its command is a speed."""
+        return self.kind == VELOCITY
+
+    @property
+    def slew_rate(self) -> float:
+        """How fast its command may change, in ``unit``/s."""
+        return self.acceleration if self.by_speed else self.velocity
 
 
 @dataclass(frozen=True)
@@ -212,11 +272,11 @@ def _refuse_unknown(kind: type, tables: Iterable[Mapping[str, Any]]) -> None:
 
 
 def speeds(spec: EmbodimentSpec) -> list[str]:
-    """Names of the action's joints that, by their names, are commanded by a speed.
+    """Names of the action's joints that, by their names, are speeds without being of that kind.
 
     Simulated environments and datasets may have such joints; a robot's are refused.
     """
-    return [joint.name for joint in spec.joints if _is_speed(joint.name)]
+    return [joint.name for joint in spec.joints if not joint.by_speed and _is_speed(joint.name)]
 
 
 def _is_speed(name: str) -> bool:

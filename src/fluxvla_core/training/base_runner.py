@@ -164,6 +164,7 @@ class BaseTrainRunner(Strategy):
 
     def _build_vla(self) -> nn.Module:
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
+        from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import flops, lora
         from fluxvla_core.training.model import checkpoint_activations, compile_units
         from fluxvla_core.training.rng import seed_all
@@ -179,9 +180,10 @@ class BaseTrainRunner(Strategy):
         seed_all(self.options.seed)
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self.resume_checkpoint
-        start_training_from(vla, options.init_from, before, self.lora is not None, self.world)
+        init_from = options.init_from or VLA.adapt(vla).pretrained_name_or_path
+        start_training_from(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
-            self.adapter_base = base_to_note(before, options.init_from)
+            self.adapter_base = base_to_note(before, init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
         self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:

@@ -13,10 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
+from fluxvla_core.checkpoints.foreign import foreign_folder
+from fluxvla_core.checkpoints.parts import Stored
 from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, on_first
+from fluxvla_core.training.formats import is_foreign, read_foreign
 from fluxvla_core.training.model import frozen_sources, set_frozen_source
 
 
@@ -88,7 +91,7 @@ def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, 
     return {name: tensor for name, tensor in state.items() if name not in skipped}
 
 
-def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor | Stored]) -> None:
     """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
     state = weights_by_name(model)
     # strict=False only for what is left out of checkpoints: names and sizes have been checked.
@@ -236,6 +239,8 @@ def exact_place(place: str | Path) -> str:
     Raises:
         CheckpointError: there is none.
     """
+    if is_foreign(place):
+        return str(foreign_folder(place).resolve())
     path = Path(os.path.realpath(place))
     return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
 
@@ -244,7 +249,8 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
     """Give a freshly built ``model`` the weights of another training, or of an export.
 
     Args:
-        place: a checkpoint's folder, a work dir (its newest one), or a safetensors file.
+        place: a checkpoint's folder, a work dir (its newest one), a safetensors file, or another
+            project's checkpoint, of which a plugin has the format.
 
     Returns:
         The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
@@ -253,6 +259,9 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
     Raises:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.
     """
+    if is_foreign(place):
+        tensors: Mapping[str, Tensor | Stored] = read_foreign(place).tensors
+        return _put_all(model, tensors, foreign_folder(place).resolve())
     path = Path(os.path.realpath(place))
     if path.suffix != ".safetensors":
         checkpoint = Checkpoint.open(path)
@@ -261,7 +270,10 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
         return checkpoint.path
     if not path.is_file():
         raise CheckpointError(f"there are no weights at {path}")
-    tensors = read_tensors(path)
+    return _put_all(model, read_tensors(path), path)
+
+
+def _put_all(model: nn.Module, tensors: Mapping[str, Tensor | Stored], path: Path) -> Path:
     brings = left_out(model).names - set(tensors)
     check_names(tensors, weights_by_name(model, brings), "the weights", str(path))
     put_model_tensors(model, tensors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
 from fluxvla_aloha.embodiment import CAMERAS, GRIPPERS, RATE_HZ, aloha_spec
 from fluxvla_aloha.presets import PRESETS
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
-from fluxvla_core.operators import Camera, EmbodimentSpec
+from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 from fluxvla_core.ros2 import (
     JOINT_STATE,
     ODOMETRY,
     SIDE,
+    STATE,
     TWIST,
     BadMessage,
     CommandSpec,
@@ -54,6 +56,9 @@ class AlohaOperator(RosOperator):
         robot_base_topic, robot_base_cmd_topic: odometry and velocity of the base.
         use_depth_image: read depth into ``frame.depths``.
         use_robot_base: read the base's speed into ``frame.base``, and allow :meth:`drive`.
+        policy_drives_base: the base's forward and turning speed are the last two of the policy's
+            actions and of the state (``base_forward`` in m/s, ``base_turn`` in rad/s), as Mobile
+            ALOHA has them; nobody else may drive it then. It comes to rest in every hold and stop.
         publish_rate: commands a second.
         camera_names: what front, left and right camera are called, in this order; with fewer names
             the last cameras are not used.
@@ -63,6 +68,8 @@ class AlohaOperator(RosOperator):
         arm_message, gripper_message: types of the commands: ``sensor_msgs.msg:JointState``, one
             with a field ``cmd`` as Interbotix has, or a std_msgs array or number.
         base_max_linear, base_max_angular: largest speeds of the base, in m/s and rad/s.
+        base_max_linear_acceleration, base_max_angular_acceleration: how fast a policy may change
+            them, in m/s^2 and rad/s^2.
         camera_rate_hz: pictures a second that should come; None: as many as are sent.
         arms: ``viperx300``, ``arx_x5`` or ``piper``: whose limits are kept. The preset
             ``interbotix`` has the first; with ``cobot_magic`` nobody but you can tell, and without
@@ -96,6 +103,7 @@ class AlohaOperator(RosOperator):
         robot_base_cmd_topic: str | None = None,
         use_depth_image: bool = False,
         use_robot_base: bool = False,
+        policy_drives_base: bool = False,
         publish_rate: float = RATE_HZ,
         camera_names: Sequence[str] = tuple(camera.name for camera in CAMERAS),
         height: int = 480,
@@ -107,6 +115,8 @@ class AlohaOperator(RosOperator):
         gripper_message: str | None = None,
         base_max_linear: float = 0.3,
         base_max_angular: float = 0.5,
+        base_max_linear_acceleration: float = 0.5,
+        base_max_angular_acceleration: float = 1.0,
         camera_rate_hz: float | None = None,
         arms: str | None = None,
         embodiment: Mapping[str, Any] | None = None,
@@ -146,7 +156,8 @@ class AlohaOperator(RosOperator):
             (known.odometry, known.velocity), robot_base_topic, robot_base_cmd_topic
         )
         self._use_depth = use_depth_image
-        self._use_base = use_robot_base
+        self._use_base = use_robot_base or policy_drives_base
+        self._policy_drives = policy_drives_base
         self._names = tuple(joint_names or known.joints)
         if len(self._names) != _ARM:
             raise ConfigError(f"joint_names are {_ARM} names of one arm, got {list(self._names)}")
@@ -165,6 +176,12 @@ class AlohaOperator(RosOperator):
             base_max_linear,
             base_max_angular,
         )
+        if policy_drives_base:
+            base = (
+                Joint.base("base_forward", "m/s", base_max_linear, base_max_linear_acceleration),
+                Joint.base("base_turn", "rad/s", base_max_angular, base_max_angular_acceleration),
+            )
+            self.embodiment = replace(self.embodiment, joints=(*self.embodiment.joints, *base))
 
     def connect(self) -> None:
         """As ``RosOperator`` does it, once it is known which arms are there.
@@ -195,7 +212,8 @@ class AlohaOperator(RosOperator):
             if self._use_depth:
                 found.append(camera_stream(camera, depth, self._camera_hz, depth=True))
         if self._use_base:
-            found.append(StreamSpec("base", self._base_topics[0], ODOMETRY, SIDE, depth=1))
+            kind = STATE if self._policy_drives else SIDE
+            found.append(StreamSpec("base", self._base_topics[0], ODOMETRY, kind, depth=1))
         return found
 
     def commands(self) -> Sequence[CommandSpec]:
@@ -215,11 +233,14 @@ class AlohaOperator(RosOperator):
             state[column] = (state[column] - self._gripper_closed) / (
                 self._gripper_open - self._gripper_closed
             )
+        if self._policy_drives:
+            state = np.concatenate([state, self._base_speeds(messages)])
         return state
 
     def read_base(self, messages: Mapping[str, Any]) -> Array | None:
-        if not self._use_base:
-            return None
+        return self._base_speeds(messages) if self._use_base else None
+
+    def _base_speeds(self, messages: Mapping[str, Any]) -> Array:
         twist = messages["base"].twist.twist
         speeds = np.array([twist.linear.x, twist.angular.z])
         if not np.isfinite(speeds).all():
@@ -237,6 +258,8 @@ class AlohaOperator(RosOperator):
             name = self._names[-1]
             self._command(arm_topic, self._arm_message, self._names[:-1], arm[:-1], _GROUP)
             self._command(gripper_topic, self._gripper_message, (name,), arm[-1:], name)
+        if self._policy_drives:
+            self._drive.drive(*action[2 * _ARM :].tolist())
 
     def drive(self, linear: float, angular: float) -> None:
         """Drive the base at ``linear`` m/s forward and ``angular`` rad/s.
@@ -244,9 +267,12 @@ class AlohaOperator(RosOperator):
         The speed ends a quarter of a second later unless it is asked for again, and in ``stop``.
 
         Raises:
-            Rejected: this operator has no base, or a speed is not finite or beyond its limit.
+            Rejected: this operator has no base, the policy drives it, or a speed is not finite or
+                beyond its limit.
             NotReady: not connected.
         """
+        if self._policy_drives:
+            raise Rejected("the policy drives the base", next="policy_drives_base=False")
         if not self._use_base:
             raise Rejected(
                 "the base is not used", next=f"--set <{type(self).__name__}>.use_robot_base=true"
@@ -261,7 +287,8 @@ class AlohaOperator(RosOperator):
             connection.every(TIMEOUT_S / 5, self._tick)
 
     def on_stop(self) -> None:
-        if self._use_base:
+        # What the policy drives is braked with the arm, and stays at 0.
+        if self._use_base and not self._policy_drives:
             self._drive.halt()
 
     def _tick(self) -> None:

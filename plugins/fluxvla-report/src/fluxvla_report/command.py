@@ -20,7 +20,10 @@ class Report:
         parser.add_argument("--title", default="", help="default: the name of the config")
 
     def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.commands import heartbeat
         from fluxvla_report.page import build_report
 
-        print(build_report(args.work_dir, args.out, args.title))
+        with heartbeat(f"writing the report of {args.work_dir}"):
+            path = build_report(args.work_dir, args.out, args.title)
+        print(path)
         return 0

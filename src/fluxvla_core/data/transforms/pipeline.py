@@ -124,6 +124,14 @@ def declared(thing: object, name: str, method: str) -> Any:
     return vars(owner).get(name)
 
 
+def redirected(
+    transforms: Sequence[Mapping[str, Any]], processors: Path
+) -> list[Mapping[str, Any]]:
+    """``transforms`` with the tokenizers that a checkpoint's ``processors`` folder has."""
+    saved = _saved(processors)
+    return [_redirect(table, saved) for table in transforms]
+
+
 def _saved(folder: Path) -> dict[str, str]:
     """Model path in a config -> folder of its saved copy."""
     file = folder / INDEX

@@ -217,7 +217,7 @@ def _check_jumps(
     """Refuse jumps between points ``(N, dim)``; the second one is keyframe ``first``."""
     moves = np.diff(points, axis=0)
     # Each keyframe has its own period to move in; jump_s comes on top.
-    seconds = np.abs(moves) / np.array([j.velocity for j in embodiment.joints]) - 1.0 / rate_hz
+    seconds = np.abs(moves) / np.array([j.slew_rate for j in embodiment.joints]) - 1.0 / rate_hz
     if not (seconds > settings.jump_s).any():
         return
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)

@@ -39,6 +39,12 @@ Targets are tracked without overshoot as far as the limits allow: relative to th
 the same ``b`` bounds the closing speed, so a step is followed in the least time and a ramp without
 lag.
 
+A joint that is commanded by its speed (kind ``velocity``: a mobile base) goes through the same
+steps one derivative up: its command ``p`` is the speed, kept within ``lower`` and ``upper``, and
+``|p - p_before| <= A dt``. Nothing limits the change of that but ``jerk``, so that the speed is
+reached and left at full acceleration. What brakes an arm brings such a joint to 0: there it rests,
+and nowhere else.
+
 Joints that state a ``jerk`` limit ``J`` are smoothed after that: what is sent is the mean of the
 last ``N`` such commands, which also keeps ``|a - a_before| <= J dt``; ``smoothing`` proves
 it, and that such an arm comes to rest within all limits too. A motion that keeps the limits is sent
@@ -120,14 +126,19 @@ class CommandLimiter:
         joints = embodiment.joints
         self.embodiment = embodiment
         self.period = period
-        self.lower: Array = np.array([j.lower for j in joints])
-        self.upper: Array = np.array([j.upper for j in joints])
-        speeds = np.array([j.velocity for j in joints])
-        self.velocity: Array = speeds * velocity_scale * (1 - MARGIN)
+        # Joints whose command is a speed; what is called speed below is its change then.
+        self._by_speed = np.array([j.by_speed for j in joints])
+        shares = np.where(self._by_speed, velocity_scale, 1.0)
+        self.lower: Array = np.array([j.lower for j in joints]) * shares
+        self.upper: Array = np.array([j.upper for j in joints]) * shares
+        rates = np.array([j.slew_rate for j in joints]) * (1 - MARGIN)
+        self.velocity: Array = rates * np.where(self._by_speed, acceleration_scale, velocity_scale)
         steps = np.array([j.acceleration for j in joints]) * period
-        self._step: Array = steps * acceleration_scale * (1 - MARGIN)
+        steps = steps * acceleration_scale * (1 - MARGIN)
+        self._smoothing = Smoothing(joints, steps / period, period)
+        # From full acceleration to full deceleration in one period.
+        self._step: Array = np.where(self._by_speed, 2.0 * self.velocity, steps)
         self._planned: Array = self._step * (1 - MARGIN)
-        self._smoothing = Smoothing(joints, self._step / period, period)
         # The last command, and what it is the mean of: the last position before smoothing.
         self._last: Array | None = None
         self._raw: Array = np.zeros(len(joints))
@@ -154,24 +165,31 @@ class CommandLimiter:
     @property
     def longest_stop(self) -> int:
         """How many commands braking takes, at most."""
-        ticks = int(np.max(self.velocity / self.acceleration) / self.period)
-        return ticks + 2 + self._smoothing.length
+        ways = np.where(
+            self._by_speed,
+            np.maximum(-self.lower, self.upper) / self.velocity,
+            self.velocity / self.acceleration,
+        )
+        return int(np.max(ways) / self.period) + 2 + self._smoothing.length
 
     @property
     def at_rest(self) -> bool:
         """Whether the last two commands were the same, and so will be those of braking."""
-        return not self._speed.any() and self._smoothing.at_rest
+        return not self._moving and self._smoothing.at_rest
 
     def start(self, measured: npt.ArrayLike) -> None:
         """Begin from where the arm is, at rest.
 
         Args:
-            measured: ``(D,)`` position of every action joint.
+            measured: ``(D,)`` position of every action joint, speed of those commanded by it.
 
         Raises:
-            BadCommand: a joint is not finite, or further beyond its limits than backlash explains.
+            BadCommand: a joint is not finite, or further beyond its limits than backlash explains;
+                or a mobile base is rolling.
         """
         pose = self._checked(measured, "the measured pose")
+        self._refuse_rolling(pose)
+        pose = np.where(self._by_speed, 0.0, pose)
         excess = np.maximum(self.lower - pose, pose - self.upper)
         slack = np.minimum(START_SHARE * (self.upper - self.lower), START_SLACK)
         for index in np.flatnonzero(excess > slack):
@@ -201,6 +219,7 @@ class CommandLimiter:
 
         For joints that do not obey: to brake one that is blocked would be to push on.
         """
+        joints = joints & ~self._by_speed
         self._raw = np.where(joints, self.last, self._raw)
         self._target = np.where(joints, self.last, self._target)
         self._speed = np.where(joints, 0.0, self._speed)
@@ -209,7 +228,7 @@ class CommandLimiter:
     def rest(self) -> Array:
         """``(D,)`` where the arm comes to rest if it brakes now."""
         now = self.snapshot()
-        while self._speed.any():
+        while self._moving:
             self.brake()
         pose = self._raw.copy()
         self.restore(now)
@@ -219,8 +238,9 @@ class CommandLimiter:
         """``(D,)`` the next command on the way to rest at ``goal``; ``speed`` as ``step`` has it.
 
         ``step`` follows a motion; here ``goal`` is none, however far from the last target it is.
+        Joints that are commanded by their speed go to 0.
         """
-        self._target = np.clip(goal, self.lower, self.upper)
+        self._target = np.where(self._by_speed, 0.0, np.clip(goal, self.lower, self.upper))
         return self.step(self._target, speed)[0]
 
     def step(self, wanted: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[Clamp]]:
@@ -239,7 +259,9 @@ class CommandLimiter:
         target = self._checked(wanted, "the command")
         self._started()
         before = self._raw
-        reachable = np.clip(target, self.lower, self.upper)
+        # The share is of a speed, also where that is the command.
+        share = np.where(self._by_speed, speed, 1.0)
+        reachable = np.clip(target, self.lower * share, self.upper * share)
         raw, braked = self._advance(before, reachable, speed)
         self._target = reachable
         self._speed = (raw - before) / self.period
@@ -278,8 +300,26 @@ class CommandLimiter:
         slower[np.abs(slower) < self._step * 1e-9] = 0.0
         raw = np.clip(before + slower * self.period, self.lower, self.upper)
         self._speed = np.where(slower == 0.0, 0.0, (raw - before) / self.period)
+        left = np.maximum(np.abs(before) - self.velocity * self.period, 0.0)
+        raw = np.where(self._by_speed, np.sign(before) * left, raw)
+        self._speed = np.where(self._by_speed, (raw - before) / self.period, self._speed)
         self._target = raw
         return self._smoothed(raw).copy()
+
+    @property
+    def _moving(self) -> bool:
+        """Whether what is smoothed is not at rest."""
+        return bool(self._speed.any() or self._raw[self._by_speed].any())
+
+    def _refuse_rolling(self, pose: Array) -> None:
+        rolling = self._by_speed & (np.abs(pose) > START_SHARE * (self.upper - self.lower))
+        for index in np.flatnonzero(rolling):
+            joint = self.embodiment.joints[index]
+            raise BadCommand(
+                f"{joint.name} moves at {pose[index]:.4g} {joint.unit}; an episode begins at rest",
+                cause="somebody drives the base, or it rolls by itself",
+                next="bring it to rest, then start again",
+            )
 
     def _begin(self, pose: Array, speed: Array) -> None:
         """Be at ``(D,)`` pose, at a speed that was steady."""
@@ -309,7 +349,8 @@ class CommandLimiter:
         gap = target - before - drift * dt
         wish = drift + np.sign(gap) * braking_speed(np.abs(gap), planned, dt)
         # A smaller share of the speed than before is reached by braking, not at once.
-        top = np.maximum(self.velocity * speed, np.abs(self._speed) - step)
+        share = np.where(self._by_speed, 1.0, speed)
+        top = np.maximum(self.velocity * share, np.abs(self._speed) - step)
         low = np.maximum(-top, self._speed - step)
         high = np.minimum(top, self._speed + step)
         floor = -braking_speed(before - self.lower, planned, dt)
@@ -336,7 +377,11 @@ class CommandLimiter:
         found = []
         for index in np.flatnonzero(np.abs(given - target) > SAME):
             pace = abs(reachable[index] - before[index]) / self.period
-            if target[index] != reachable[index]:
+            if self._by_speed[index]:
+                reason = "velocity" if target[index] != reachable[index] else "acceleration"
+                if target[index] == reachable[index] and abs(raw[index] - target[index]) <= SAME:
+                    reason = "jerk"
+            elif target[index] != reachable[index]:
                 reason = "position"
             elif abs(raw[index] - target[index]) <= SAME:
                 reason = "jerk"

@@ -338,6 +338,11 @@ def check_pose(pose: npt.ArrayLike, embodiment: EmbodimentSpec) -> Array:
             f"{', '.join(names)}"
         )
     for joint, value in zip(embodiment.joints, target, strict=True):
+        if joint.by_speed and value != 0.0:
+            raise ConfigError(
+                f"prepare_pose has {joint.name} move at {value:g} {joint.unit}; in a pose it rests",
+                next=f"0 for {joint.name}",
+            )
         if not joint.lower <= value <= joint.upper:
             raise ConfigError(
                 f"prepare_pose puts {joint.name} at {value:g}, outside its limits "

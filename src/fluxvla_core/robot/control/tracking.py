@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.robot.control.safety import BadFrame, NotFollowing, SafetySettings
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 # A prismatic joint's tracking error in m, as a share of a revolute one's in rad.
 PRISMATIC_SHARE = 0.1
 # A joint further than this from its last command (rad, or m) was blocked, or moved since: it is
 # held where it is, and continues from there.
-HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015, "gripper": np.inf}
+HOLD_REACH = {"revolute": 0.15, "prismatic": 0.015, "gripper": np.inf, VELOCITY: np.inf}
 # Commands that are kept to hold a state against; an older one is too old to say anything.
 _REMEMBERED = 256
 
@@ -35,6 +35,7 @@ class TrackingWatch:
             "revolute": settings.tracking_error,
             "prismatic": settings.tracking_error * PRISMATIC_SHARE,
             "gripper": np.inf,
+            VELOCITY: np.inf,  # the ground, and what is pushed, decide how it follows
         }
         self._allowed: Array = np.array([allowed[j.kind] for j in embodiment.joints])
         reach = np.array([HOLD_REACH[j.kind] for j in embodiment.joints])
@@ -63,7 +64,7 @@ class TrackingWatch:
 
     def positions(self, state: npt.ArrayLike) -> Array:
         """``(dim,)`` where the action's joints are, of a ``(state_dim,)`` state."""
-        return np.asarray(state, dtype=np.float64)[self._columns]
+        return action_values(self._columns, state)
 
     def check(self, state: npt.ArrayLike, measured: float) -> None:
         """Compare where the arm was with the command that it had then.
@@ -101,16 +102,25 @@ class TrackingWatch:
 
 
 def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
-    """Where in the state vector each action joint's position is; ``(dim,)`` indices.
+    """Where in the state vector each action joint is; ``(dim,)`` indices.
+
+    A joint that is commanded by its speed need not be in the state; its index is -1 then.
 
     Raises:
-        BadFrame: the state lacks a joint that is commanded.
+        BadFrame: the state lacks another joint that is commanded.
     """
     names = embodiment.state_names
-    missing = [name for name in embodiment.joint_names if name not in names]
+    missing = [j.name for j in embodiment.joints if j.name not in names and not j.by_speed]
     if missing:
         raise BadFrame(
             f"the state of {embodiment.name} does not tell where {', '.join(missing)} is; "
             "a joint that cannot be read back cannot be moved safely"
         )
-    return np.array([names.index(name) for name in embodiment.joint_names], dtype=np.intp)
+    places = [names.index(n) if n in names else -1 for n in embodiment.joint_names]
+    return np.array(places, dtype=np.intp)
+
+
+def action_values(columns: npt.NDArray[np.intp], state: npt.ArrayLike) -> Array:
+    """``(dim,)`` values of the action's joints in a ``(state_dim,)`` state; 0 of those without."""
+    values = np.asarray(state, dtype=np.float64)[columns]
+    return np.where(columns < 0, 0.0, values)

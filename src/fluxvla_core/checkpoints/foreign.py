@@ -1,0 +1,133 @@
+"""Files of other projects' checkpoints: where they are, and their tensors under other names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePath
+from typing import Any
+
+from torch import Tensor
+
+from fluxvla_core.checkpoints.parts import Stored, StoredTensors
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.untrusted import read_json
+
+HUB = "hf:"
+"""Before the id of a model on the Hugging Face hub."""
+_INDEX = ".safetensors.index.json"
+_SHOWN = 6
+
+
+def safetensors_in(folder: str | Path, stem: str = "model") -> Mapping[str, Stored]:
+    """The tensors of ``<stem>.safetensors``, or of the parts that its index lists.
+
+    Nothing but the headers is read until a tensor is indexed.
+
+    Raises:
+        CheckpointError: there is neither, or a file that is listed is missing or damaged.
+    """
+    folder = Path(folder)
+    single, index = folder / f"{stem}.safetensors", folder / f"{stem}{_INDEX}"
+    if not os.path.lexists(index):
+        return StoredTensors([single])
+    content = read_json(index, dict[str, Any], CheckpointError)
+    listed = content.get("weight_map")
+    if not isinstance(listed, dict) or not all(isinstance(n, str) for n in listed.values()):
+        raise CheckpointError("weight_map: no table of file names", where=str(index))
+    names = sorted(set(listed.values()))
+    outside = [name for name in names if PurePath(name).name != name]
+    if outside:
+        raise CheckpointError(f"{outside[0]!r} is not a file next to it", where=str(index))
+    tensors = StoredTensors([folder / name for name in names])
+    missing = sorted(set(listed) - set(tensors))
+    if missing:
+        raise CheckpointError(f"no file has {missing[0]!r}, which is listed", where=str(index))
+    return tensors
+
+
+class Renamed(Mapping[str, "Tensor | Stored"]):
+    """``tensors`` under the names of ``names``: this project's -> the other's.
+
+    Several names may be of one tensor (tied weights).
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor | Stored], names: Mapping[str, str]) -> None:
+        self._tensors = tensors
+        self._names = names
+
+    def __getitem__(self, name: str) -> Tensor | Stored:
+        return self._tensors[self._names[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def renamed(
+    tensors: Mapping[str, Tensor | Stored], names: Mapping[str, str], where: str
+) -> Mapping[str, Tensor | Stored]:
+    """``tensors`` under this project's names; every one must be named, and every name be there.
+
+    Args:
+        tensors: by the names of the checkpoint.
+        names: the name here -> the name there.
+        where: the checkpoint, for messages.
+
+    Raises:
+        CheckpointError: lists what is missing in the checkpoint, and what it has besides.
+    """
+    missing = sorted(set(names.values()) - set(tensors))
+    extra = sorted(set(tensors) - set(names.values()))
+    lines = [
+        f"    {len(items)} {kind}: {', '.join(items[:_SHOWN])}{' …' if len(items) > _SHOWN else ''}"
+        for kind, items in (("missing", missing), ("unexpected", extra))
+        if items
+    ]
+    if lines:
+        raise CheckpointError(
+            "the tensors of the checkpoint are not those of its model:\n" + "\n".join(lines),
+            where=where,
+            cause="it was saved by another version of that project, or is of another model",
+        )
+    return Renamed(tensors, names)
+
+
+def foreign_folder(place: str | Path) -> Path:
+    """The folder of another project's checkpoint; ``hf:<id>[@<revision>]`` is one on the hub.
+
+    What the hub has is fetched through ``huggingface_hub`` into its cache, or found there.
+
+    Raises:
+        CheckpointError: it is not there, cannot be fetched, or ``huggingface_hub`` is missing.
+    """
+    text = str(place)
+    if not text.startswith(HUB):
+        folder = Path(text).expanduser()
+        if not folder.is_dir():
+            kind = "is a file, not a folder" if folder.exists() else "does not exist"
+            raise CheckpointError(
+                f"{text} {kind}",
+                next=f"name the checkpoint's folder, or {HUB}OWNER/NAME for one on the "
+                "Hugging Face hub",
+            )
+        return folder
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise CheckpointError(
+            f"{text} is on the Hugging Face hub, and huggingface_hub is not installed",
+            next="pip install 'fluxvla-core[hub]', or name a folder",
+        ) from error
+    name, _, revision = text[len(HUB) :].partition("@")
+    try:
+        return Path(snapshot_download(name, revision=revision or None))
+    except (OSError, ValueError) as error:  # the hub's errors are OSErrors, its checks ValueErrors
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise CheckpointError(
+            f"{text} cannot be fetched: {lines[0]}",
+            cause="there is no such model, it is not public, or the hub cannot be reached",
+            next="download it elsewhere, and name its folder",
+        ) from error

@@ -1,0 +1,240 @@
+"""How long a policy takes to answer: ``fluxvla bench-policy``.
+
+One observation after another is asked for a chunk, as a robot does. What is measured follows from
+the command line alone (pictures, states and weights are drawn from ``seed``), so that anybody can
+repeat a published figure.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from fluxvla_core.build import build_operator_from_cfg, build_vla_from_cfg
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.training import Transform
+from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
+from fluxvla_core.data.lerobot import camera_name
+from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.errors import ConfigError, UsageError
+from fluxvla_core.plugins._metadata import version
+from fluxvla_core.policies.local import LocalPolicy
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.training import flops
+
+STAGES = ("preprocess", "inference", "postprocess")
+_PACKAGES = ("fluxvla-core", "torch", "transformers", "numpy")
+_MATRIX = 1024
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """Seconds of each call, by stage.
+
+    Args:
+        stages: stage -> ``(calls,)`` seconds; ``total`` is from observation to chunk.
+        first_s: seconds of the first call, which loads, compiles and allocates.
+        memory_mb: most memory of the GPU, or of the process on a CPU, since it began.
+    """
+
+    stages: Mapping[str, npt.NDArray[np.float64]]
+    first_s: float
+    memory_mb: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values: percentiles in ms."""
+        found: dict[str, Any] = {
+            stage: {
+                f"p{percent}_ms": round(float(np.percentile(seconds, percent)) * 1e3, 3)
+                for percent in (50, 95, 99)
+            }
+            for stage, seconds in self.stages.items()
+        }
+        hz = round(1.0 / float(np.median(self.stages["total"])), 2)
+        first, memory = round(self.first_s, 3), round(self.memory_mb, 1)
+        return {**found, "hz": hz, "first_call_s": first, "memory_mb": memory}
+
+
+def measure(
+    policy: LocalPolicy, observations: Sequence[Observation], calls: int, warmup: int
+) -> Latencies:
+    """Ask ``policy`` ``warmup + calls`` times, going through ``observations`` again and again."""
+    policy.reset(0)
+    begun = time.perf_counter()
+    policy.predict_action(observations[0])
+    first = time.perf_counter() - begun
+    rows: list[list[float]] = []
+    for call in range(warmup + calls):
+        begun = time.perf_counter()
+        policy.predict_action(observations[call % len(observations)])
+        total = time.perf_counter() - begun
+        if call >= warmup:
+            rows.append([*(policy.stages[stage] for stage in STAGES), total])
+    columns = np.asarray(rows).T
+    return Latencies(
+        dict(zip((*STAGES, "total"), columns, strict=True)), first, _memory_mb(policy.device)
+    )
+
+
+def random_observations(
+    policy: LocalPolicy, task: str, seed: int, count: int = 4
+) -> list[Observation]:
+    """Pictures of noise of the robot's sizes, and states within its limits."""
+    rng = np.random.default_rng(seed)
+    robot = policy.embodiment
+    joints = robot.state_joints or robot.joints
+    lower, upper = (np.array([getattr(j, end) for j in joints]) for end in ("lower", "upper"))
+    return [
+        {
+            "images": {
+                camera.name: rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
+                for camera in robot.cameras
+                if camera.name in policy.cameras
+            },
+            "qpos": rng.uniform(lower, upper).astype(np.float32),
+            "task_description": task,
+        }
+        for _ in range(count)
+    ]
+
+
+def untrained_policy(
+    config: Mapping[str, Any],
+    embodiment: EmbodimentSpec | None,
+    device: str,
+    precision: str,
+    seed: int,
+) -> LocalPolicy:
+    """The policy that a config trains, with random weights and statistics of 0 and 1.
+
+    Args:
+        embodiment: the robot; by default that of ``inference.operator``.
+
+    Raises:
+        ConfigError: the config lacks the model, its dataset's transforms, or the robot.
+    """
+    if "model" not in config:
+        raise ConfigError("the config has no section 'model'")
+    robot = embodiment or _robot_of(config)
+    dataset = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
+    missing = [key for key in ("img_keys", "transforms") if key not in dataset]
+    if missing:
+        raise ConfigError(
+            f"train_dataloader.dataset has no {', '.join(missing)}: how observations are prepared "
+            "is unknown"
+        )
+    name = dataset.get("statistic_name", "private")
+    statistics = {name: {"proprio": _unit(robot.state_dim), "action": _unit(robot.dim)}}
+    prepare = PrivateInferenceDataset(
+        dataset["img_keys"],
+        dataset["transforms"],
+        norm_stats=statistics,
+        embodiment_id=dataset.get("embodiment_id"),
+        statistic_name=name,
+    )
+    normalizers = [
+        t for t in prepare.pipeline.transforms if implements(t, Transform, "denormalizer")
+    ]
+    if not normalizers:
+        raise ConfigError("no transform of train_dataloader.dataset normalises actions")
+    torch.manual_seed(seed)
+    model = build_vla_from_cfg(config["model"])
+    horizon, _ = model.action_shape
+    return LocalPolicy(
+        model=model.to(device).eval(),
+        prepare=prepare,
+        denormalize=normalizers[0].denormalizer(statistics, name),
+        embodiment=robot,
+        cameras=tuple(camera_name(key) for key in dataset["img_keys"]),
+        action_rate_hz=robot.rate_hz,
+        horizon=horizon,
+        device=device,
+        precision=precision,
+        source="random weights",
+    )
+
+
+def inference_flops(policy: LocalPolicy, observation: Observation) -> int:
+    """Operations of matrix products, convolutions and attention in one answer, counted in it."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    policy.reset(0)
+    with FlopCounterMode(display=False) as counter:
+        policy.predict_action(observation)
+    return int(counter.get_total_flops())
+
+
+def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float, str]:
+    """The device's peak and where the figure is from: given, its maker's, or measured."""
+    if given is not None:
+        return given, "given"
+    dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+    if torch.device(device).type == "cuda":
+        known = flops.known_peak(torch.cuda.get_device_name(device), dtype)
+        if known is not None:
+            return known, "its maker's"
+    return _measured_tflops(device, dtype), f"a product of two {_MATRIX} x {_MATRIX} matrices"
+
+
+def machine(device: str) -> dict[str, Any]:
+    """What a figure belongs to: device, threads and versions."""
+    gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None
+    return {
+        "device": gpu or f"{platform.machine()}, {os.cpu_count()} CPUs",
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in _PACKAGES},
+    }
+
+
+def _measured_tflops(device: str, dtype: torch.dtype) -> float:
+    left, right = (torch.randn(_MATRIX, _MATRIX, device=device, dtype=dtype) for _ in range(2))
+    wait: Callable[[], Any] = (
+        torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
+    )
+    best = float("inf")
+    for _ in range(10):
+        begun = time.perf_counter()
+        torch.mm(left, right)
+        wait()
+        best = min(best, time.perf_counter() - begun)
+    return float(2 * _MATRIX**3 / best / 1e12)
+
+
+def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
+    section = config.get("inference", {})
+    table = section.get("operator") if isinstance(section, Mapping) else None
+    if table is None:
+        raise UsageError(
+            "the config has no inference.operator: for which robot its actions are is unknown",
+            next="--embodiment FILE",
+        )
+    operator = Operator.adapt(build_operator_from_cfg(table))
+    try:
+        return operator.embodiment
+    finally:
+        operator.close()
+
+
+def _unit(width: int) -> dict[str, list[float]]:
+    zeros, ones, below = [0.0] * width, [1.0] * width, [-1.0] * width
+    return {"mean": zeros, "std": ones, "min": below, "max": ones, "q01": below, "q99": ones}
+
+
+def _memory_mb(device: str) -> float:
+    if torch.device(device).type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / 1e6 if sys.platform == "darwin" else most / 1e3

@@ -1,0 +1,77 @@
+"""Formats of other projects' checkpoints that are installed, and reading by the one that fits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fluxvla_core.checkpoints.checkpoint import folders
+from fluxvla_core.checkpoints.foreign import HUB, foreign_folder
+from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
+from fluxvla_core.errors import CheckpointError, PluginError, UsageError, nearest
+from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS
+
+
+def read_foreign(
+    source: str | Path, format: str | None = None, tokenizer: str | None = None
+) -> ForeignCheckpoint:
+    """Another project's checkpoint, by the format that recognises it.
+
+    Raises:
+        CheckpointError: none does, or it is damaged.
+        UsageError: there is no format of that name.
+    """
+    folder = foreign_folder(source)
+    known, failed = formats()
+    if format is not None and format not in {f.name for f in known}:
+        raise UsageError(unknown_format(format, known))
+    asked = [f for f in known if format in (None, f.name)]
+    able = [f for f in asked if f.recognizes(folder)]
+    if len(able) == 1:
+        return able[0].read(folder, tokenizer)
+    if able:
+        listed = ", ".join(sorted(f"{f.name} ({type(f).__name__})" for f in able))
+        raise CheckpointError(
+            f"several formats recognise the checkpoint: {listed}",
+            where=str(folder),
+            next="choose one: --format NAME",
+        )
+    listed = ", ".join(sorted(f"{f.name} ({', '.join(f.model_types)})" for f in asked))
+    broken = "".join(f"; cannot be loaded: {error.what}" for error in failed)
+    raise CheckpointError(
+        "no installed format recognises the checkpoint",
+        where=str(folder),
+        cause=f"formats that were tried: {listed or 'none'}{broken}",
+        next="install the plugin of its model family; fluxvla plugins list has what is installed",
+    )
+
+
+def is_foreign(place: str | Path) -> bool:
+    """Whether ``place`` is another project's checkpoint rather than one of this project's."""
+    text = str(place)
+    if text.startswith(HUB):
+        return True
+    folder = Path(text)
+    if not folder.is_dir() or (folder / MANIFEST).is_file() or folders(folder):
+        return False
+    return any(f.recognizes(folder) for f in formats()[0])
+
+
+def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
+    """The installed formats, and why others cannot be loaded."""
+    found: list[CheckpointFormat] = []
+    failed: list[PluginError] = []
+    for name in CHECKPOINT_FORMATS:
+        try:
+            found.append(CheckpointFormat.adapt(CHECKPOINT_FORMATS.get(name)()))
+        except PluginError as error:
+            failed.append(error)
+    return found, failed
+
+
+def unknown_format(name: str, known: list[CheckpointFormat]) -> str:
+    """Says that no format is called ``name``, and what there is."""
+    names = sorted({f.name for f in known})
+    close = nearest(name, names)
+    meant = f"; did you mean {close!r}?" if close else ""
+    return f"there is no checkpoint format {name!r}{meant} Installed: {', '.join(names) or 'none'}"

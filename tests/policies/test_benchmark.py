@@ -1,0 +1,146 @@
+"""``fluxvla bench-policy``: what it measures, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fluxvla_core.cli.main import main
+from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+
+torch = pytest.importorskip("torch")
+
+ARM = EmbodimentSpec(
+    "arm",
+    tuple(Joint(n, "rad", -1.0, 1.0, 1.0, 1.0) for n in "ab"),
+    (Camera("front", 8, 8), Camera("wrist", 6, 8)),
+    50.0,
+)
+
+
+class StepVLA(torch.nn.Module):
+    """Noise through one matrix, as one block."""
+
+    action_shape = (4, 2)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = torch.nn.Linear(2, 2, bias=False)
+        self.states: list[Any] = []
+
+    def forward(self, actions: Any) -> dict[str, Any]:
+        return {"loss": self.gain(actions).mean()}
+
+    def predict_action(self, images: Any, states: Any, noise: Any) -> Any:
+        assert images.shape == (1, 3, 8, 8)
+        return self.gain(noise) + states[:, None]
+
+    def fsdp_units(self) -> list[Any]:
+        return [self.gain]
+
+
+@pytest.fixture(autouse=True)
+def model() -> Any:
+    VLAS.register_module()(StepVLA)
+    yield
+    VLAS.unregister("StepVLA")
+
+
+def written(folder: Path, **dataset: Any) -> list[str]:
+    """A config of the arm's front camera, and the arguments that name it."""
+    table = {
+        "type": "ParquetDataset",
+        "img_keys": ["observation.images.front"],
+        "transforms": [{"type": "NormalizeStatesAndActions", "norm_type": "mean_std"}],
+        **dataset,
+    }
+    text = f"model = dict(type='StepVLA')\ntrain_dataloader = dict(dataset={table!r})\n"
+    (folder / "c.py").write_text(text)
+    (folder / "embodiment.json").write_text(json.dumps(ARM.to_dict()))
+    return ["bench-policy", "--config", str(folder / "c.py"), "--embodiment", str(folder)]
+
+
+def test_each_stage_of_each_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [*written(tmp_path), "--calls", "3", "--warmup", "1", "--modes", "compiled,eager"]
+    out = tmp_path / "results" / "bench.json"
+
+    assert main([*words, "--json", str(out), "--peak-tflops", "0.5"]) == 0
+
+    figures = json.loads(out.read_text())
+    assert figures["model"] == "StepVLA"
+    assert figures["parameters"] == 4
+    assert figures["weights"] == "random weights"
+    assert figures["gflops"] == round(2 * 4 * 2 * 2 / 1e9, 3)  # (4, 2) times (2, 2)
+    assert figures["cameras"] == {"front": [8, 8], "wrist": [6, 8]}
+    assert (figures["peak_tflops"], figures["peak_is"]) == (0.5, "given")
+    assert list(figures["modes"]) == ["eager", "compiled"]
+    for found in figures["modes"].values():
+        for stage in ("preprocess", "inference", "postprocess", "total"):
+            assert 0 < found[stage]["p50_ms"] <= found[stage]["p95_ms"] <= found[stage]["p99_ms"]
+        assert found["total"]["p50_ms"] >= found["inference"]["p50_ms"]
+        assert found["hz"] == pytest.approx(1e3 / found["total"]["p50_ms"], rel=0.05)
+        assert found["memory_mb"] > 0
+    shown = capsys.readouterr().out
+    assert "StepVLA: 0.0 M parameters, float32" in shown
+    assert "inference" in shown
+    assert "of the peak of 0.5 TFLOP/s (given)" in shown
+
+
+def test_a_peak_that_nobody_gives_is_measured(tmp_path: Path) -> None:
+    out = tmp_path / "bench.json"
+    assert main([*written(tmp_path), "--calls", "1", "--warmup", "0", "--json", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert figures["peak_tflops"] > 0
+    assert "1024 x 1024" in figures["peak_is"]
+
+
+def test_the_same_seed_asks_the_same(tmp_path: Path) -> None:
+    from fluxvla_core.policies.benchmark import random_observations, untrained_policy
+
+    config = {
+        "model": {"type": "StepVLA"},
+        "train_dataloader": {
+            "dataset": {
+                "img_keys": ["front"],
+                "transforms": [{"type": "NormalizeStatesAndActions", "norm_type": "mean_std"}],
+            }
+        },
+    }
+    chunks = []
+    for _ in range(2):
+        policy = untrained_policy(config, ARM, "cpu", "float32", 3)
+        observations = random_observations(policy, "wave", 3)
+        policy.reset(0)
+        chunks.append(policy.predict_action(observations[1]))
+        assert set(observations[0]["images"]) == {"front"}
+        assert all((np.abs(o["qpos"]) <= 1).all() for o in observations)
+    np.testing.assert_array_equal(chunks[0], chunks[1])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--checkpoint", "x"], "give either --config FILE or --checkpoint DIR"),
+        (["--modes", "eager,graph"], "'graph' is none of eager, compiled"),
+        (["--peak-tflops", "-1"], "--peak-tflops -1 is no number of operations"),
+        (["--calls", "0"], "0 is less than 1"),
+        (["--set", "train_dataloader.dataset.transforms=[]"], "no transform of train_dataloader"),
+    ],
+)
+def test_what_does_not_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    assert main([*written(tmp_path), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_config_that_names_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(written(tmp_path)[:3]) == 2
+    ended = capsys.readouterr().err
+    assert "no inference.operator" in ended
+    assert "--embodiment FILE" in ended

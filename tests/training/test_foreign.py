@@ -1,0 +1,329 @@
+"""Checkpoints of other projects: imported, trained from, and written back."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from fluxvla_core.build import RunContext, build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.cli.main import main
+from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
+from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS, VLAS
+from fluxvla_core.policies.loading import load_policy
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.testing.training import TinyDataset, tiny_config
+from fluxvla_core.training.foreign import export_foreign, import_checkpoint
+
+ARM = EmbodimentSpec(
+    "arm",
+    tuple(Joint(n, "rad", -1.0, 1.0, 1.0, 1.0) for n in "ab"),
+    (Camera("front", 8, 8),),
+    50.0,
+)
+ROW = {"mean": [0.1, 0.2], "std": [0.5, 2.0]}
+NAMES = {"gain.weight": "net.w", "gain.bias": "net.b", "head.weight": "net.w", "scale": "s"}
+
+
+class ReachVLA(torch.nn.Module):
+    """A weight under two names, and one number."""
+
+    action_shape = (4, 2)
+
+    def __init__(self, pretrained_name_or_path: str | None = None):
+        super().__init__()
+        self.gain = torch.nn.Linear(2, 2)
+        self.head = torch.nn.Linear(2, 2, bias=False)
+        self.head.weight = self.gain.weight
+        self.scale = torch.nn.Parameter(torch.ones(()))
+        self.pretrained_name_or_path = pretrained_name_or_path
+
+    def forward(self, x, y):
+        return {"loss": (self.scale * self.head(self.gain(x)) - y).square().mean()}
+
+    def predict_action(self, states, noise):
+        return self.scale * self.head(self.gain(noise)) + states[:, None]
+
+
+class ReachFormat(CheckpointFormat):
+    name = "reach"
+    model_types = ("ReachVLA",)
+
+    def recognizes(self, folder):
+        return (folder / "reach.json").is_file()
+
+    def read(self, folder, tokenizer=None):
+        facts = json.loads((folder / "reach.json").read_text())
+        return ForeignCheckpoint(
+            model={"type": "ReachVLA"},
+            tensors=renamed(safetensors_in(folder), NAMES, str(folder)),
+            img_keys=("base",),
+            transforms=({"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},),
+            statistics={"private": {"proprio": ROW, "action": ROW}},
+            horizon=4,
+            action_rate_hz=facts.get("hz"),
+            notes=("the wrist camera is not used",),
+        )
+
+    def write(self, checkpoint, folder):
+        tensors = {theirs: checkpoint.tensors[ours] for ours, theirs in NAMES.items()}
+        save_file(tensors, folder / "model.safetensors")
+        (folder / "reach.json").write_text(json.dumps({"hz": checkpoint.action_rate_hz}))
+
+
+@pytest.fixture(autouse=True)
+def plugin():
+    VLAS.register_module()(ReachVLA)
+    CHECKPOINT_FORMATS.register_module()(ReachFormat)
+    yield
+    VLAS.unregister("ReachVLA")
+    CHECKPOINT_FORMATS.unregister("ReachFormat")
+
+
+def weights():
+    torch.manual_seed(0)
+    made = {"net.w": torch.randn(2, 2), "net.b": torch.randn(2), "s": torch.tensor(1.5)}
+    return {name: tensor.bfloat16() for name, tensor in made.items()}
+
+
+def published(folder, tensors=None, hz=10.0):
+    folder.mkdir()
+    save_file(weights() if tensors is None else tensors, folder / "model.safetensors")
+    (folder / "reach.json").write_text(json.dumps({"hz": hz}))
+    return folder
+
+
+def test_an_imported_checkpoint_acts(tmp_path, capsys):
+    source = published(tmp_path / "theirs")
+    (tmp_path / "arm.json").write_text(json.dumps(ARM.to_dict()))
+    out = tmp_path / "ours"
+    words = ["--embodiment", str(tmp_path / "arm.json"), "--camera", "base=front"]
+
+    assert main(["import-checkpoint", str(source), str(out), *words]) == 0
+
+    assert capsys.readouterr().out == (
+        f"{out}: ReachVLA, 4 tensors; cameras front; chunks of 4 actions at 10 Hz; arm\n"
+        "note: the wrist camera is not used\n"
+    )
+    Checkpoint.open(out).verify()
+    policy = load_policy(out)
+    policy.reset(3)
+    chunk = policy.predict_action(
+        {
+            "qpos": np.array([0.3, -0.4], np.float32),
+            "images": {"front": np.zeros((8, 8, 3), np.uint8)},
+            "task_description": "wave",
+        }
+    )
+    noise = np.random.Generator(np.random.Philox(key=np.array([3, 0], np.uint64)))
+    drawn = torch.from_numpy(noise.standard_normal((4, 2), dtype=np.float32)).double()
+    w, b, s = (tensor.double() for tensor in weights().values())
+    mean, std = torch.tensor(ROW["mean"]).double(), torch.tensor(ROW["std"]).double()
+    state = (torch.tensor([0.3, -0.4]).double() - mean) / std
+    expected = (s * (drawn @ w.T + b) @ w.T + state) * std + mean
+    np.testing.assert_allclose(chunk, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_weights_keep_their_dtype_and_go_back_bit_for_bit(tmp_path, capsys):
+    source = published(tmp_path / "theirs")
+    out, _ = import_checkpoint(source, tmp_path / "ours")
+    assert load_file(out / "model.safetensors")["gain.weight"].dtype == torch.bfloat16
+
+    assert main(["export", str(out), str(tmp_path / "back"), "--format", "reach"]) == 0
+
+    ours, theirs = load_file(tmp_path / "back" / "model.safetensors"), weights()
+    assert set(ours) == set(theirs)
+    assert all(torch.equal(ours[n], theirs[n]) and ours[n].dtype == theirs[n].dtype for n in ours)
+    assert json.loads((tmp_path / "back" / "reach.json").read_text()) == {"hz": 10.0}
+
+
+@pytest.mark.parametrize("named_by", ["pretrained_name_or_path", "init_from"])
+def test_a_training_starts_from_it(tmp_path, named_by):
+    source = published(tmp_path / "theirs")
+    settings = {"init_from": str(source)} if named_by == "init_from" else {}
+    config = tiny_config({"type": "OneProcessRunner", "max_steps": 1, **settings})
+    config["model"] = {"type": "ReachVLA"}
+    if not settings:
+        config["model"]["pretrained_name_or_path"] = str(source)
+    context = RunContext(config=config, section="runner", work_dir=tmp_path / "run")
+    runner = build_runner_from_cfg(config["runner"], context)
+
+    runner.run_setup(len(TinyDataset(37)))
+
+    model = runner.vla
+    assert torch.equal(model.gain.weight.detach(), weights()["net.w"].float())
+    assert model.scale.item() == 1.5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"net.b": None}, "1 missing: net.b"),
+        ({"extra": torch.zeros(1)}, "1 unexpected: extra"),
+        ({"net.w": torch.zeros(3, 2)}, r"2 of another size: gain.weight: \(3, 2\) in the"),
+    ],
+)
+def test_other_tensors_are_refused_by_name(tmp_path, change, words):
+    tensors = {n: t for n, t in {**weights(), **change}.items() if t is not None}
+    source = published(tmp_path / "theirs", tensors)
+    with pytest.raises(CheckpointError, match=words):
+        import_checkpoint(source, tmp_path / "ours")
+    assert not (tmp_path / "ours").exists()
+
+
+def test_what_no_format_recognises(tmp_path, capsys):
+    (tmp_path / "theirs").mkdir()
+    assert main(["import-checkpoint", str(tmp_path / "theirs"), str(tmp_path / "ours")]) == 2
+    text = capsys.readouterr().err
+    assert "no installed format recognises the checkpoint" in text
+    assert "reach (ReachVLA)" in text
+
+
+def test_two_formats_that_recognise_it_are_told_apart_by_name(tmp_path):
+    class AlsoFormat(ReachFormat):
+        name = "also"
+
+    CHECKPOINT_FORMATS.register_module()(AlsoFormat)
+    try:
+        source = published(tmp_path / "theirs")
+        with pytest.raises(CheckpointError, match=r"also .*, reach .*") as caught:
+            import_checkpoint(source, tmp_path / "ours")
+        assert "--format NAME" in str(caught.value)
+        import_checkpoint(source, tmp_path / "ours", format="also")
+    finally:
+        CHECKPOINT_FORMATS.unregister("AlsoFormat")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--format", "raech"], "there is no checkpoint format 'raech'; did you mean 'reach'?"),
+        (["--camera", "wrist=front"], "the checkpoint has no such camera; it has base"),
+        (["--camera", "front"], "'front' is not THEIRS=OURS"),
+        (["--rate", "0"], "--rate 0 is not a rate"),
+        (["--rate", "nan"], "--rate nan is not a rate"),
+        (["--embodiment", "nowhere"], "there is no embodiment.json at nowhere"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path, capsys, words, said):
+    source = published(tmp_path / "theirs")
+    assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *words]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "ours").exists()
+
+
+def test_another_robot_is_refused(tmp_path):
+    source = published(tmp_path / "theirs")
+    with pytest.raises(SpecMismatch, match="looks at base; arm has front") as caught:
+        import_checkpoint(source, tmp_path / "ours", embodiment=ARM)
+    assert "--camera base=NAME" in str(caught.value)
+    joints = (*ARM.joints, Joint("c", "rad", -1.0, 1.0, 1.0, 1.0))
+    longer = EmbodimentSpec("longer", joints, ARM.cameras, 50.0)
+    with pytest.raises(SpecMismatch, match="'action' have 2 dimensions, longer has 3"):
+        import_checkpoint(source, tmp_path / "ours", embodiment=longer, cameras={"base": "front"})
+
+
+def test_without_a_robot_it_drives_nothing(tmp_path):
+    out, _ = import_checkpoint(published(tmp_path / "theirs"), tmp_path / "ours")
+    with pytest.raises(SpecMismatch, match="does not say the embodiment"):
+        load_policy(out)
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
+    source = published(tmp_path / "theirs")
+    with pytest.raises(UsageError, match="there is something at"):
+        import_checkpoint(source, source)
+    out, _ = import_checkpoint(source, tmp_path / "ours")
+    with pytest.raises(UsageError, match="there is something at"):
+        export_foreign(out, source, "reach")
+
+
+def test_a_model_that_a_format_does_not_hold(tmp_path, monkeypatch):
+    out, _ = import_checkpoint(published(tmp_path / "theirs"), tmp_path / "ours")
+    monkeypatch.setattr(ReachFormat, "model_types", ("OtherVLA",))
+    with pytest.raises(UsageError, match="format 'reach' holds no ReachVLA; it holds OtherVLA"):
+        export_foreign(out, tmp_path / "back", "reach")
+    assert not (tmp_path / "back").exists()
+
+
+def test_a_write_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
+    def write(self, checkpoint, folder):
+        (folder / "half").touch()
+        raise CheckpointError("it does not fit")
+
+    out, _ = import_checkpoint(published(tmp_path / "theirs"), tmp_path / "ours")
+    monkeypatch.setattr(ReachFormat, "write", write)
+    with pytest.raises(CheckpointError, match="it does not fit"):
+        export_foreign(out, tmp_path / "out" / "back", "reach")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def in_parts(folder, weight_map=None):
+    folder.mkdir()
+    (folder / "reach.json").write_text("{}")
+    named = {}
+    for place, (name, tensor) in enumerate(weights().items(), 1):
+        file = f"model-{place:05d}-of-00003.safetensors"
+        save_file({name: tensor}, folder / file)
+        named[name] = file
+    index = {"metadata": {}, "weight_map": {**named, **(weight_map or {})}}
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
+    return folder
+
+
+def test_weights_in_several_files(tmp_path):
+    out, found = import_checkpoint(in_parts(tmp_path / "theirs"), tmp_path / "ours")
+    whole, _ = import_checkpoint(published(tmp_path / "one", hz=None), tmp_path / "other")
+    assert found.action_rate_hz is None
+    first, second = (load_file(p / "model.safetensors") for p in (out, whole))
+    assert all(torch.equal(first[name], second[name]) for name in first.keys() | second.keys())
+
+
+@pytest.mark.parametrize(
+    ("weight_map", "words"),
+    [
+        ({"net.x": "model-00001-of-00003.safetensors"}, "no file has 'net.x', which is listed"),
+        ({"net.x": "../secret.safetensors"}, "'../secret.safetensors' is not a file next to it"),
+        ({"net.x": 3}, "weight_map: no table of file names"),
+        ({"net.x": "gone.safetensors"}, "gone.safetensors cannot be read"),
+    ],
+)
+def test_an_index_that_lies(tmp_path, weight_map, words):
+    with pytest.raises(CheckpointError, match=words):
+        safetensors_in(in_parts(tmp_path / "theirs", weight_map))
+
+
+def hub_cache(folder, monkeypatch):
+    """The hub's cache with one model in it, and no way to the hub."""
+    pytest.importorskip("huggingface_hub")
+    from huggingface_hub import constants
+
+    revision = "0123456789abcdef0123456789abcdef01234567"
+    repository = folder / "models--acme--reach"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text(revision)
+    (repository / "snapshots").mkdir()
+    published(repository / "snapshots" / revision)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(folder))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+
+
+def test_one_on_the_hub(tmp_path, monkeypatch):
+    hub_cache(tmp_path / "cache", monkeypatch)
+    out, _ = import_checkpoint("hf:acme/reach", tmp_path / "ours")
+    assert torch.equal(load_file(out / "model.safetensors")["scale"], weights()["s"])
+    with pytest.raises(CheckpointError, match="hf:acme/other cannot be fetched"):
+        import_checkpoint("hf:acme/other", tmp_path / "more")
+    with pytest.raises(CheckpointError, match="hf:a/b/c cannot be fetched"):
+        import_checkpoint("hf:a/b/c", tmp_path / "more")
+
+
+def test_a_typo_never_asks_the_hub(tmp_path):
+    with pytest.raises(CheckpointError, match="acme/reach does not exist") as caught:
+        import_checkpoint("acme/reach", tmp_path / "ours")
+    assert "hf:OWNER/NAME" in str(caught.value)

@@ -154,6 +154,27 @@ def test_it_says_what_to_do_next_with_real_paths(fluxvla: Fluxvla, tmp_path: Pat
     assert all("TODO" in (folder / name).read_text() for name in todo)
 
 
+def test_a_mobile_robot_passes_its_kit_and_stops_its_base(rendered: Rendered) -> None:
+    place = rendered.folder / "mobile"
+    words = ["new-plugin", "rover", "--kind", "operator", "--mobile-base", "--cameras", "0"]
+    assert rendered.python("-m", "fluxvla_core", *words, "--dir", place).returncode == 0
+    folder, site = place / "fluxvla-rover", rendered.site
+    install = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    assert rendered.python(*install, "--target", site, folder).returncode == 0
+    done = rendered.python("-m", "pytest", "-q", "-p", "no:cacheprovider", folder / "tests")
+    assert done.returncode == 0, done.stdout
+    for tool in (["check"], ["format", "--check"]):
+        assert rendered.python("-m", "ruff", *tool, "--no-cache", folder).returncode == 0
+    code = (
+        "import numpy as np; from fluxvla_rover.operator import RoverOperator\n"
+        "robot = RoverOperator(); robot.connect(); robot.send_action(np.r_[np.zeros(7), 0.4, "
+        "0.2])\n"
+        "robot.stop(); print(robot.last_action[-2:].tolist(), robot.embodiment.joint_names[-2:])"
+    )
+    said = rendered.python("-c", code).stdout
+    assert said == "[0.0, 0.0] ('base_forward', 'base_turn')\n"
+
+
 def test_a_robot_has_as_many_joints_and_cameras_as_asked(
     fluxvla: Fluxvla, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,15 +218,15 @@ def test_bad_input_is_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("option", ["--joints", "--cameras"])
+@pytest.mark.parametrize("option", [["--joints", "2"], ["--cameras", "2"], ["--mobile-base"]])
 def test_what_is_said_of_a_robot_is_refused_of_others(
-    fluxvla: Fluxvla, tmp_path: Path, option: str
+    fluxvla: Fluxvla, tmp_path: Path, option: list[str]
 ) -> None:
     others = [kind for kind in KINDS if kind != "operator"]
     for kind in others:
-        ended = fluxvla("new-plugin", "x", "--kind", kind, option, "2", "--dir", str(tmp_path))
+        ended = fluxvla("new-plugin", "x", "--kind", kind, *option, "--dir", str(tmp_path))
         assert (ended.code, ended.err.count("\n")) == (2, 1)
-        assert f"{option} is for --kind operator" in ended.err
+        assert f"{option[0]} is for --kind operator" in ended.err
 
 
 def test_a_folder_that_exists_is_left_as_it_is(fluxvla: Fluxvla, tmp_path: Path) -> None:

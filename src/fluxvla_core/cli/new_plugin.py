@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 ROBOT = "operator"
 JOINTS, CAMERAS = 7, 2
 """Of a robot of which nothing else is said."""
+BASE = """(
+    Joint.base("base_forward", "m/s", speed=0.5, acceleration=1.0),
+    Joint.base("base_turn", "rad/s", speed=1.0, acceleration=2.0),
+)"""
+"""The joints of a mobile base, in the words of an embodiment."""
 
 
 class NewPlugin:
@@ -35,6 +40,9 @@ class NewPlugin:
         parser.once("--dir", default=".", metavar="DIR", help="where the new folder is made")
         parser.once("--joints", type=positive, metavar="N", help=f"of a robot (default {JOINTS})")
         parser.once("--cameras", type=natural, metavar="N", help=f"of a robot (default {CAMERAS})")
+        parser.add_argument(
+            "--mobile-base", action="store_true", help="a robot that drives: two speeds more"
+        )
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.cli import scaffold
@@ -56,12 +64,18 @@ def _options(args: argparse.Namespace) -> dict[str, str]:
     Raises:
         UsageError: it says that of something else.
     """
-    for name in ("joints", "cameras"):
-        if getattr(args, name) is not None and args.kind != ROBOT:
+    given = {
+        "joints": args.joints is not None,
+        "cameras": args.cameras is not None,
+        "mobile-base": args.mobile_base,
+    }
+    for name, there in given.items():
+        if there and args.kind != ROBOT:
             raise UsageError(f"--{name} is for --kind {ROBOT}, and this is a {args.kind}")
     joints = JOINTS if args.joints is None else args.joints
     cameras = CAMERAS if args.cameras is None else args.cameras
-    return {"joints": str(joints), "cameras": str(cameras)}
+    base = BASE if args.mobile_base else "()"
+    return {"joints": str(joints), "cameras": str(cameras), "base": base}
 
 
 def _refuse_taken(plugin: Plugin, kind: Kind) -> None:

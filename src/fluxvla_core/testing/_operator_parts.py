@@ -76,14 +76,15 @@ class DividedOperatorChecks:
                 time.sleep(0.02)
 
     def hold(self, operator: Any) -> Array:
-        """The command that keeps the arm where it is, inside the limits."""
+        """The command that keeps the arm where it is, inside the limits, and a base still."""
         return self._held(operator.embodiment, self.frame(operator).state)
 
     def _held(self, embodiment: EmbodimentSpec, state: Array) -> Array:
         joints = embodiment.joints
         where = dict(zip(embodiment.state_names, state, strict=True))
-        target = [np.clip(where.get(j.name, j.lower), j.lower, j.upper) for j in joints]
-        return np.array(target, dtype=np.float64)
+        there = [0.0 if joint.by_speed else where.get(joint.name, joint.lower) for joint in joints]
+        limits = [joint.lower for joint in joints], [joint.upper for joint in joints]
+        return np.clip(np.array(there, dtype=np.float64), *limits)
 
     def commands_heard(self, operator: Any) -> int | None:
         """The number of commands the arm, or its stand-in, has received; override to count them.
@@ -140,7 +141,7 @@ class DividedOperatorChecks:
         before = self._state(cameras)
         target = self._held(spec, before)
         names = spec.state_names
-        index = next(i for i, j in enumerate(spec.joints) if j.name in names)
+        index = next(i for i, j in enumerate(spec.joints) if j.name in names and not j.by_speed)
         joint, column = spec.joints[index], names.index(spec.joints[index].name)
         step = min(STEP, (joint.upper - joint.lower) / 4.0)
         upwards = joint.upper - target[index] > target[index] - joint.lower

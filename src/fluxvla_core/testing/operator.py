@@ -262,7 +262,7 @@ class OperatorConformance(DividedOperatorChecks):
         base = operator.last_action
         base = self.hold(connected) if base is None else np.array(base)
         for index, joint in enumerate(spec.joints):
-            if joint.name in spec.state_names:
+            if joint.name in spec.state_names and not joint.by_speed:
                 self._nudge(connected, base, index)
 
     def _nudge(self, connected: Any, base: Array, index: int) -> None:

@@ -285,7 +285,22 @@ class OperatorConformance(DividedOperatorChecks):
             return bool(near and (np.abs(others) <= abs(step) / 2.0).all())
 
         self._until(followed, lambda: _not_followed(spec, column, step, moved))
-        self._send(connected, base)
+
+        def returned() -> bool:
+            # Commands and readings may be under way for a while: only this shows that it is back.
+            nonlocal moved
+            self._send(connected, base)
+            moved = self.frame(connected).state - before
+            return bool((np.abs(moved) <= abs(step) / 4.0).all())
+
+        self._until(
+            returned,
+            lambda: (
+                f"send_action() moves {joint.name} back to where it was, and after "
+                f"{self.ready_within_s:g} s the state is {moved.tolist()} from there, expected "
+                "the arm to be back: its state follows its commands"
+            ),
+        )
 
     def _at_rest(self, connected: Any, base: Array) -> Array:
         """The state at the command ``base``, once it no longer changes, if it comes to that."""

@@ -291,14 +291,14 @@ class OperatorConformance(DividedOperatorChecks):
             nonlocal moved
             self._send(connected, base)
             moved = self.frame(connected).state - before
-            return bool((np.abs(moved) <= abs(step) / 4.0).all())
+            return bool(abs(moved[column]) <= abs(step) / 4.0)
 
         self._until(
             returned,
             lambda: (
                 f"send_action() moves {joint.name} back to where it was, and after "
-                f"{self.ready_within_s:g} s the state is {moved.tolist()} from there, expected "
-                "the arm to be back: its state follows its commands"
+                f"{self.ready_within_s:g} s its state is {moved[column]:.4g} from there, expected "
+                "it to be back: the state follows the commands"
             ),
         )
 

@@ -54,7 +54,7 @@ FAULTS = {
     ),
     "slow": Fault(
         "it_is_quick_enough", "self.seen += 1", "self.seen += 1; time.sleep(0.03)",
-        "the run waits for it",
+        "it is left out when it falls behind its budget_s",
     ),
     "leaves a thread": Fault(
         "nothing_is_left_running", "        self.rows.append(chunk.mean())",

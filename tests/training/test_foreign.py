@@ -18,7 +18,7 @@ from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS, VLAS
 from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
-from fluxvla_core.training.foreign import export_foreign, import_checkpoint
+from fluxvla_core.training.foreign import embodiment_in, export_foreign, import_checkpoint
 
 ARM = EmbodimentSpec(
     "arm",
@@ -215,6 +215,13 @@ def test_options_that_do_not_fit(tmp_path, capsys, words, said):
     assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *words]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "ours").exists()
+
+
+def test_the_robot_of_a_dataset(tmp_path):
+    (tmp_path / "data" / "meta").mkdir(parents=True)
+    path = tmp_path / "data" / "meta" / "fluxvla_embodiment.json"
+    path.write_text(json.dumps(ARM.to_dict()))
+    assert embodiment_in(tmp_path / "data") == ARM
 
 
 def test_another_robot_is_refused(tmp_path):

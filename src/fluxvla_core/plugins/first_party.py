@@ -17,7 +17,20 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fluxvla-ddp": {"runners": ("DDPTrainRunner",)},
     "fluxvla-deepspeed": {"runners": ("DeepSpeedTrainRunner",)},
     "fluxvla-fsdp": {"runners": ("FSDPTrainRunner",)},
+    "fluxvla-gr00t": {
+        "checkpoint_formats": ("GR00TN15Format", "GR00TN17Format", "LeRobotGR00TFormat"),
+        "heads": ("GR00TActionHead",),
+        "transforms": (
+            "ClipNormalized",
+            "ListInstruction",
+            "ProcessQwenPrompts",
+            "ResizeCropImages",
+        ),
+        "vlas": ("GR00T",),
+        "vlm_backbones": ("EagleBackbone", "Qwen3VLBackbone"),
+    },
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
+    "fluxvla-latency": {"hooks": ("LatencyLog",)},
     "fluxvla-libero": {
         "environments": ("LiberoEnvironment",),
         "policies": ("LiberoExpert",),
@@ -34,7 +47,27 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vision_backbones": ("ConvEncoder",),
         "vlas": ("CompactVLA",),
     },
+    "fluxvla-openvla": {
+        "checkpoint_formats": ("OpenVLAFormat",),
+        "commands": ("openvla-oft",),
+        "transforms": (
+            "CenterCropOpenVLAImages",
+            "DenormalizeOpenVLA",
+            "JitterOpenVLAColors",
+            "NormalizeOpenVLA",
+            "ProcessOpenVLAPrompts",
+            "RandomCropOpenVLAImages",
+            "ResizeOpenVLAImages",
+            "SampleDiffusionSteps",
+        ),
+        "vlas": ("OpenVLA", "OpenVLAOFT"),
+    },
+    "fluxvla-pi": {
+        "checkpoint_formats": ("LeRobotPi", "OpenPi"),
+        "vlas": ("PI05FlowMatching", "PI0FlowMatching"),
+    },
     "fluxvla-report": {"commands": ("report",)},
+    "fluxvla-rerun": {"hooks": ("RerunViewer",)},
     "fluxvla-sim": {
         "commands": ("collect", "sim"),
         "environments": ("AlohaSimEnvironment", "URSimEnvironment"),
@@ -46,6 +79,11 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         ),
         "policies": ("SimExpert",),
         "runners": ("AlohaSimEvalRunner", "URSimEvalRunner"),
+    },
+    "fluxvla-smolvla": {
+        "checkpoint_formats": ("LeRobotSmolVLA",),
+        "transforms": ("SmolVLAImages", "SmolVLANormalize", "SmolVLAPrompt"),
+        "vlas": ("SmolVLA",),
     },
     "fluxvla-ur": {
         "action_filters": ("URWorkspaceBox",),

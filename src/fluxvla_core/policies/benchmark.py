@@ -14,11 +14,10 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from fluxvla_core.build import build_operator_from_cfg, build_vla_from_cfg
 from fluxvla_core.contracts.contract import implements
@@ -32,7 +31,9 @@ from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.plugins._metadata import version
 from fluxvla_core.policies.local import LocalPolicy
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.training import flops
+
+if TYPE_CHECKING:
+    import torch
 
 STAGES = ("preprocess", "inference", "postprocess")
 _PACKAGES = ("fluxvla-core", "torch", "transformers", "numpy")
@@ -149,6 +150,8 @@ def untrained_policy(
     ]
     if not normalizers:
         raise ConfigError("no transform of train_dataloader.dataset normalises actions")
+    import torch
+
     torch.manual_seed(seed)
     model = build_vla_from_cfg(config["model"])
     horizon, _ = model.action_shape
@@ -180,6 +183,10 @@ def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float
     """The device's peak and where the figure is from: given, its maker's, or measured."""
     if given is not None:
         return given, "given"
+    import torch
+
+    from fluxvla_core.training import flops
+
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     if torch.device(device).type == "cuda":
         known = flops.known_peak(torch.cuda.get_device_name(device), dtype)
@@ -190,6 +197,8 @@ def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float
 
 def machine(device: str) -> dict[str, Any]:
     """What a figure belongs to: device, threads and versions."""
+    import torch
+
     gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None
     return {
         "device": gpu or f"{platform.machine()}, {os.cpu_count()} CPUs",
@@ -200,6 +209,8 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def _measured_tflops(device: str, dtype: torch.dtype) -> float:
+    import torch
+
     left, right = (torch.randn(_MATRIX, _MATRIX, device=device, dtype=dtype) for _ in range(2))
     wait: Callable[[], Any] = (
         torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
@@ -234,6 +245,8 @@ def _unit(width: int) -> dict[str, list[float]]:
 
 
 def _memory_mb(device: str) -> float:
+    import torch
+
     if torch.device(device).type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

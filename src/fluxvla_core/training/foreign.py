@@ -23,6 +23,7 @@ from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.contract import implements
+from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
@@ -251,7 +252,7 @@ def embodiment_in(place: str | Path) -> EmbodimentSpec:
         UsageError: there is none, or it is not an embodiment.
     """
     path = Path(place)
-    files = [path] if path.is_file() else [path / ckpt.EMBODIMENT, path / "meta" / ckpt.EMBODIMENT]
+    files = [path] if path.is_file() else [path / ckpt.EMBODIMENT, path / DATASET_EMBODIMENT]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
         raise UsageError(

@@ -1,0 +1,81 @@
+"""The action expert: a transformer that turns noisy actions into the velocity of flow matching."""
+
+from __future__ import annotations
+
+import torch
+from fluxvla_models.velocity import sinusoids
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_smolvla.sizes import TextSize
+from fluxvla_smolvla.transformer import ExpertLayer, Memory, RMSNorm, Rotation, Suffix
+
+
+class Expert(nn.Module):
+    """Layers that attend to every ``stride``-th layer of the language model.
+
+    Args:
+        size: of the expert.
+        stride: layers of the language model for one of the expert's.
+        self_attn_every_n_layers: layers of the language model whose number is a multiple of this
+            are joined with self-attention between actions, the others crossed; 0 crosses all.
+
+    Raises:
+        ConfigError: counted in the expert's layers, other layers would be crossed: the published
+            names could not tell which.
+    """
+
+    def __init__(self, size: TextSize, stride: int, self_attn_every_n_layers: int) -> None:
+        super().__init__()
+        every = self_attn_every_n_layers
+        crossed = [_crosses(i, every) for i in range(size.layers)]
+        if crossed != [_crosses(i * stride, every) for i in range(size.layers)]:
+            raise ConfigError(
+                f"SmolVLA: self_attn_every_n_layers {every} and {stride} layers of the language "
+                "model for one of the expert's do not go together",
+                next="make num_expert_layers that of the language model's layers",
+            )
+        self.head_dim, self.stride = size.head_dim, stride
+        self.layers = nn.ModuleList(ExpertLayer(size, crosses) for crosses in crossed)
+        self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
+
+    def forward(self, x: Tensor, memory: Memory) -> Tensor:
+        """Action tokens ``(B, T, width)`` -> the same shape."""
+        count = x.shape[1]
+        places = torch.arange(count, device=x.device)[None]
+        suffix = Suffix(
+            causal=torch.ones(count, count, dtype=torch.bool, device=x.device).tril()[None, None],
+            behind=Rotation.at(memory.length[:, None] + places, self.head_dim),
+            alone=Rotation.at(places, self.head_dim),
+        )
+        for number, layer in enumerate(self.layers):
+            place = number * self.stride
+            x = layer(x, memory.keys[place], memory.values[place], memory.seen, suffix)
+        return self.norm(x)
+
+
+class ActionTimeMLP(nn.Module):
+    """Noisy actions ``(B, T, D)`` and their time ``(B,)`` -> action tokens ``(B, T, width)``."""
+
+    def __init__(self, action_dim: int, width: int, shortest: float, longest: float) -> None:
+        super().__init__()
+        if not 0 < shortest < longest:
+            raise ConfigError(
+                f"SmolVLA: min_period {shortest} and max_period {longest} must be positive, the "
+                "second one larger"
+            )
+        self.shortest, self.longest = shortest, longest
+        self.action_in_proj = nn.Linear(action_dim, width)
+        self.action_time_mlp_in = nn.Linear(2 * width, width)
+        self.action_time_mlp_out = nn.Linear(width, width)
+
+    def forward(self, noisy: Tensor, time: Tensor) -> Tensor:
+        actions = self.action_in_proj(noisy)
+        waves = sinusoids(time, actions.shape[-1], self.shortest, self.longest)
+        joined = torch.cat([actions, waves.to(actions.dtype)[:, None].expand_as(actions)], dim=2)
+        return self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))
+
+
+def _crosses(layer: int, every: int) -> bool:
+    return every < 1 or layer % every != 0

@@ -1,0 +1,178 @@
+"""Files around LeRobot's policies: processors with their statistics, and what their names mean.
+
+LeRobot 0.4 and later saves ``policy_preprocessor.json`` and ``policy_postprocessor.json``, lists of
+steps; a step's tensors are in a safetensors file that it names (lerobot/processor/pipeline.py).
+Earlier ones kept the statistics as buffers between the weights:
+``normalize_inputs.buffer_observation_state.mean`` and so on
+(lerobot/processor/migrate_policy_normalization.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+from torch import Tensor
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_core.results import read_json
+
+STATE, ACTION = "observation.state", "action"
+BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
+EPS = 1e-8
+NORMS = {
+    "MEAN_STD": "mean_std",
+    "MIN_MAX": "min_max",
+    "QUANTILES": "quantile",
+    "QUANTILE10": "quantile10",
+    "IDENTITY": "none",
+}
+"""LeRobot's normalisations -> those of ``SmolVLANormalize``."""
+_IGNORED = {
+    "to_batch_processor",
+    "device_processor",
+    "smolvla_new_line_processor",  # as SmolVLAPrompt
+}
+_BUFFERS = {
+    "normalize_inputs.buffer_observation_state.": STATE,
+    "normalize_targets.buffer_action.": ACTION,
+    "unnormalize_outputs.buffer_action.": ACTION,
+}
+BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+Statistics = dict[str, dict[str, list[float]]]
+"""Feature -> statistic -> numbers, one for each dimension."""
+
+
+@dataclass(frozen=True)
+class Processors:
+    """What LeRobot does before and after the model.
+
+    Args:
+        norms: ``STATE`` and ``ACTION`` -> the name of a normalisation.
+        statistics: by feature; the action's are those that make physical actions.
+        renamed: the robot's key of an observation -> the policy's.
+        max_length: of the tokens; None if it does not say.
+        tokenizer: the name of the tokenizer.
+    """
+
+    norms: Mapping[str, str] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=dict)
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    max_length: int | None = None
+    tokenizer: str | None = None
+
+
+def read_processors(folder: Path) -> Processors | None:
+    """The processors that are saved in ``folder``; None if there are none.
+
+    Raises:
+        CheckpointError: they are damaged, or do something that is not known here.
+    """
+    if not (folder / f"{BEFORE}.json").is_file():
+        return None
+    norms: dict[str, str] = {}
+    statistics: Statistics = {}
+    renamed: dict[str, str] = {}
+    tokens: Mapping[str, Any] = {}
+    for stem in (BEFORE, AFTER):
+        where = str(folder / f"{stem}.json")
+        for step in _steps(folder / f"{stem}.json"):
+            name, settings = step.get("registry_name"), step.get("config", {})
+            if name in ("normalizer_processor", "unnormalizer_processor"):
+                norms |= norms_of(settings.get("norm_map", {}), where)
+                if settings.get("eps", EPS) != EPS:
+                    raise CheckpointError(
+                        f"{name} divides by a std plus {settings['eps']}; {EPS} is known",
+                        where=where,
+                    )
+                statistics |= _stored_statistics(folder, step.get("state_file"), where)
+            elif name == "rename_observations_processor":
+                renamed |= _texts(settings.get("rename_map", {}), "rename_map", where)
+            elif name == "tokenizer_processor":
+                tokens = settings
+            elif not isinstance(name, str) or name not in _IGNORED:
+                raise CheckpointError(
+                    f"the step {name!r} of the processors is not known here",
+                    where=where,
+                    cause="it was added to LeRobot's own steps, or by a later version",
+                )
+    length, tokenizer = tokens.get("max_length"), tokens.get("tokenizer_name")
+    for name, value, kind in (("max_length", length, int), ("tokenizer_name", tokenizer, str)):
+        if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
+            raise CheckpointError(f"{name} of the tokenizer's step is {value!r}", where=str(folder))
+    return Processors(norms, statistics, renamed, length, tokenizer)
+
+
+def buffered_statistics(tensors: Mapping[str, Stored]) -> Statistics:
+    """Statistics that earlier versions kept between the weights."""
+    found: Statistics = {}
+    for name in tensors:
+        for prefix, feature in _BUFFERS.items():
+            if name.startswith(prefix):
+                values = whole(tensors[name]).float()
+                # Infinite where nothing was ever set.
+                if values.isfinite().all():
+                    found.setdefault(feature, {})[name.removeprefix(prefix)] = values.tolist()
+    return found
+
+
+def whole(stored: Stored | Tensor) -> Tensor:
+    """The tensor that ``stored`` stands for."""
+    if isinstance(stored, Tensor):
+        return stored
+    return stored[tuple(slice(0, length) for length in stored.shape)]
+
+
+def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
+    """State's and action's normalisation, from LeRobot's names.
+
+    Raises:
+        CheckpointError: an unknown normalisation, or one of pictures.
+    """
+    texts = _texts(mapping, "the mapping of normalisations", where)
+    unknown = {kind: norm for kind, norm in texts.items() if norm not in NORMS}
+    if unknown:
+        kind, norm = next(iter(unknown.items()))
+        raise CheckpointError(
+            f"the normalisation {norm!r} of {kind} is not one of {', '.join(NORMS)}", where=where
+        )
+    if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
+        raise CheckpointError(
+            f"pictures are normalised by {mapping['VISUAL']}; SmolVLA takes them as they are "
+            "(IDENTITY)",
+            where=where,
+        )
+    return {kind: NORMS[norm] for kind, norm in mapping.items() if kind in ("STATE", "ACTION")}
+
+
+def _steps(path: Path) -> list[dict[str, Any]]:
+    content = read_json(path, dict[str, Any], CheckpointError)
+    steps = content.get("steps")
+    if not isinstance(steps, list) or not all(
+        isinstance(step, dict) and isinstance(step.get("config", {}), dict) for step in steps
+    ):
+        raise CheckpointError("steps is no list of steps with a config", where=str(path))
+    return steps
+
+
+def _texts(table: Any, what: str, where: str) -> dict[str, str]:
+    if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
+        raise CheckpointError(f"{what} is no table of names: {table!r}", where=where)
+    return table
+
+
+def _stored_statistics(folder: Path, file: Any, where: str) -> Statistics:
+    if file is None:
+        return {}
+    if not isinstance(file, str) or PurePath(file).name != file:
+        raise CheckpointError(f"state_file {file!r} is not a file next to it", where=where)
+    found: Statistics = {}
+    tensors = safetensors_in(folder, file.removesuffix(".safetensors"))
+    for name in tensors:
+        feature, _, statistic = name.rpartition(".")
+        if feature in (STATE, ACTION) and statistic != "count":
+            found.setdefault(feature, {})[statistic] = whole(tensors[name]).float().tolist()
+    return found

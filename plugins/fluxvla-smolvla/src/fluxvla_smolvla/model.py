@@ -1,0 +1,320 @@
+"""SmolVLA (Shukor et al. 2025, arXiv 2506.01844), as LeRobot publishes it.
+
+Pictures, the instruction and a state token go through the first layers of SmolVLM2. An action
+expert of narrower layers attends to that model's keys and values, layer by layer, and predicts the
+velocity of flow matching. The language model sees nothing of the actions, so its part of a sample
+is computed once, however many draws of noise or integration steps follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from fluxvla_models.guidance import Guide
+from fluxvla_models.velocity import sample
+from torch import Tensor, nn
+
+from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.models import VLA
+from fluxvla_smolvla.expert import ActionTimeMLP, Expert
+from fluxvla_smolvla.loss import masked_mean
+from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
+from fluxvla_smolvla.transformer import ContextLayer, Memory, Prefix, RMSNorm, Rotation
+from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
+
+LOSSES = ("valid", "all")
+SMOLVLM2 = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+BLACK = -1.0
+"""What pictures are padded with, normalised."""
+
+
+class LanguageModel(nn.Module):
+    """The first layers of SmolLM2; ``norm`` is kept for checkpoints, nothing uses it.
+
+    Args:
+        size: of all layers.
+        deepest: number of the last layer whose keys and values are used.
+    """
+
+    def __init__(self, size: TextSize, deepest: int) -> None:
+        super().__init__()
+        self.size, self.deepest = size, deepest
+        self.embed_tokens = nn.Embedding(size.vocabulary, size.hidden_size)
+        self.layers = nn.ModuleList(ContextLayer(size) for _ in range(size.layers))
+        self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
+
+    def forward(self, context: Tensor, seen: Tensor, state: Tensor) -> Memory:
+        """Keys and values of the layers up to the deepest.
+
+        Args:
+            context: ``(B, C, width)``; ``seen``: ``(B, C)`` bool, real ones.
+            state: ``(B, 1, width)``.
+        """
+        count = seen.sum(1)
+        head_dim = self.size.head_dim
+        prefix = Prefix(
+            seen=seen[:, None, None],
+            context=Rotation.at(seen.long().cumsum(1) - 1, head_dim),
+            state=Rotation.at(count[:, None], head_dim),
+        )
+        keys, values = [], []
+        for number, layer in enumerate(self.layers[: self.deepest + 1]):
+            last = number == self.deepest
+            context, state, key, value = layer(context, state, prefix, last)
+            keys.append(key)
+            values.append(value)
+        all_seen = nn.functional.pad(prefix.seen, (0, 1), value=True)
+        return Memory(tuple(keys), tuple(values), all_seen, count + 1)
+
+
+class SmolVLA(VLA, nn.Module):
+    """Pictures, instruction and joint state in, action chunk out; 450 million parameters.
+
+    ``forward`` and ``predict_action`` draw nothing: noise and times come in with the batch.
+
+    Args:
+        vision, text: sizes of the vision tower and of the language model; SmolVLM2-500M's.
+        n_action_steps: actions in a chunk.
+        max_state_dim, max_action_dim: widths of states and actions, padded with zeros.
+        ori_action_dim: dimensions of the robot's action; the loss leaves out the padding behind
+            them. None counts all.
+        num_steps: Euler steps at inference.
+        num_expert_layers: layers of the expert; as many as the language model's if None.
+        self_attn_every_n_layers: see ``Expert``; 1 never crosses.
+        expert_width_multiplier: the expert's width, of the language model's.
+        min_period, max_period: of the sinusoids that stand for the time.
+        freeze_vision_encoder: do not train the vision tower.
+        train_expert_only: train neither the tower, nor the connector, nor the language model.
+        train_state_proj: train the layer that makes the state token.
+        loss_mean: ``valid``, as LeRobot: the mean over the steps that are inside their episodes;
+            ``all``: steps beyond the end count as 0, which several processes, each with its own
+            share of a batch, compute exactly as one process does.
+        vlm_model_name: the backbone's name on the hub, which LeRobot looks up; for exports.
+        pretrained_name_or_path: weights that a training starts from, as ``runner.init_from``.
+
+    Raises:
+        ConfigError: sizes that do not go together.
+    """
+
+    def __init__(
+        self,
+        vision: VisionSize | Mapping[str, Any] | None = None,
+        text: TextSize | Mapping[str, Any] | None = None,
+        n_action_steps: int = 50,
+        max_state_dim: int = 32,
+        max_action_dim: int = 32,
+        ori_action_dim: int | None = None,
+        num_steps: int = 10,
+        num_expert_layers: int | None = None,
+        self_attn_every_n_layers: int = 2,
+        expert_width_multiplier: float = 0.75,
+        min_period: float = 4e-3,
+        max_period: float = 4.0,
+        freeze_vision_encoder: bool = True,
+        train_expert_only: bool = True,
+        train_state_proj: bool = True,
+        loss_mean: str = "valid",
+        vlm_model_name: str = SMOLVLM2,
+        pretrained_name_or_path: str | None = None,
+    ) -> None:
+        super().__init__()
+        seen, read = size_of(VisionSize, vision), size_of(TextSize, text)
+        experts = read.layers if num_expert_layers is None else num_expert_layers
+        _check_counts(
+            experts,
+            read.layers,
+            n_action_steps=n_action_steps,
+            num_steps=num_steps,
+            max_state_dim=max_state_dim,
+            max_action_dim=max_action_dim,
+        )
+        if ori_action_dim is not None and not 1 <= ori_action_dim <= max_action_dim:
+            raise ConfigError(
+                f"SmolVLA: ori_action_dim {ori_action_dim} is not in 1..{max_action_dim} "
+                "(max_action_dim)"
+            )
+        if loss_mean not in LOSSES:
+            raise ConfigError(f"SmolVLA: loss_mean {loss_mean!r} is not one of {', '.join(LOSSES)}")
+        self.n_action_steps, self.num_steps, self.loss_mean = n_action_steps, num_steps, loss_mean
+        self.max_state_dim, self.max_action_dim = max_state_dim, max_action_dim
+        self.ori_action_dim = max_action_dim if ori_action_dim is None else ori_action_dim
+        self.image_size, self.width = seen.image_size, read.hidden_size
+        self.pretrained_name_or_path = pretrained_name_or_path
+        size = expert_size(read, experts, expert_width_multiplier)
+        self.vision = VisionTower(seen)
+        self.connector = Connector(seen, read.hidden_size)
+        stride = read.layers // experts
+        self.text = LanguageModel(read, deepest=(experts - 1) * stride)
+        # Of no use here; kept so that a checkpoint goes back to LeRobot as it came.
+        self.lm_head = nn.Linear(read.hidden_size, read.vocabulary, bias=False)
+        self.state_proj = nn.Linear(max_state_dim, read.hidden_size)
+        self.embed_actions = ActionTimeMLP(max_action_dim, size.hidden_size, min_period, max_period)
+        self.expert = Expert(size, stride, self_attn_every_n_layers)
+        self.action_out_proj = nn.Linear(size.hidden_size, max_action_dim)
+        self.apply(_initialize)
+        self._freeze(freeze_vision_encoder, train_expert_only, train_state_proj)
+
+    def forward(
+        self,
+        images: Tensor,
+        img_masks: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        actions: Tensor,
+        action_masks: Tensor,
+        noise: Tensor,
+        time: Tensor,
+    ) -> dict[str, Tensor]:
+        """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
+
+        Args:
+            images: ``(B, 3N, H, W)`` in -1..1; of another size than the vision tower's, they are
+                resized without distortion.
+            img_masks: ``(B, N)`` bool, False for cameras that are not there.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool.
+            states: ``(B, S)`` normalised; ``actions``: ``(B, T, D)`` normalised.
+            action_masks: ``(B, T)``, 0 beyond the end of an episode.
+            noise: ``(B, K, T, D)``; ``time``: ``(B, K)`` in 0..1, 1 being the data.
+
+        Raises:
+            DataError: an input of a width that the model does not have.
+        """
+        draws, shape = noise.shape[1], self.action_shape
+        _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
+        _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
+        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states).repeat(draws)
+        t = (1.0 - time)[..., None, None]
+        clean = actions[:, None]
+        noisy, target = t * noise + (1.0 - t) * clean, noise - clean
+        found = self._velocity(noisy.flatten(0, 1), t.flatten(), memory).unflatten(0, (-1, draws))
+        errors = (found.float() - target).square()[..., : self.ori_action_dim]
+        loss, each = masked_mean(errors, action_masks, self.loss_mean)
+        return {"loss": loss, "sample_losses": each.detach()}
+
+    def predict_action(
+        self,
+        images: Tensor,
+        img_masks: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        noise: Tensor,
+        prev_actions: Tensor | None = None,
+        prefix_weights: Tensor | None = None,
+        prefix_len: Tensor | None = None,
+        max_guidance_weight: Tensor | None = None,
+    ) -> Tensor:
+        """Observation and ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+
+        Args:
+            images, img_masks, lang_tokens, lang_masks, states: as of ``forward``.
+            prev_actions: ``(B, T, D)`` normalised, to continue; the other three belong to it, see
+                ``fluxvla_models.guidance.Guide``.
+            prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
+
+        Raises:
+            DataError: an input of a width that the model does not have.
+        """
+        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
+        guide = None
+        if prev_actions is not None:
+            assert prefix_weights is not None
+            assert prefix_len is not None
+            assert max_guidance_weight is not None
+            own = prev_actions[..., : self.ori_action_dim]
+            guide = Guide(own, prefix_weights, prefix_len, max_guidance_weight)
+
+        def velocity(x: Tensor, t: Tensor) -> Tensor:
+            return self._velocity(x, t, memory).to(x.dtype)
+
+        return sample(velocity, noise, self.num_steps, guide)
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """``(T, D)`` of a chunk, and of the noise that one starts from."""
+        return self.n_action_steps, self.max_action_dim
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """The layers of the vision tower, of the language model and of the expert."""
+        return [*self.vision.layers, *self.text.layers, *self.expert.layers]
+
+    def _memory(
+        self, images: Tensor, img_masks: Tensor, tokens: Tensor, masks: Tensor, states: Tensor
+    ) -> Memory:
+        cameras, rest = divmod(images.shape[1], 3)
+        if rest or cameras != img_masks.shape[1]:
+            raise DataError(
+                f"SmolVLA: images have {images.shape[1]} channels, img_masks {img_masks.shape[1]} "
+                "cameras; 3 channels each are expected"
+            )
+        _expect("states", states.shape[1:], "max_state_dim", (self.max_state_dim,))
+        pictures = self._look(images.unflatten(1, (cameras, 3)).flatten(0, 1))
+        pictures = pictures.unflatten(0, (-1, cameras))
+        shown = img_masks.bool()[..., None].expand(-1, -1, pictures.shape[2])
+        words = self.text.embed_tokens(tokens)
+        context = torch.cat([pictures.flatten(1, 2), words.to(pictures.dtype)], dim=1)
+        seen = torch.cat([shown.flatten(1), masks.bool()], dim=1)
+        state = self.state_proj(states)[:, None]
+        # LeRobot scales pictures and words by the root of their width, but not the state.
+        return self.text(context * self.width**0.5, seen, state)
+
+    def _look(self, pictures: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` in -1..1 -> ``(B, tokens, width)``."""
+        whole = resize_with_pad(pictures, self.image_size, self.image_size, BLACK)
+        return self.connector(self.vision(whole))
+
+    def _velocity(self, noisy: Tensor, t: Tensor, memory: Memory) -> Tensor:
+        hidden = self.expert(self.embed_actions(noisy, t), memory)
+        out = self.action_out_proj
+        # The velocity is summed over the steps: it is computed in fp32 whatever the weights are in.
+        with torch.autocast(hidden.device.type, enabled=False):
+            return nn.functional.linear(hidden.float(), out.weight.float(), out.bias.float())
+
+    def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:
+        """As LeRobot freezes: what no gradient reaches never trains either.
+
+        Of the deepest layer that the expert attends to, only keys and values are used, and LeRobot
+        trains none of it.
+        """
+        frozen: list[nn.Module] = [self.lm_head, self.text.norm]
+        frozen += [self.vision] if vision or expert_only else []
+        frozen += [self.connector, self.text] if expert_only else []
+        frozen += self.text.layers[self.text.deepest :]
+        frozen += [] if state_proj else [self.state_proj]
+        for module in frozen:
+            module.requires_grad_(False)
+
+
+def _initialize(module: nn.Module) -> None:
+    """Normal weights of 0.02, as SmolVLM2 begins; states and actions are projected by torch's."""
+    if isinstance(module, (Expert, LanguageModel, VisionTower, Connector)):
+        for part in module.modules():
+            if isinstance(part, (nn.Linear, nn.Embedding, nn.Conv2d)):
+                nn.init.normal_(part.weight, std=0.02)
+                if isinstance(part, (nn.Linear, nn.Conv2d)) and part.bias is not None:
+                    nn.init.zeros_(part.bias)
+
+
+def _check_counts(experts: int, layers: int, **counts: int) -> None:
+    for name, count in counts.items():
+        if count < 1:
+            raise ConfigError(f"SmolVLA: {name} {count} must be positive")
+    if experts < 1 or layers % experts:
+        raise ConfigError(
+            f"SmolVLA: num_expert_layers {experts} does not divide the language model's {layers} "
+            "layers (text.layers)"
+        )
+
+
+def _expect(what: str, found: Any, names: str, expected: tuple[int, ...]) -> None:
+    if tuple(found) != expected:
+        raise DataError(
+            f"SmolVLA: {what} of a sample have shape {tuple(found)}, {expected} ({names}) is "
+            "expected",
+            next="the transforms pad and cut: compare their widths and action_window_size with "
+            "the model's",
+        )

@@ -1,0 +1,156 @@
+"""SmolVLA trains: the loss falls, several processes do as one does, and it resumes bit for bit."""
+
+from __future__ import annotations
+
+import json
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from fluxvla_smolvla.keys import published
+
+from fluxvla_core import build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
+from fluxvla_core.operators import RunContext
+from fluxvla_core.testing.training import checkpoint_differences, run_ranks
+
+from .tiny import ACTION, HORIZON, SIZES, STATE, WIDTH, lerobot_folder, published_weights
+
+KEYS = [
+    "images",
+    "img_masks",
+    "lang_tokens",
+    "lang_masks",
+    "states",
+    "actions",
+    "action_masks",
+    "noise",
+    "time",
+]
+
+
+class Samples:
+    """Ten samples, each always with the same noise; some end within the chunk."""
+
+    fps = 10.0
+    statistics: ClassVar[dict] = {"private": {}}
+    embodiment = None
+
+    def __len__(self):
+        return 10
+
+    def get_sample(self, index, epoch):
+        rng = np.random.default_rng(index)
+        shape = (HORIZON, WIDTH)
+        actions, states = np.zeros(shape, np.float32), np.zeros(WIDTH, np.float32)
+        actions[:, :ACTION] = rng.standard_normal((HORIZON, ACTION))
+        states[:STATE] = rng.standard_normal(STATE)
+        return {
+            "images": rng.uniform(-1, 1, (6, 64, 64)).astype(np.float32),
+            "img_masks": np.array([True, index % 2 == 0]),
+            "lang_tokens": rng.integers(0, 300, 6),
+            "lang_masks": np.arange(6) < 3 + index % 4,
+            "states": states,
+            "actions": actions,
+            "action_masks": (np.arange(HORIZON) < 4 + index % 4).astype(np.float32),
+            "noise": rng.standard_normal((1, *shape)).astype(np.float32),
+            "time": rng.uniform(0, 0.999, 1).astype(np.float32),
+        }
+
+
+def learn(work_dir, runner="OneProcessRunner", batch=4, resume=None, model=None, **settings):
+    """One training; gives the work dir."""
+    table = {
+        "type": runner,
+        "learning_rate": 1e-4,
+        "max_steps": 4,
+        "seed": 1,
+        "collator": {"type": "DictCollator", "keys": KEYS},
+        **settings,
+    }
+    config = {
+        "model": {"type": "SmolVLA", **SIZES, "loss_mean": "all", **(model or {})},
+        "train_dataloader": {"per_device_batch_size": batch},
+        "runner": table,
+    }
+    context = RunContext(config=config, section="runner", work_dir=work_dir, resume=resume)
+    made = build_runner_from_cfg(table, context)
+    made.run_setup(10)
+    made.run(Samples())
+    return work_dir
+
+
+def losses(work_dir):
+    return [json.loads(line)["loss"] for line in (work_dir / "metrics.jsonl").open()]
+
+
+def test_the_loss_falls_with_the_expert_alone(tmp_path):
+    found = losses(learn(tmp_path, max_steps=80, batch=5, learning_rate=1e-3))
+    assert np.mean(found[-5:]) < 0.3 * np.mean(found[:5])
+
+
+def test_a_training_starts_from_lerobots_folder(tmp_path):
+    source = lerobot_folder(tmp_path / "theirs")
+    model = {"pretrained_name_or_path": str(source), "n_action_steps": HORIZON, "num_steps": 2}
+    learn(tmp_path / "run", model=model, max_steps=1, learning_rate=1e-9)
+    found = latest(tmp_path / "run").tensors("model.safetensors")
+    ours = {published(name): tensor for name, tensor in found.items()}
+    for name, tensor in published_weights().items():
+        torch.testing.assert_close(ours[name], tensor, rtol=0, atol=1e-8)
+
+
+PARTS = {
+    "expert": {},
+    "language": {"train_expert_only": False},
+}
+
+
+def on_two(work_dir):
+    torch.distributed.init_process_group("gloo")
+    mixed = {"model": PARTS["language"], "enable_mixed_precision_training": True}
+    learn(work_dir / "bf16", "FSDPTrainRunner", batch=2, **mixed)
+    for part, model in PARTS.items():
+        for runner in ("DDPTrainRunner", "FSDPTrainRunner"):
+            learn(work_dir / f"{part}-{runner}", runner, batch=2, model=model)
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    place = tmp_path_factory.mktemp("two")
+    assert run_ranks(2, on_two, place) == [0, 0]
+    return place
+
+
+@pytest.mark.parametrize("runner", ["DDPTrainRunner", "FSDPTrainRunner"])
+@pytest.mark.parametrize("part", PARTS)
+def test_two_processes_train_as_one_does(two, tmp_path, part, runner):
+    alone = learn(tmp_path, model=PARTS[part])
+    together = two / f"{part}-{runner}"
+    np.testing.assert_allclose(losses(together), losses(alone), rtol=1e-5)
+    ours, theirs = (latest(place).tensors("model.safetensors") for place in (together, alone))
+    assert ours.keys() == theirs.keys()
+    worst = max(ours, key=lambda name: float((ours[name] - theirs[name]).abs().max()))
+    assert float((ours[worst] - theirs[worst]).abs().max()) < 1e-5, worst
+
+
+def test_in_bf16_the_losses_are_about_the_same(two, tmp_path):
+    alone = losses(learn(tmp_path, model=PARTS["language"]))
+    found = losses(two / "bf16")
+    assert found != alone
+    np.testing.assert_allclose(found, alone, rtol=0.02)
+
+
+def test_a_training_resumes_bit_for_bit(tmp_path):
+    model = {"train_expert_only": False, "freeze_vision_encoder": False}
+    settings = {"save_iter_interval": 2, "max_keep_ckpts": 0, "ema_decay": 0.9}
+    whole = learn(tmp_path / "whole", model=model, **settings)
+    first = str(folders(whole)[0])
+    on = learn(tmp_path / "on", model=model, resume=first, **settings)
+    assert checkpoint_differences(latest(whole).path, latest(on).path) == []
+
+
+def test_blocks_are_recomputed_to_the_same_gradients(tmp_path):
+    plain = learn(tmp_path / "plain", model=PARTS["language"])
+    again = learn(tmp_path / "again", model=PARTS["language"], enable_gradient_checkpointing=True)
+    np.testing.assert_allclose(losses(again), losses(plain), rtol=1e-6)

@@ -64,6 +64,12 @@ COMMANDS: Mapping[str, Entry] = {
     "plugins doctor": Entry(
         "fluxvla_core.cli.doctor:Doctor", "look for what is wrong with the installation"
     ),
+    "plugins check": Entry(
+        "fluxvla_core.cli.check_plugin:CheckPlugin", "run the conformance kit of one class"
+    ),
+    "new-plugin": Entry(
+        "fluxvla_core.cli.new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"
+    ),
     "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
     "data validate": Entry(
         "fluxvla_core.cli.data_commands:Validate", "read every row, decode every frame"

@@ -15,7 +15,6 @@ syntax is new are rewritten. What they say stays the same.
 from __future__ import annotations
 
 import re
-import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +47,7 @@ NEEDS = (
     "termcolor",
     "transformers==5.5.4",
 )
+NEEDS_044 = ("huggingface-hub<1", "peft", "transformers==4.57.6")
 POLICIES = (
     "act.modeling_act",
     "diffusion.modeling_diffusion",
@@ -113,12 +113,19 @@ def prepare(log: Callable[[str], None], root: Path = ORACLES / "lerobot061") -> 
     return env
 
 
+def prepare_044(log: Callable[[str], None]) -> Env:
+    """LeRobot 0.4.4, the last one with GR00T N1.5, with the transformers that it was made for.
+
+    Raises:
+        StepFailed: something cannot be installed.
+    """
+    return lerobot_env.prepare(log, ORACLES / "lerobot044", NEEDS_044)
+
+
 def adapt(env: Env) -> None:
     """Let the installed LeRobot and torchvision be imported here; done again, no more."""
     lerobot_env.declare_operators(env)
-    # draccus brings its tests as a package of that name, which would hide this repository's.
-    for package in env.root.glob("lib/python*/site-packages/tests"):
-        shutil.rmtree(package)
+    lerobot_env.remove_tests(env)
     if sys.version_info >= (3, 12):
         return
     for module in env.root.glob("lib/python*/site-packages/lerobot/**/*.py"):
@@ -153,7 +160,7 @@ def without_type_parameters(text: str) -> str:
 
 # What a program's line ``ENVIRONMENT = "NAME"`` may say.
 ENVIRONMENTS: dict[str, Callable[[Callable[[str], None]], Env]] = {
-    "lerobot044": lerobot_env.prepare,
+    "lerobot044": prepare_044,
     "lerobot061": prepare,
 }
 

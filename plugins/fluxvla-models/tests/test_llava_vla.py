@@ -195,13 +195,17 @@ def test_pictures_and_words_see_each_other_in_paligemma(folders) -> None:
 
 def test_weights_come_from_the_folder_and_equal_transformers(folders) -> None:
     part = SigLIPBackbone(folders["siglip"]).eval()
-    reference = transformers.SiglipVisionModel.from_pretrained(folders["siglip"]).eval()
+    reference = transformers.SiglipVisionModel.from_pretrained(
+        folders["siglip"], trust_remote_code=False
+    ).eval()
     images = torch.randn(2, 3, 32, 32)
     with torch.inference_mode():
         expected = reference(pixel_values=images).last_hidden_state
         torch.testing.assert_close(part(images), expected)
     inside = SigLIPBackbone(folders["siglip_both"]).eval()
-    both = transformers.SiglipModel.from_pretrained(folders["siglip_both"]).eval()
+    both = transformers.SiglipModel.from_pretrained(
+        folders["siglip_both"], trust_remote_code=False
+    ).eval()
     with torch.inference_mode():
         expected = both.vision_model(pixel_values=images).last_hidden_state
         torch.testing.assert_close(inside(images), expected)
@@ -211,7 +215,9 @@ def test_weights_come_from_the_folder_and_equal_transformers(folders) -> None:
         (LlamaBackbone, "llama"),
     ):
         language = kind(folders[name]).eval()
-        causal = transformers.AutoModelForCausalLM.from_pretrained(folders[name]).eval()
+        causal = transformers.AutoModelForCausalLM.from_pretrained(
+            folders[name], trust_remote_code=False
+        ).eval()
         tokens = torch.randint(0, 50, (2, 5))
         with torch.inference_mode():
             found = language(language.embed(tokens), torch.ones(2, 5, dtype=torch.bool))

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import pty
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -80,7 +85,7 @@ def kit_of(arm: str) -> str:
 
 
 def test_a_right_class_of_a_file_passes(fluxvla: Fluxvla, arm: str) -> None:
-    ended = fluxvla("plugins", "check", "CheckedOperator", "--plugin", arm)
+    ended = fluxvla("plugins", "check", "CheckedOperator", "--simulated", "--plugin", arm)
     assert ended.code == 0, ended.out
     lines = ended.out.splitlines()
     assert "  ok       a command moves its own joint" in lines
@@ -92,7 +97,7 @@ def test_a_right_class_of_a_file_passes(fluxvla: Fluxvla, arm: str) -> None:
 
 def test_what_is_wrong_is_said_in_words(fluxvla: Fluxvla, arm: str) -> None:
     """With the kit of a file: only the one for this class is run, with its own settings."""
-    words = ["--plugin", arm, "--kit", kit_of(arm)]
+    words = ["--simulated", "--plugin", arm, "--kit", kit_of(arm)]
     ended = fluxvla("plugins", "check", "CheckedOperator", *words)
     assert ended.code == 1, ended.out
     said = " ".join(ended.out.split())
@@ -124,6 +129,10 @@ def test_arguments_reach_the_constructor(fluxvla: Fluxvla) -> None:
         (["LowPass", "--kit", "{kit}"], "no kit whose entry_point is 'LowPass'"),
         (["LowPass", "--kit", "{kit}", "--set", "share=1"], "has arguments of its own"),
         (["LowPass", "--plugin", "nowhere.py"], "there is no such file"),
+        (["LowPass", "--hardware"], "are for operators; LowPass is none"),
+        (["CheckedOperator"], "moves what it connects to: every joint by 0.03 of its unit"),
+        (["CheckedOperator", "--hardware"], "no person is at a terminal to agree"),
+        (["CheckedOperator", "--hardware", "--simulated"], "not allowed with argument"),
     ],
 )
 def test_bad_input_is_refused_in_words(
@@ -134,6 +143,33 @@ def test_bad_input_is_refused_in_words(
     assert ended.code == 2
     assert said in ended.err
     assert "Traceback" not in ended.err
+
+
+@pytest.mark.parametrize(("typed", "code"), [("CheckedOperator", 0), ("yes", 2), ("", 2)])
+def test_a_robot_moves_when_a_person_agrees(
+    tmp_path: Path, arm: str, typed: str, code: int
+) -> None:
+    """At a terminal of its own."""
+    log = tmp_path / "said"
+    keyboard, screen = pty.openpty()
+    words = ["plugins", "check", "CheckedOperator", "--hardware", "--plugin", arm]
+    with log.open("w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "fluxvla_core", *words], stdin=screen, stdout=out, stderr=out
+        )
+    try:
+        until = time.monotonic() + 60
+        while "to let it move" not in log.read_text():
+            assert time.monotonic() < until
+            assert process.poll() is None, log.read_text()
+            time.sleep(0.05)
+        os.write(keyboard, f"{typed}\n".encode())
+        assert process.wait(60) == code, log.read_text()
+    finally:
+        process.kill()
+        os.close(keyboard)
+        os.close(screen)
+    assert ("nothing was moved" in log.read_text()) == (code == 2)
 
 
 def test_a_kit_that_cannot_be_loaded_is_told(fluxvla: Fluxvla, tmp_path: Path) -> None:

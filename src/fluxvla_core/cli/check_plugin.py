@@ -10,6 +10,7 @@ import contextlib
 import importlib.util
 import io
 import os
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -57,7 +58,7 @@ class CheckPlugin:
     api = "1.0"
     help = (
         "Run the conformance kit that fits a class, and say in words what is wrong. An operator's "
-        "kit moves the robot that --set arguments reach: every joint by 0.03 of its unit."
+        "kit moves the robot that it connects to, and so asks for --hardware or --simulated."
     )
 
     def add_arguments(self, parser: Parser) -> None:
@@ -76,6 +77,16 @@ class CheckPlugin:
             help="a Python file with subclasses of the kits, such as a plugin's own tests: those "
             "for this class are run",
         )
+        behind = parser.add_mutually_exclusive_group()
+        behind.add_argument(
+            "--hardware",
+            action="store_true",
+            help="of an operator: a robot is behind it, and may be moved once you have agreed at "
+            "the terminal",
+        )
+        behind.add_argument(
+            "--simulated", action="store_true", help="of an operator: no robot is behind it"
+        )
         add_plugin_files(parser)
 
     def run(self, args: argparse.Namespace) -> int:
@@ -86,6 +97,7 @@ class CheckPlugin:
         load_plugin_files(args.plugin_files)
         registry = _registry_of(args.name)
         kit = _kit_of(registry, args.name)
+        _agree(args, registry)
         if args.kit is not None and args.arguments:
             raise UsageError("--set is for a kit without a file; --kit has arguments of its own")
         found = list(_run(args, kit))
@@ -147,6 +159,34 @@ def _kit_of(registry: str, name: str) -> str:
             next="pip install -e its distribution; fluxvla new-plugin begins one",
         )
     return KITS[registry]
+
+
+def _agree(args: argparse.Namespace, registry: str) -> None:
+    """Let nothing move that nobody has agreed to.
+
+    Raises:
+        UsageError: an operator without one of the options, another class with one, or a person who
+            does not agree.
+    """
+    if registry != "operators":
+        if args.hardware or args.simulated:
+            raise UsageError(f"--hardware and --simulated are for operators; {args.name} is none")
+        return
+    moves = f"the kit of {args.name} moves what it connects to: every joint by 0.03 of its unit"
+    if args.simulated:
+        return
+    if not args.hardware:
+        raise UsageError(
+            moves,
+            next="--simulated, if no robot is behind it; --hardware, with a hand on the emergency "
+            "stop: it asks you first",
+        )
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise UsageError(f"{moves}, and no person is at a terminal to agree to that")
+    say(f"{moves}. Clear its space, and keep a hand on the emergency stop.")
+    say(f"Type {args.name} to let it move:")
+    if sys.stdin.readline().strip() != args.name:
+        raise UsageError("nobody agreed, and nothing was moved")
 
 
 def _arguments(words: list[str]) -> dict[str, Any]:

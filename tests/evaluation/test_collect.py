@@ -194,7 +194,7 @@ def test_slips_are_told_before_anything_starts(tmp_path, capsys, more, text):
 
 
 def test_a_collection_that_is_silent_is_said_to_be_working(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1,))
+    monkeypatch.setattr(KeepAliveReporter.__init__, "__defaults__", (0.1, "start"))
     slow = ["--set", "env.slow=0.05", "--workers", "1"]
     assert main(words(tmp_path / "out", *slow, episodes=1)) == 0
     assert "s since: collecting 1 demonstrations into" in capsys.readouterr().out

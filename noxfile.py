@@ -3,6 +3,7 @@
     nox -s demo [-- --smoke | --full] [--fresh]     from demonstrations to an evaluated policy
     nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
     nox -s nightly [-- PYTEST ARGUMENTS]            the tests that take minutes each
+    nox -s oracles                                  other implementations, again
     nox -s lint | types | layers | bench            one part of it
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -22,8 +24,10 @@ sys.path.insert(0, str(ROOT))
 
 from tools import (  # noqa: E402
     envs,
+    golden,
     lerobot_env,
     needs,
+    oracle_env,
     project,
     rendering,
     shell,
@@ -103,6 +107,34 @@ def environments(session: nox.Session) -> None:
     with Steps(session) as step:
         step("LeRobot", lambda: lerobot_env.prepare(session.log))
         step("demo", lambda: demo_env(session))
+
+
+@nox.session
+def oracles(session: nox.Session) -> None:
+    """What other implementations compute, computed again and compared with the golden files."""
+    with Steps(session) as step:
+        made: dict[Path, Path] = {}
+        by_hand = [p for p in golden.programs(ROOT) if p.environment is None]
+        for program in by_hand:
+            session.log(f"run by hand, as it says: {program.path.relative_to(ROOT)}")
+        alone = oracle_env.VARIABLES
+        with tempfile.TemporaryDirectory() as temporary:
+            for program in golden.programs(ROOT):
+                if program.environment is None:
+                    continue
+                env = oracle_env.ENVIRONMENTS[program.environment](session.log)
+                folder = Path(temporary) / program.golden.parent.parent.name
+                folder.mkdir(exist_ok=True)
+                made[program.golden] = folder
+                words = [program.path, folder]
+                name = program.path.relative_to(ROOT).as_posix()
+                step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT, env=alone))
+            env = oracle_env.prepare(session.log)
+            for committed, folder in made.items():
+                some = ["--some"] if committed in {p.golden for p in by_hand} else []
+                words = ["-m", "tools.golden", folder, committed, *some]
+                name = f"compare {committed.relative_to(ROOT).as_posix()}"
+                step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
 
 
 @nox.session

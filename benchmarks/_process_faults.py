@@ -55,7 +55,7 @@ hooks = ["BlockingHook"]
 inference = dict(
     type="ProgramRunner", task_descriptions={{"1": "swing"}}, async_execution=True,
     record_fps=None, max_publish_step={steps}, control_process=True,
-    operator=dict(type="ProgramArm", folder={folder!r}),
+    operator=dict(type={arm!r}, folder={folder!r}),
     policy=dict(type="HarmfulSwing", folder={folder!r}, orders={orders}))
 """
 START_S, END_S = 120.0, 60.0
@@ -78,7 +78,7 @@ class Program:
         (folder / "program.py").write_text(plugin)
         reads, writes = os.pipe()
         self._orders = os.fdopen(writes, "w", encoding="utf-8", buffering=1)
-        config = CONFIG.format(steps=steps, folder=str(folder), orders=reads)
+        config = CONFIG.format(steps=steps, folder=str(folder), orders=reads, arm=stage.arm)
         (folder / "cfg.py").write_text(config)
         line = ["run", "--config", folder / "cfg.py", "--plugin", folder / "program.py"]
         line += ["--work-dir", folder, *words]

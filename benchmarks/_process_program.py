@@ -20,13 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._robot_faults import Array, BenchArm, Swing
-from fluxvla_core import BaseInferenceRunner
+from benchmarks._robot_faults import ARM, Array, BenchArm, Swing
+from fluxvla_core import BaseInferenceRunner, Frame, Operator
 from fluxvla_core.plugins.registry import HOOKS, OPERATORS, POLICIES, RUNNERS
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.ros2.streams import Ring
 
 PROVOKED, SENT, FLOOD = "provoked", "sent", "flood"
+# Of ``WholeArm``: what it received and when, and what its next ``get_frame`` is to do.
+RECEIVED, BLOCK, KEEP = "received", "block", "keep"
 # How long what blocks does so: longer than any rule waits, and shorter than a person.
 BLOCKED_S = 5.0
 # Lengths of a driver's warnings that fill what the processes share in a second, to the last byte.
@@ -55,6 +57,48 @@ class ProgramArm(BenchArm):
         if self._flood.exists():
             for length in FLOOD_BYTES:
                 DRIVER.warning("x" * length)
+
+
+@OPERATORS.register_module()
+class WholeArm(Operator):
+    """In one process, of the old shape: it cannot be divided, and its state comes with pictures.
+
+    Follows at once, and stores every command and when it came. ``get_frame`` does harm while
+    ``BLOCK`` or ``KEEP`` is there.
+    """
+
+    api = "1.0"
+    embodiment = ARM
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+
+    def connect(self) -> None:
+        self._pose = np.array([0.0, 0.0, 0.5])
+        # Without a buffer: what was sent before a kill is there.
+        self._sent = open(self._folder / SENT, "ab", buffering=0)  # noqa: SIM115
+        self._received = open(self._folder / RECEIVED, "ab", buffering=0)  # noqa: SIM115
+
+    def get_frame(self) -> Frame:
+        for name, harm in ((BLOCK, lambda: time.sleep(BLOCKED_S)), (KEEP, keep_interpreter)):
+            if (self._folder / name).exists():
+                (self._folder / name).unlink()
+                (self._folder / PROVOKED).write_text(str(time.monotonic()))
+                harm()
+        now = time.monotonic()
+        images = {c.name: np.zeros((c.height, c.width, 3), np.uint8) for c in ARM.cameras}
+        return Frame(self._pose.copy(), images, dict.fromkeys(("state", *images), now))
+
+    def send_action(self, action: Array) -> None:
+        self._pose = np.array(action, np.float64)
+        self._sent.write(self._pose.tobytes())
+        self._received.write(np.array([time.monotonic(), *action], np.float64).tobytes())
+
+    def stop(self) -> None:
+        """It rests where its last command is."""
+
+    def close(self) -> None:
+        """The files end with the process."""
 
 
 @POLICIES.register_module()
@@ -174,6 +218,11 @@ def stand_in_for_a_link_whose_thread_ends(policy: HarmfulSwing) -> None:
     Link.receive = receive  # type: ignore[method-assign]
 
 
+def in_get_frame(name: str) -> Callable[[HarmfulSwing], None]:
+    """``WholeArm``, in the control process, does it."""
+    return lambda policy: (policy.folder / name).touch()
+
+
 def block_a_hook(policy: HarmfulSwing) -> None:
     policy.blocks = True
 
@@ -188,4 +237,6 @@ HARMS: Mapping[str, Callable[[HarmfulSwing], None]] = {
     "link is not read": stand_in_for_a_link_that_is_not_read,
     "hook blocks": block_a_hook,
     "link's thread ends": stand_in_for_a_link_whose_thread_ends,
+    "get_frame blocks": in_get_frame(BLOCK),
+    "get_frame keeps the interpreter": in_get_frame(KEEP),
 }

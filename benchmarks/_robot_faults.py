@@ -147,6 +147,8 @@ class Stage:
     arguments: dict[str, Any] = field(default_factory=dict)
     task: str = "1"
     most: int = 1000
+    # What a program of its own drives.
+    arm: str = "ProgramArm"
     more: list[Driver] = field(default_factory=list)
 
     def runner(self) -> BaseInferenceRunner:

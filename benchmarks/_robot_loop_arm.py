@@ -16,17 +16,21 @@ TIMES = "FLUXVLA_BENCH_TIMES"
 """Names the file that ``TimedAloha`` writes."""
 
 
-def proportional_mb() -> float:
-    """Memory of this process in MiB; of what processes share, each counts its part."""
-    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
-    (kib,) = (line.split()[1] for line in lines if line.startswith("Pss:"))
-    return int(kib) / 1024
+def memory_mb() -> dict[str, float]:
+    """Memory of this process in MiB, of ``/proc/self/smaps_rollup`` (proc(5)).
 
-
-def resident_mb() -> float:
-    """Resident memory of this process, in MiB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    Returns:
+        ``resident``: all that is mapped and in memory; ``proportional``: of what n processes share,
+        each counts the n-th part; ``private``: what no other process has mapped.
+    """
+    lines = Path("/proc/self/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]
+    kib = {name: int(value.split()[0]) for name, value in (line.split(":") for line in lines)}
+    sums = {
+        "resident": kib["Rss"],
+        "proportional": kib["Pss"],
+        "private": kib["Private_Clean"] + kib["Private_Dirty"],
+    }
+    return {name: round(value / 1024, 1) for name, value in sums.items()}
 
 
 @OPERATORS.register_module()
@@ -51,7 +55,7 @@ class TimedAloha(AlohaOperator):
             found = {
                 "sent": self.sent,
                 "core_share": round(share, 3),
-                "mb": round(resident_mb(), 1),
+                "mb": memory_mb(),
             }
             Path(os.environ[TIMES]).write_text(json.dumps(found), encoding="utf-8")
             self.sent = []

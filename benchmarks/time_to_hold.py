@@ -3,7 +3,8 @@
     python -m benchmarks.time_to_hold [--rounds 5] [--only WORDS]
 
 The real runner moves an arm of three joints over ROS 2; the faults are provoked for real
-(``_robot_fault_list``, and ``_process_faults`` with a control process). The time is from the fault
+(``_robot_fault_list``; with a control process ``_process_faults``, and ``_whole_faults``, where the
+arm is in that process and stores itself what it receives). The time is from the fault
 to the receipt, in another process, of the first command that is not changed any more. It contains
 what is allowed before something counts as a fault: ``max_age_s`` (0.5 s) of silence,
 ``tracking_time_s`` (0.25 s) away from the command, ``silence_s`` (0.2 s) without the main process.
@@ -20,18 +21,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import _process_faults, _results, _robot_faults
+from benchmarks import _process_faults, _results, _robot_faults, _whole_faults
 from benchmarks._process_faults import PROCESS_FAULTS
 from benchmarks._robot_fault_list import FAULTS
 from benchmarks._robot_faults import Fault, Result, Stage, stage_crew
+from benchmarks._whole_faults import WHOLE_FAULTS
 
-ALL = (*FAULTS, *PROCESS_FAULTS)
+ALL = (*FAULTS, *PROCESS_FAULTS, *WHOLE_FAULTS)
 
 
 def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result:
     """One fault; a machine that stalls stops the arm, rightly, before it is there."""
     for attempt in range(4):
-        if fault in PROCESS_FAULTS:
+        if fault in WHOLE_FAULTS:
+            result = _whole_faults.play(folder / str(attempt), fault)
+        elif fault in PROCESS_FAULTS:
             # Drivers that still know a killed process may keep their pictures from the next one.
             with stage_crew() as fresh:
                 result = _process_faults.play(fresh(folder / str(attempt)), fault)

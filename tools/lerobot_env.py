@@ -11,8 +11,9 @@ installed into the system.
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tools import project, shell, torch_build
@@ -79,20 +80,30 @@ class LeRobotEnv(Env):
         }
 
 
-def prepare(log: Callable[[str], None], root: Path = project.ROOT / ".nox" / "lerobot") -> Env:
-    """Install what is missing; about a minute the first time. Raises StepFailed if it cannot be."""
+def prepare(
+    log: Callable[[str], None],
+    root: Path = project.ROOT / ".nox" / "lerobot",
+    more: Sequence[str] = (),
+) -> Env:
+    """Install what is missing, and ``more``; about a minute the first time.
+
+    Raises:
+        StepFailed: it cannot be installed.
+    """
     env = LeRobotEnv(root)
     version = project.constrained_version("torch")
-    base = {"python": sys.version, "torch": version, "needs": " ".join(NEEDS)}
+    needs = (*NEEDS, *more)
+    base = {"python": sys.version, "torch": version, "needs": " ".join(needs)}
 
     def install_base() -> None:
         # No constraints: they are this project's, and LeRobot's needs are others.
         torch_build.install(env, version, None, log)
-        env.pip_install(*NEEDS, quiet=True)
+        env.pip_install(*needs, quiet=True)
 
     def install_parts(changed: list[str], fresh: bool) -> None:
         env.pip_install("--no-deps", *LEROBOT, quiet=True)
         declare_operators(env)
+        remove_tests(env)
         _link_ffmpeg(env)
         # Some Pythons (Debian's, unless libpython3.x is installed) lack the library it links to.
         env.run("python", "-c", TRY_CODEC, quiet=True, echo=False)
@@ -110,6 +121,12 @@ def declare_operators(env: Env) -> None:
     (module,) = env.root.glob("lib/python*/site-packages/torchvision/extension.py")
     own = module.read_text(encoding="utf-8").partition(DECLARED.splitlines()[1])[0].rstrip()
     module.write_text(f"{own}\n{DECLARED}", encoding="utf-8")
+
+
+def remove_tests(env: Env) -> None:
+    """Remove the package ``tests`` that draccus installs: it would hide this repository's."""
+    for package in env.root.glob("lib/python*/site-packages/tests"):
+        shutil.rmtree(package)
 
 
 def _link_ffmpeg(env: LeRobotEnv) -> None:

@@ -1,13 +1,18 @@
 """Hooks: calls the observers that a config names, and keeps a run safe from them.
 
 What they may observe is :class:`fluxvla_core.contracts.Hook`. pluggy checks each hook's name and
-arguments against it and does the calling. An exception in a hook is reported with the hook's
-origin, and that plugin is left out for the rest of the run: an observer must never end the training
-or the motion that it watches.
+arguments against it and does the calling, for each in a thread of its own: the run hands over what
+happened and goes on. One that raises, ends its thread or falls behind is reported once, with its
+origin, and left out for the rest of the run: an observer must never end, or delay, the training or
+the motion that it watches. What it can still do is keep the interpreter's lock or end the process.
 """
 
 from __future__ import annotations
 
+import math
+import threading
+import time
+from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,28 +33,158 @@ for _function in public_methods(Hook).values():
     _specified(_function)
 
 
+MOST_WAITING = 10_000
+"""Calls that may wait for a hook, whatever its ``budget_s``: what they hold takes memory."""
+_LATE_TWICE_S = 0.2
+
+
 class HookCaller:
     """``call("after_step", step=3, metrics={...})`` reaches every active hook, in config order."""
 
     def __init__(self, context: RunContext, plugins: Iterable[tuple[str, object]] = ()) -> None:
         self._context = context
-        self._managers = [(name, _manager(name, plugin)) for name, plugin in plugins]
+        self._observers = [_Observer(name, plugin) for name, plugin in plugins]
+        self._lock = threading.Lock()
 
     def call(self, hook: str, **arguments: Any) -> None:
-        """Call ``hook`` on each plugin; one that raises is reported and left out from then on."""
-        for entry in list(self._managers):
-            name, manager = entry
-            try:
-                getattr(manager.hook, hook)(context=self._context, **arguments)
-            except Exception as error:  # noqa: BLE001 - an observer never ends what it observes
-                self._managers.remove(entry)
+        """Tell each hook; returns at once, but for ``run_finished``, which waits for them.
+
+        What went wrong with one since the last call is reported, and it is left out from then on.
+        """
+        observers = list(self._observers)
+        for observer in observers:
+            observer.tell(hook, {"context": self._context, **arguments})
+        if hook == "run_finished":
+            for observer in observers:
+                observer.finish()
+        for observer in observers:
+            problem = observer.trouble()
+            if problem and self._remove(observer):
                 self._context.reporter.warn(
-                    f"hook {name}.{hook} raised {type(error).__name__}: {error}; "
-                    f"{name} is left out for the rest of this run"
+                    f"hook {observer.name}.{problem}; "
+                    f"{observer.name} is left out for the rest of this run"
                 )
+            if problem or hook == "run_finished":
+                observer.end()
+
+    def _remove(self, observer: _Observer) -> bool:
+        """Whether it was there: a robot's events come from several threads."""
+        with self._lock:
+            if observer not in self._observers:
+                return False
+            self._observers.remove(observer)
+            return True
+
+    def settle(self) -> None:
+        """Wait until the hooks have been called with all that happened; for tests."""
+        for observer in self._observers:
+            observer.finish()
 
     def __bool__(self) -> bool:
-        return bool(self._managers)
+        return bool(self._observers)
+
+
+class _Observer:
+    """One hook, and the thread that calls it.
+
+    Raises:
+        LoadFailed: it has no method that is a hook, or one with other arguments.
+        ConfigError: its ``budget_s`` is not a positive number.
+    """
+
+    def __init__(self, name: str, plugin: object) -> None:
+        self.name = name
+        self._manager, self._hooks = _manager(name, plugin)
+        self._budget_s = Hook.adapt(plugin).budget_s
+        number = isinstance(self._budget_s, (int, float)) and not isinstance(self._budget_s, bool)
+        if not number or not 0 < self._budget_s < math.inf:
+            raise ConfigError(
+                f"hook {name}: budget_s must be a positive number, got {self._budget_s!r}"
+            )
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[float, str, dict[str, Any]]] = deque()  # the first is under way
+        self._problem = ""
+        self._late_since: float | None = None
+        self._ended = False
+        self._thread: threading.Thread | None = None
+
+    def tell(self, hook: str, arguments: dict[str, Any]) -> None:
+        """Have it called, soon and in another thread, if it has such a method."""
+        if hook not in self._hooks:
+            return
+        with self._changed:
+            if self._ended:
+                return
+            if self._thread is None:
+                target, name = self._call, f"hook-{self.name}"
+                self._thread = threading.Thread(target=target, name=name, daemon=True)
+                try:
+                    self._thread.start()
+                except RuntimeError as error:  # the system has no more of them
+                    self._problem = f"{hook} raised {type(error).__name__}: {error}"
+                    return
+            self._waiting.append((time.monotonic(), hook, arguments))
+            self._changed.notify_all()
+
+    def trouble(self) -> str:
+        """What is wrong with it: ``after_step raised ...``; empty if nothing is.
+
+        Late is who is seen late twice, a moment apart: after a pause of the whole process all are.
+        """
+        with self._changed:
+            if self._problem or not self._waiting:
+                self._late_since = None
+                return self._problem
+            now = time.monotonic()
+            since, hook, _ = self._waiting[0]
+            if len(self._waiting) > MOST_WAITING:
+                self._problem = f"{hook} keeps {len(self._waiting)} calls waiting"
+            elif now - since <= self._budget_s:
+                self._late_since = None
+            elif self._late_since is None:
+                self._late_since = now
+            elif now - self._late_since >= _LATE_TWICE_S:
+                self._problem = self._slow(hook, now - since)
+            return self._problem
+
+    def finish(self) -> None:
+        """Wait until it has been called with all that it was told, for its budget at most."""
+        with self._changed:
+            done = lambda: not self._waiting or bool(self._problem)  # noqa: E731
+            if not self._changed.wait_for(done, min(self._budget_s, threading.TIMEOUT_MAX)):
+                since, hook, _ = self._waiting[0]
+                self._problem = self._slow(hook, time.monotonic() - since)
+
+    def end(self) -> None:
+        """Call it no more; a call that is under way is left to itself."""
+        with self._changed:
+            self._ended = True
+            self._waiting.clear()
+            self._changed.notify_all()
+
+    def _slow(self, hook: str, seconds: float) -> str:
+        return f"{hook} is {seconds:.1f} s behind the run, and may be {self._budget_s:g} s"
+
+    def _call(self) -> None:
+        """The thread's life."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._ended)
+                if self._ended:
+                    return
+                _, hook, arguments = self._waiting[0]
+            try:
+                getattr(self._manager.hook, hook)(**arguments)
+                problem = ""
+            except BaseException as error:  # noqa: BLE001 - an observer never ends what it observes
+                problem = f"{hook} raised {type(error).__name__}: {error}"
+            with self._changed:
+                if not self._ended:
+                    self._waiting.popleft()
+                self._problem = self._problem or problem
+                self._changed.notify_all()
+                if self._problem:
+                    return
 
 
 def build_hooks(context: RunContext) -> HookCaller:
@@ -72,7 +207,8 @@ def build_hooks(context: RunContext) -> HookCaller:
     return HookCaller(context, plugins)
 
 
-def _manager(name: str, plugin: object) -> pluggy.PluginManager:
+def _manager(name: str, plugin: object) -> tuple[pluggy.PluginManager, frozenset[str]]:
+    """What calls a hook's methods, and their names."""
     # One manager for each plugin: within one, pluggy stops at the first exception.
     manager = pluggy.PluginManager("fluxvla")
     manager.add_hookspecs(Hook)
@@ -86,7 +222,7 @@ def _manager(name: str, plugin: object) -> pluggy.PluginManager:
         manager.register(marked, name)
     except pluggy.PluginValidationError as error:
         raise LoadFailed(f"hook plugin {name}: {error}") from error
-    return manager
+    return manager, frozenset(marked.names)
 
 
 class _Marked:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 
+from fluxvla_core import DATASETS, OPERATORS, RUNNERS
 from fluxvla_core.cli.config_commands import literal
 from fluxvla_core.config.overrides import parse_value
 
@@ -116,3 +120,49 @@ def test_a_config_without_sections(fluxvla: Fluxvla, write: Write) -> None:
 )
 def test_what_is_printed_can_be_typed_again(value: object) -> None:
     assert parse_value(literal(value)) == value
+
+
+def test_diff_of_files(fluxvla: Fluxvla, write: Write) -> None:
+    write("d.toml", "_base_ = 'c.py'\n[runner]\nmax_epochs = 7\n[eval]\nseeds = 3\n")
+    ended = fluxvla("config", "diff", "c.py", "d.toml")
+    assert (ended.code, ended.out, ended.err) == (
+        1,
+        "- runner.max_epochs = 1  # c.py:3\n+ runner.max_epochs = 7  # d.toml:3\n"
+        "+ eval.seeds = 3         # d.toml:5\n",
+        "",
+    )
+    same = fluxvla("config", "diff", "c.py", "c.py")
+    assert (same.code, same.out, same.err) == (0, "", "")
+    assert fluxvla("config", "diff", "c.py", "gone.py").code == 2
+
+
+def test_diff_of_runs(run: Fluxvla, fluxvla: Fluxvla) -> None:
+    """A work dir, or what a checkpoint keeps, says where each value was written then."""
+    for name, epochs in (("a", 1), ("b", 2)):
+        words = ("--section", "runner", "--work-dir", name, "--set", f"runner.max_epochs={epochs}")
+        assert run("--config", "c.py", *words).code == 0
+    ended = fluxvla("config", "diff", "a", "b/config.resolved.json")
+    assert ended.code == 1
+    assert ended.out == (
+        "- runner.max_epochs = 1  # --set runner.max_epochs=1\n"
+        "+ runner.max_epochs = 2  # --set runner.max_epochs=2\n"
+    )
+    assert fluxvla("config", "diff", "c.py", "a").code == 0
+    ended = fluxvla("config", "diff", "c.py", ".")
+    assert ended.code == 2
+    assert "this is a directory, not a config file" in ended.err
+
+
+def test_schema(fluxvla: Fluxvla, write: Write) -> None:
+    words = ("config", "schema", "--plugin", "toy.py")
+    printed = json.loads(fluxvla(*words).out)
+    assert printed["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert printed["$defs"]["whole:runners:ToyTrainRunner"]["required"] == ["type", "max_epochs"]
+    for registry in (RUNNERS, OPERATORS, DATASETS):
+        for name in ("ToyDataset", "ToyOperator", "ToyTrainRunner", "ToyEvalRunner"):
+            registry.unregister(name)
+    ended = fluxvla(*words, "--out", "s.json")
+    assert (ended.code, ended.out) == (0, "wrote s.json\n")
+    assert json.loads(Path("s.json").read_text()) == printed
+    ended = fluxvla("config", "schema", "--out", "gone/s.json")
+    assert (ended.code, ended.err) == (2, "--out gone/s.json: No such file or directory\n")

@@ -416,7 +416,7 @@ def test_two_distributions_with_one_name(write: Write, install: Install) -> None
     install("acme-toy", entry_points=points)
     text = findings(GOOD, write)
     assert "'ToyOperator' is provided by acme-toy 1.0 (toy.robot:ToyOperator), fluxvla-toy" in text
-    assert "write type='<distribution>:ToyOperator' to choose, or uninstall one" in text
+    assert "write type='acme-toy:ToyOperator' or type='fluxvla-toy:ToyOperator' to choose" in text
     text = GOOD.replace("'ToyOperator'", "'acme-toy:ToyOperator'")
     checked = check_config(load_config(write("c.py", text)))
     assert checked.uses[-1].found.origin == "acme-toy 1.0"

@@ -56,7 +56,10 @@ NO_INDEX = (
 )
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+PUBLISHED = "fetches published weights of several GB; the plugin's tests run it on tiny ones"
+FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
+WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
     (page, line): why
     for why, lines in {
@@ -82,8 +85,15 @@ NOT_RUN: dict[tuple[str, str], str] = {
             ("plugins/fluxvla-ddp/README.md", "fluxvla run --config FILE --nproc 2"),
             ("plugins/fluxvla-fsdp/README.md", "fluxvla run --config FILE --nproc 2"),
         ],
+        FOLDER: [
+            (
+                "plugins/fluxvla-models/README.md",
+                "fluxvla import-checkpoint FOLDER work/imported --embodiment arm.json --rate 50",
+            ),
+        ],
         NO_INDEX: [
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
+            ("plugins/fluxvla-gr00t/README.md", "pip install fluxvla-gr00t 'fluxvla-core[hub]'"),
             (
                 "plugins/fluxvla-gymnasium/README.md",
                 "pip install fluxvla-gymnasium gym-aloha        "
@@ -99,7 +109,14 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "pip install 'fluxvla-metaworld[metaworld]'        "
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
+            ("plugins/fluxvla-latency/README.md", "pip install fluxvla-latency"),
+            ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
+            ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
+            (
+                "plugins/fluxvla-rerun/README.md",
+                "pip install fluxvla-rerun        # with rerun-sdk, 170 MB",
+            ),
             (
                 "plugins/fluxvla-smolvla/README.md",
                 "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
@@ -110,6 +127,38 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "plugins/fluxvla-smolvla/README.md",
                 "fluxvla import-checkpoint hf:OWNER/my_smolvla policy --tokenizer tokenizer "
                 "--embodiment dataset --rate 30 \\",
+            ),
+        ],
+        WEIGHTS: [
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla import-checkpoint models/openvla-7b-oft-finetuned-libero-spatial policy "
+                "--embodiment libero.json",
+            ),
+            (
+                "plugins/fluxvla-openvla/README.md",
+                "fluxvla openvla-oft models/openvla-7b models/openvla-oft-libero --robot libero",
+            ),
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla import-checkpoint hf:lerobot/pi05_libero pi05 --tokenizer paligemma "
+                "--embodiment robot.json --rate 10",
+            ),
+            (
+                "plugins/fluxvla-pi/README.md",
+                "fluxvla export work_dirs/pi05 exported --format lerobot",
+            ),
+        ],
+        PUBLISHED: [
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_gr00t policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 20",
+            ),
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla run --config configs/gr00t_n15_aloha.py --section runner --nproc 8 "
+                "--set model.pretrained_name_or_path=hf:nvidia/GR00T-N1.5-3B",
             ),
         ],
         EXAMPLE: [

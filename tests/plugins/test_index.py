@@ -44,6 +44,14 @@ def test_a_corrupt_file_is_reported_and_hides_nothing(install, broken, reason):
     assert reason in line
 
 
+def test_a_version_that_is_missing_is_reported(install):
+    info = install("fluxvla-bare", entry_points=GOOD)
+    (info / "METADATA").write_text("Name: fluxvla-bare\n")
+    _metadata.index.cache_clear()
+    assert any("METADATA has no Version" in b for b in _metadata.index().broken)
+    assert ("fluxvla.operators", "GoodOperator") not in _metadata.index().plugins
+
+
 def test_missing_metadata_is_reported(install):
     install("fluxvla-bare", entry_points=GOOD, metadata=False)
     assert any("METADATA is missing or has no Name" in b for b in _metadata.index().broken)

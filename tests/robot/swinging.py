@@ -81,7 +81,7 @@ class SwingRunner(BaseInferenceRunner):
 CONFIG = """
 inference = dict(
     type="SwingRunner", task_descriptions={{"1": "swing to and fro"}}, record_fps=None,
-    max_publish_step={steps}, fault={fault!r},
+    max_publish_step={steps}, fault={fault!r}, control_process={control},
     operator=dict(type="LoggedArm", log={log!r}, slow_stop={slow_stop}))
 """
 
@@ -95,6 +95,7 @@ class Swinging:
         slow_stop: seconds that the arm's ``stop`` takes.
         steps: commands of an episode.
         fault: what the policy does in its sixth answer and every later one, in Python.
+        control: the runner's ``control_process``.
         terminal: give it a terminal of its own, with a person (``type``) at it.
     """
 
@@ -106,11 +107,14 @@ class Swinging:
         steps: int = 10000,
         terminal: bool = False,
         fault: str = "",
+        control: bool | None = None,
     ) -> None:
         self.log, self.work_dir = folder / "log", folder / "work"
         (folder / "arm.py").write_text(PLUGIN)
         (folder / "cfg.py").write_text(
-            CONFIG.format(log=str(self.log), slow_stop=slow_stop, steps=steps, fault=fault)
+            CONFIG.format(
+                log=str(self.log), slow_stop=slow_stop, steps=steps, fault=fault, control=control
+            )
         )
         line = ["run", "--config", folder / "cfg.py", "--plugin", folder / "arm.py"]
         line += ["--work-dir", self.work_dir, *words]

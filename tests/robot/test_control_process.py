@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 
 from fluxvla_core import OPERATORS, BaseInferenceRunner, RunContext
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.operators import Camera, EmbodimentSpec, Frame, Joint, Operator
 from fluxvla_core.robot.control.clock import SimulatedClock
+from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.recording.recorded import open_recording
 
 ARM = EmbodimentSpec("arm", (Joint("j", "rad", -1, 1, 2, 10),), (Camera("front", 8, 8),), 50)
 
 
 class Arm(Operator):
-    """An arm that cannot be divided."""
+    """An arm of the old shape, which cannot be divided."""
 
     api = "1.0"
     embodiment = ARM
@@ -47,6 +48,37 @@ class DividedArm(Arm):
         return self
 
 
+class Recorded(Arm):
+    follows_commands = False
+
+
+class OwnClock(Arm):
+    class clock:
+        lockstep = False
+        now = sleep_until = None
+
+
+class Placed(Arm):
+    def begin_episode(self, instruction, episode):
+        """Puts its objects in place."""
+
+
+class Connecting:
+    """As the specification has it, with an embodiment that it knows once it is connected."""
+
+    def __init__(self):
+        self.embodiment = ARM
+
+    def get_frame(self):
+        """Nothing."""
+
+    def send_action(self, action):
+        """Goes nowhere."""
+
+    def stop(self):
+        """Is at rest."""
+
+
 class Simulated(DividedArm):
     def __init__(self):
         self.clock = SimulatedClock()
@@ -54,7 +86,7 @@ class Simulated(DividedArm):
 
 @pytest.fixture(autouse=True)
 def registered():
-    classes = [Arm, DividedArm, Simulated]
+    classes = [Arm, DividedArm, Simulated, Recorded, OwnClock, Placed, Connecting]
     for cls in classes:
         OPERATORS.register_module()(cls)
     yield
@@ -83,6 +115,38 @@ def test_an_operator_that_can_be_divided_is_divided(tmp_path):
     assert not runner(tmp_path, {"type": "DividedArm"}, control_process=False).divided
 
 
+def test_one_that_cannot_be_divided_runs_there_as_a_whole(tmp_path):
+    made = runner(tmp_path, {"type": "Arm"})
+
+    assert made.divided
+    assert isinstance(made.ros_operator, RemoteOperator)
+    assert (made.robot.name, made.embodiment) == ("Arm", ARM)
+    alone = runner(tmp_path, {"type": "Arm"}, control_process=False)
+    assert not alone.divided
+    assert isinstance(alone.ros_operator, Arm)
+
+
+@pytest.mark.parametrize("table", [{}, {"type": "Nobody"}, {"type": 3}])
+def test_an_operator_that_is_none_is_an_error_as_ever(tmp_path, table):
+    with pytest.raises(FluxError) as caught:
+        runner(tmp_path, table)
+    with pytest.raises(type(caught.value)) as alone:
+        runner(tmp_path, table, control_process=False)
+    assert str(caught.value) == str(alone.value)
+
+
+def test_one_that_cannot_be_divided_may_be_a_simulation(tmp_path):
+    assert runner(tmp_path, {"type": "Placed"}).robot.simulated
+    assert not runner(tmp_path, {"type": "Arm"}).robot.simulated
+
+
+def test_what_is_wrong_with_one_is_found_before_there_is_another_process(tmp_path):
+    wider = EmbodimentSpec("arm", (Joint("j", "rad", -1, 1, 9, 10),), ARM.cameras, 50)
+
+    with pytest.raises(FluxError, match="the config's embodiment widens velocity"):
+        runner(tmp_path, {"type": "Arm"}, embodiment=wider)
+
+
 def test_a_runner_that_only_observes_in_its_own_way_is_divided(tmp_path):
     assert runner(tmp_path, {"type": "DividedArm"}, OwnObservation).divided
 
@@ -98,10 +162,13 @@ def local_arm():
 @pytest.mark.parametrize(
     ("operator", "cls", "why"),
     [
-        ({"type": "Arm"}, BaseInferenceRunner, "Arm cannot be divided"),
+        ({"type": "Arm"}, OwnObservation, "OwnObservation reads the robot by a method of its own"),
+        ({"type": "Recorded"}, BaseInferenceRunner, "Recorded follows no commands"),
+        ({"type": "OwnClock"}, BaseInferenceRunner, "OwnClock .* has a clock of its own"),
+        ({"type": "Connecting"}, BaseInferenceRunner, "Connecting connects in its constructor"),
         (DividedArm(), BaseInferenceRunner, "DividedArm is an object, not a table"),
         ({"type": "Simulated"}, BaseInferenceRunner, "stands still between commands"),
-        ({"type": "DividedArm"}, OwnSending, "OwnSending has an _execute_actions of its own"),
+        ({"type": "DividedArm"}, OwnSending, "OwnSending sends commands by a method of its own"),
         (local_arm, BaseInferenceRunner, "Local is defined where no other process can import it"),
     ],
 )

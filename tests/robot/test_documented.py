@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks._process_faults import PROCESS_FAULTS
-from benchmarks._robot_fault_list import FAULTS
+from benchmarks.time_to_hold import ALL
 from fluxvla_core.operators import SafetySettings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +53,7 @@ def test_every_test_that_the_page_names_exists(page):
 
 
 def test_the_table_has_the_faults_that_are_provoked_and_nothing_blank(rows):
-    assert [row[0] for row in rows] == [fault.name for fault in (*FAULTS, *PROCESS_FAULTS)]
+    assert [row[0] for row in rows] == [fault.name for fault in ALL]
     for row in rows:
         assert len(row) == 5
         assert all(row), row

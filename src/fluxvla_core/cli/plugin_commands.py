@@ -1,32 +1,21 @@
-"""``fluxvla plugins list``, ``show`` and ``doctor``.
-
-``list`` reads metadata alone, ``show`` the source of a class. ``doctor`` looks for what is wrong
-with the installation: in metadata and sources first, which takes a second; then each plugin is
-imported, in processes that may break.
-"""
+"""``fluxvla plugins list`` and ``show``: the one reads metadata, the other a class's source."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.cli.main import COMMANDS, STRICT
-from fluxvla_core.cli.parser import Parser, positive
+from fluxvla_core.cli.parser import Parser
 from fluxvla_core.cli.terminal import say
-from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, MissingPlugin, PluginError, nearest
+from fluxvla_core.errors import MissingPlugin, PluginError, nearest
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin, canonical, index
 from fluxvla_core.registries import GROUPS, PREFIX, REGISTRIES
 
 if TYPE_CHECKING:
     from fluxvla_core.config.signature import Signature
-
-IMPORT_LIMIT_S = 120
-"""Seconds that ``doctor`` gives one import."""
 
 
 class List:
@@ -68,10 +57,14 @@ class Show:
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument("name", help="a class's name, or distribution:name")
+        parser.add_argument("--json", action="store_true", help="for machines")
 
     def run(self, args: argparse.Namespace) -> int:
         found = providers(args.name)
-        say("\n\n".join(describe(plugin) for plugin in found))
+        if args.json:
+            say(json.dumps([record(plugin) for plugin in found], indent=1))
+        else:
+            say("\n\n".join(describe(plugin) for plugin in found))
         return 0
 
 
@@ -106,13 +99,10 @@ def providers(name: str) -> list[Plugin]:
 
 def describe(plugin: Plugin) -> str:
     """Description of a plugin without importing it."""
-    from fluxvla_core.config.resolve import installed
-
     lines = [f"{plugin.group} {plugin.name}", f"  provided by  {plugin.origin} ({plugin.value})"]
-    try:
-        signature = installed(plugin).signature
-    except PluginError as error:
-        return "\n".join([*lines, f"  cannot work  {error.what}"])
+    signature, problem = _signature(plugin)
+    if problem:
+        return "\n".join([*lines, f"  cannot work  {problem}"])
     if signature is None:
         return "\n".join([*lines, "  source       cannot be read; its keys are not checked"])
     lines.append(f"  defined at   {signature.place}")
@@ -125,6 +115,55 @@ def describe(plugin: Plugin) -> str:
     return "\n".join([*lines, *_keys(signature)])
 
 
+def record(plugin: Plugin) -> dict[str, Any]:
+    """JSON values for ``plugins show --json``; docs/writing-a-plugin.md has its keys."""
+    from fluxvla_core.config.resolve import INJECTED
+
+    signature, problem = _signature(plugin)
+    found: dict[str, Any] = {
+        **plugin.to_dict(),
+        "problem": problem or None,
+        "defined_at": None,
+        "contract": None,
+        "about": None,
+        "parameters": None,
+        "takes_others": None,
+    }
+    if signature is not None:
+        meanings = signature.meanings
+        found |= {
+            "defined_at": signature.place,
+            "contract": signature.api,
+            "about": signature.doc or None,
+            "parameters": [
+                {
+                    "name": one.name,
+                    "required": one.required,
+                    "injected": one.name in INJECTED,
+                    "annotation": one.annotation,
+                    "default": one.default,
+                    "description": meanings.get(one.name),
+                }
+                for one in signature.parameters
+            ],
+            "takes_others": signature.open,
+        }
+    return found
+
+
+def _signature(plugin: Plugin) -> tuple[Signature | None, str]:
+    """The signature of a plugin's class, if it can be read, and why the plugin cannot work."""
+    from fluxvla_core.config.resolve import installed
+    from fluxvla_core.plugins.load import unread_group
+
+    if plugin.group not in GROUPS:
+        return None, unread_group(plugin)
+    try:
+        return installed(plugin).signature, ""
+    except PluginError as error:
+        return None, error.what
+
+
 def _process(plugin: Plugin) -> str:
     """What sends an operator's commands (docs/control.md, Control process)."""
     from fluxvla_core.config.signature import implements
@@ -135,8 +174,8 @@ def _process(plugin: Plugin) -> str:
     if divided:
         return "can be divided: commands are sent from a process of its own"
     return (
-        "runs in one process with the policy: a policy that keeps the interpreter's lock delays "
-        "commands"
+        "runs as a whole in a process of its own, which sends commands and also copies its images: "
+        "its own code that keeps the interpreter's lock delays commands"
     )
 
 
@@ -158,100 +197,3 @@ def _keys(signature: Signature) -> list[str]:
     if signature.open:
         lines.append("    ...   [takes further keys, which cannot be checked]")
     return lines
-
-
-class Doctor:
-    api = "1.0"
-    help = (
-        "Look for distributions that cannot be read, names that collide, requirements on the "
-        "core that do not hold, unknown groups, syntax errors, and entry points to nothing; then "
-        "import every plugin, each distribution in a process of its own, and check its classes "
-        "against their contracts."
-    )
-
-    def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument(
-            "--no-import", action="store_true", help="look at metadata and sources only"
-        )
-        parser.once(
-            "--limit",
-            type=positive,
-            default=IMPORT_LIMIT_S,
-            metavar="SECONDS",
-            help=f"how long one import may take (default {IMPORT_LIMIT_S})",
-        )
-
-    def run(self, args: argparse.Namespace) -> int:
-        healthy = True
-        for text in self._findings(args):
-            healthy = False
-            say(text)
-        if not healthy:
-            return EXIT_FAILED
-        plugins = [p for many in index().plugins.values() for p in many]
-        dists = {p.dist for p in plugins}
-        looked = " in metadata and sources" if args.no_import else ""
-        say(f"no problems{looked}: {len(plugins)} plugin(s) of {len(dists)} distribution(s)")
-        return EXIT_DONE
-
-    def _findings(self, args: argparse.Namespace) -> Iterator[str]:
-        yield from collisions()
-        importable = []
-        for plugin in _read_groups():
-            text = _cannot_work(plugin)
-            if text is None:
-                importable.append(plugin)
-            else:
-                yield f"{plugin.group}: {text}"
-        if not args.no_import:
-            from fluxvla_core.plugins import import_check
-
-            traces = os.environ.get(STRICT) == "1"
-            yield from import_check.problems(importable, args.limit, traces, _show_progress)
-
-
-def collisions() -> Iterator[str]:
-    """One line for each distribution, group or name that the index has trouble with."""
-    yield from (f"cannot be read: {line}" for line in index().broken)
-    for (group, name), many in sorted(index().plugins.items()):
-        if group not in GROUPS:
-            yield from (_unknown_group(plugin) for plugin in many)
-            continue
-        if len(many) > 1:
-            who = ", ".join(p.origin for p in many)
-            yield (
-                f"{group}: {name!r} is provided by {who}; "
-                f"write type='<distribution>:{name}' to choose, or uninstall one"
-            )
-        if group == PREFIX + "commands" and name in COMMANDS:
-            yield f"{many[0].origin}: the command {name!r} is the core's own; rename it"
-
-
-def _read_groups() -> Iterator[Plugin]:
-    """Every plugin in a group that the core reads."""
-    for (group, _), many in sorted(index().plugins.items()):
-        if group in GROUPS:
-            yield from many
-
-
-def _cannot_work(plugin: Plugin) -> str | None:
-    from fluxvla_core.config.resolve import installed
-
-    try:
-        installed(plugin)
-    except PluginError as error:
-        from fluxvla_core.plugins.import_check import in_one_line
-
-        return in_one_line(error)
-    return None
-
-
-def _show_progress(plugins: Sequence[Plugin]) -> None:
-    if sys.stderr.isatty():
-        say(f"importing {plugins[0].origin} ({len(plugins)} plugin(s)) ...", sys.stderr)
-
-
-def _unknown_group(plugin: Plugin) -> str:
-    near = nearest(plugin.group, GROUPS)
-    hint = f"; did its author mean {near!r}?" if near else ""
-    return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"

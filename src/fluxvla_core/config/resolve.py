@@ -18,8 +18,8 @@ from fluxvla_core.errors import (
     nearest,
 )
 from fluxvla_core.plugins import first_party
-from fluxvla_core.plugins._metadata import Plugin, canonical
-from fluxvla_core.plugins.load import LIST, find, locate, unmet
+from fluxvla_core.plugins._metadata import Plugin
+from fluxvla_core.plugins.load import LIST, core_provides, find, in_unread_group, locate, unmet
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import PREFIX, check_api
 
@@ -90,8 +90,8 @@ def resolve(name: str, registry: str | None = None) -> Found:
     """
     if registry is None:
         registry = _only_registry(name)
-    elif not _has(registry, name):
-        others = [r for r in SEARCHED if _has(r, name)]
+    elif name not in BY_NAME[registry]:
+        others = [r for r in SEARCHED if name in BY_NAME[r]]
         if others:
             raise MissingPlugin(
                 f"{name!r} is one of {PREFIX}{others[0]}, and this key takes {PREFIX}{registry}"
@@ -152,8 +152,9 @@ def installed(plugin: Plugin) -> Found:
 
 
 def _only_registry(name: str) -> str:
-    """The one registry that has ``name``."""
-    hits = [r for r in SEARCHED if _has(r, name)]
+    """The one registry that has ``name``, or the one in which the core has it."""
+    hits = [r for r in SEARCHED if name in BY_NAME[r]]
+    hits = [r for r in hits if core_provides(PREFIX + r, name)] or hits
     if len(hits) == 1:
         return hits[0]
     if hits:
@@ -162,6 +163,9 @@ def _only_registry(name: str) -> str:
             next="write '<distribution>:<name>', or put it under a key that says it",
         )
     short = name.rpartition(":")[2]
+    unread = in_unread_group(short)
+    if unread:
+        raise MissingPlugin(f"no plugin named {name!r} in any registry; {unread}", next=LIST)
     for registry in SEARCHED:
         owner = first_party.owner(registry, short)
         if owner:
@@ -174,11 +178,3 @@ def _only_registry(name: str) -> str:
     near = nearest(short, sorted(names))
     hint = f"; did you mean {near!r}?" if near else ""
     raise MissingPlugin(f"no plugin named {name!r} in any registry{hint}", next=LIST)
-
-
-def _has(registry: str, name: str) -> bool:
-    dist, _, short = name.rpartition(":")
-    if not dist:
-        return name in BY_NAME[registry]
-    providers = BY_NAME[registry].installed().get(short, ())
-    return any(canonical(p.dist) == canonical(dist) for p in providers)

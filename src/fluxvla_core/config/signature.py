@@ -52,9 +52,34 @@ class Parameter:
         """Its annotation and default as written: ``: int = 3``."""
         if isinstance(self.stated, str):
             return self.stated
-        annotation, default = self.stated
-        left = f": {ast.unparse(annotation)}" if annotation else ""
-        return f"{left} = {ast.unparse(default)}" if default else left
+        left = f": {self.annotation}" if self.annotation else ""
+        return f"{left} = {self.default}" if self.default else left
+
+    @property
+    def annotation(self) -> str | None:
+        """Its annotation as source; None if it has none."""
+        return self._part(0)
+
+    @property
+    def default(self) -> str | None:
+        """Its default as source; None if it has none."""
+        return self._part(1)
+
+    def _part(self, index: int) -> str | None:
+        part = self.nodes[index]
+        return ast.unparse(part) if part else None
+
+    @property
+    def nodes(self) -> tuple[ast.expr | None, ast.expr | None]:
+        """Its annotation and default as nodes; what cannot be parsed (a repr) is None."""
+        if not isinstance(self.stated, str):
+            return self.stated
+        with suppress(SyntaxError):
+            stated = ast.parse(f"def f({self.name}{self.stated}): ...").body[0]
+            if isinstance(stated, ast.FunctionDef):
+                spec = stated.args
+                return spec.args[0].annotation, spec.defaults[0] if spec.defaults else None
+        return None, None
 
 
 @dataclass(frozen=True)
@@ -170,7 +195,7 @@ def table_of(parameter: Parameter) -> Signature | None:
     if not typed and (not known or not _is_dataclass_source(source) or _init_of(source.node)):
         return None
     fields = _fields(order, _is_typed_dict if typed else _is_dataclass_source)
-    return Signature(source.node.name, source.place, fields)
+    return Signature(source.node.name, source.place, fields, documented=lambda: _meanings(order))
 
 
 def read_help(plugin: Plugin) -> str:

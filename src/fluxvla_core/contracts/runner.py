@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fluxvla_core.contracts.frame import Observation
+    from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 
 class Runner(Contract):
@@ -59,18 +60,33 @@ class Hook(Contract):
     A method may take any subset of its arguments, by name. A hook is active only where a config
     names it (``hooks = [dict(type="LatencyLog", every=10)]``): installing a package never changes
     what a run does. In training hooks are called on rank 0. ``context`` is the ``RunContext``.
+
+    Every hook is called in a thread of its own, in the order of what happened and a moment after
+    it, and never keeps the run waiting. One that raises, or is more than ``budget_s`` behind, is
+    reported once and left out for the rest of the run.
     """
 
     _any_arguments: ClassVar[bool] = True
 
-    def run_started(self, context: Any) -> None:
-        """Once, after everything is built and before the first unit of work."""
+    @attribute
+    def budget_s(self) -> float:
+        """Seconds that a call may take, with those that wait before it; 2 by default.
+
+        A hook that uploads checkpoints says more. At the end of a run it is waited for as long.
+        """
+        return 2.0
+
+    def run_started(self, context: Any, embodiment: EmbodimentSpec | None) -> None:
+        """Once, when everything is built and the first unit of work begins.
+
+        ``embodiment`` is the robot's; None in training.
+        """
 
     def run_finished(self, context: Any, outcome: str) -> None:
         """Once, always, also after an error; ``outcome``: ``ok``, ``interrupted`` or ``failed``."""
 
     def before_step(self, context: Any, step: int) -> None:
-        """Before optimizer step ``step`` (counted from 1) reads its first batch."""
+        """When optimizer step ``step`` (counted from 1) begins."""
 
     def after_step(self, context: Any, step: int, metrics: Mapping[str, float]) -> None:
         """After each step whose metrics were fetched (every log interval)."""
@@ -78,19 +94,38 @@ class Hook(Contract):
     def checkpoint_saved(self, context: Any, path: Path, step: int) -> None:
         """After a checkpoint directory has its final name."""
 
-    def episode_started(self, context: Any, task: str) -> None:
-        """Before the first observation of an episode on a robot."""
+    def episode_started(self, context: Any, task: str, stamp: float) -> None:
+        """When an episode on a robot begins, before its first observation.
 
-    def observed(self, context: Any, observation: Observation) -> None:
+        Every ``stamp`` is in seconds on the robot's clock.
+        """
+
+    def observed(self, context: Any, observation: Observation, stamp: float) -> None:
         """After each observation that a policy is asked with; its arrays are read-only."""
 
-    def inferred(self, context: Any, chunk: npt.NDArray[np.float64], latency_s: float) -> None:
+    def inferred(
+        self, context: Any, chunk: npt.NDArray[np.float64], latency_s: float, stamp: float
+    ) -> None:
         """After each answer of a policy: ``(T, D)`` physical units, read-only, and its duration."""
 
-    def action_sent(self, context: Any, action: npt.NDArray[np.float64], stamp: float) -> None:
-        """After each command, as it was sent: ``(D,)`` physical units, read-only."""
+    def action_sent(
+        self,
+        context: Any,
+        action: npt.NDArray[np.float64],
+        stamp: float,
+        target: npt.NDArray[np.float64],
+        state: npt.NDArray[np.float64] | None,
+    ) -> None:
+        """After each command, as it was sent: ``(D,)`` physical units; all arrays are read-only.
 
-    def episode_finished(self, context: Any, reason: str) -> None:
+        ``target`` is the ``(D,)`` command before filters and limits, ``state`` the ``(state_dim,)``
+        state if it was read for this command.
+        """
+
+    def stopped(self, context: Any, rule: str, problem: str, stamp: float) -> None:
+        """After a safe stop before the task was over: the safety rule, and what it saw."""
+
+    def episode_finished(self, context: Any, reason: str, stamp: float) -> None:
         """After the safe stop that ends every episode; ``reason`` says what ended it."""
 
     @classmethod

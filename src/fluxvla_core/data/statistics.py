@@ -237,17 +237,21 @@ def make_affine(
     who: str,
     std_floor: float = 0.0,
     norm_mask: Sequence[bool] | None = None,
+    epsilon: float = EPS,
+    epsilon_if_zero: bool = False,
 ) -> Affine:
     """Compute offset and scale from one statistics entry.
 
     Args:
         stats: ``mean``, ``std``, ``min``, ``max``, ``q01``, ``q99``: ``(D,)`` or ``(T, D)``;
             optionally ``relative`` ``(D,)``.
-        norm_type: ``mean_std``: (x - mean) / (std + 1e-6); ``quantile`` and ``min_max``:
-            2 (x - low) / (high - low + 1e-6) - 1; ``none``: x.
+        norm_type: ``mean_std``: (x - mean) / (std + epsilon); ``quantile`` and ``min_max``:
+            2 (x - low) / (high - low + epsilon) - 1; ``none``: x.
         std_floor: no dimension is divided by less than this, in the data's units: a joint that
             hardly moved in the demonstrations otherwise turns noise into huge values.
         norm_mask: ``(D,)``; False leaves a dimension as it is.
+        epsilon: 1e-6 in openpi, 1e-8 in LeRobot.
+        epsilon_if_zero: ranges of ``quantile`` and ``min_max`` get it only where they are 0.
 
     Raises:
         ConfigError: a statistic is missing, or the mask has another length.
@@ -263,11 +267,14 @@ def make_affine(
     if norm_type == "none":
         offset, scale = np.zeros_like(mean), np.ones_like(mean)
     elif norm_type == "mean_std":
-        offset, scale = mean, np.maximum(_entry(stats, "std", who), std_floor) + EPS
+        offset, scale = mean, np.maximum(_entry(stats, "std", who), std_floor) + epsilon
     else:
         low, high = (_entry(stats, name, who) for name in _RANGES[norm_type])
-        scale = np.maximum((high - low + EPS) / 2, std_floor)
-        offset = _center(low, high, scale)
+        span = high - low
+        half = (np.where(span == 0, epsilon, span) if epsilon_if_zero else span + epsilon) / 2
+        scale = np.maximum(half, std_floor)
+        # ``low`` maps to -1 unless the floor widened the range; then its middle maps to 0.
+        offset = np.where(scale > half, (low + high) / 2, low + scale)
     if norm_mask is not None:
         mask = np.asarray(norm_mask, bool)
         if mask.shape != offset.shape[-1:]:
@@ -335,12 +342,6 @@ def find_idle_dimensions(
             yield IdleDimension(
                 name, spread[step, d], scale[step, d], blown_up, bool(rare[step, d])
             )
-
-
-def _center(low: Floats, high: Floats, scale: Floats) -> Floats:
-    """``low`` maps to -1 unless the floor widened the range; then its middle maps to 0."""
-    widened = scale > (high - low + EPS) / 2
-    return np.where(widened, (low + high) / 2, low + scale)
 
 
 def _entry(stats: Mapping[str, Any], name: str, who: str) -> Floats:

@@ -19,7 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.registries import PREFIX
+from fluxvla_core.errors import nearest
+from fluxvla_core.registries import GROUPS, PREFIX
 
 CORE = "fluxvla-core"
 _ENTRY_POINTS = "entry_points.txt"
@@ -70,7 +71,7 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Index:
-    """Everything that is installed under a ``fluxvla.`` group.
+    """Everything that is installed under a ``fluxvla.`` group, or one that was meant to be.
 
     Args:
         plugins: (group, name) -> every provider, sorted by distribution.
@@ -91,6 +92,35 @@ def canonical(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def intended_group(group: str) -> str | None:
+    """The group of the core that ``group`` is a misspelling of; None if of none.
+
+    Capitals, separators and single letters: ``fluxvla-runners``, ``fluxvla_runners``,
+    ``FluxVLA.Runners``, ``fluxvla.runner``.
+    """
+    plain = re.sub(r"[-_.:/\s]+", ".", group.strip()).lower()
+    if group in GROUPS or not plain.startswith(PREFIX[:2]):  # comparing words takes long
+        return None
+    return nearest(plain, GROUPS, 0.85)
+
+
+def _groups_of(text: str) -> set[str]:
+    """Groups in an ``entry_points.txt`` that are FluxVLA's, also misspelt ones.
+
+    Most files have none, which is seen soonest by its letters.
+    """
+    low = text.lower()
+    if PREFIX not in text and "vla" not in low and "flux" not in low:
+        return set()
+    named = re.findall(r"^[ \t]*\[(.*)\][ \t]*$", text.replace("\r", ""), re.MULTILINE)
+    return {g for g in map(str.strip, named) if g.startswith(PREFIX) or _is_slip(g)}
+
+
+def _is_slip(group: str) -> bool:
+    """Whether a group outside ``fluxvla.`` was meant to be one of the core's."""
+    return group.lower() == PREFIX.rstrip(".") or intended_group(group) is not None
+
+
 @functools.cache
 def index() -> Index:
     """The scan. Cached: it is asked for in many places, and lists every folder of ``sys.path``.
@@ -109,7 +139,8 @@ def index() -> Index:
         if isinstance(dist, _Folder) and dist.is_dist_info:
             folders.setdefault(dist.stated_name, dist.path)
         try:
-            if PREFIX not in (dist.read_text(_ENTRY_POINTS) or ""):
+            ours = _groups_of(dist.read_text(_ENTRY_POINTS) or "")
+            if not ours:
                 continue
             if os.path.basename(str(where)).startswith("~"):
                 raise ValueError("leftover of an interrupted uninstall; delete this folder")
@@ -124,9 +155,11 @@ def index() -> Index:
             if not _wanted(key):
                 continue
             version, requires = about.version, tuple(about.requires or ())
+            if not version:
+                raise ValueError("its METADATA has no Version; reinstall it")
             versions[key] = version
             for point in about.entry_points:
-                if point.group.startswith(PREFIX):
+                if point.group in ours:
                     plugin = Plugin(point.group, point.name, point.value, name, version, requires)
                     found.setdefault((plugin.group, plugin.name), []).append(plugin)
         except Exception as error:  # noqa: BLE001 - one broken distribution must not hide the others
@@ -144,8 +177,17 @@ def version(dist: str) -> str | None:
     try:
         found = _distribution(dist)
         return None if found is None else found.version
-    except ValueError:
+    except (OSError, ValueError):
         return None
+
+
+def requirements(dist: str) -> tuple[str, ...]:
+    """What a distribution requires (PEP 508); nothing where it is not there or cannot be read."""
+    try:
+        found = _distribution(dist)
+    except (OSError, ValueError):
+        return ()
+    return () if found is None else tuple(found.requires or ())
 
 
 def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dict[str, str]:
@@ -167,7 +209,7 @@ def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dic
                 continue
             try:
                 dist = _distribution(name)
-            except ValueError:
+            except (OSError, ValueError):
                 continue
             if dist is None or dist.version is None:
                 continue
@@ -203,17 +245,18 @@ class _Folder:
         """A file in it; None where there is none.
 
         Raises:
-            ValueError: it is a pipe or the like, larger than such files are, or no UTF-8.
+            OSError: it cannot be read: permissions, links in a circle, a failing disk.
+            ValueError: it is a folder, a pipe or the like, larger than such files are, or no UTF-8.
         """
         try:
             # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
             flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
             descriptor = os.open(os.path.join(self.path, name) if name else self.path, flags)
-        except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError):
+        except (FileNotFoundError, NotADirectoryError):
             return None
         try:
             found = os.fstat(descriptor)
-            if stat.S_ISDIR(found.st_mode):
+            if stat.S_ISDIR(found.st_mode) and not name:  # an .egg-info of files
                 return None
             if not stat.S_ISREG(found.st_mode):
                 raise ValueError(f"{name} is not a regular file")
@@ -229,7 +272,7 @@ class _Folder:
         """What it says of its distribution: a :class:`_DistInfo`, or importlib's of an older kind.
 
         Raises:
-            ValueError: see :meth:`read_text`.
+            OSError, ValueError: see :meth:`read_text`.
         """
         if self.is_dist_info:
             return _DistInfo(self)
@@ -308,7 +351,7 @@ def _distribution(name: str) -> Any | None:
     """The distribution called ``name``; None if there is none.
 
     Raises:
-        ValueError: its METADATA cannot be read.
+        OSError, ValueError: its METADATA cannot be read.
     """
     folder = index().folders.get(canonical(name))
     if folder is not None:

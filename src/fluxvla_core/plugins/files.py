@@ -14,6 +14,8 @@ from pathlib import Path
 from fluxvla_core.errors import FluxError, LoadFailed, UsageError
 from fluxvla_core.plugins.registry import BY_NAME
 
+PLUGIN_FILE = "fluxvla_plugin_"
+"""What the modules that are made of these files are called, before the name of the file."""
 _loaded: dict[str, Path] = {}  # module -> its file
 
 
@@ -49,7 +51,7 @@ def _load(path: Path) -> None:
         raise UsageError(f"--plugin {path}: there is no such file")
     if path.suffix != ".py":
         raise UsageError(f"--plugin {path}: not a .py file")
-    module = f"fluxvla_plugin_{path.stem}".replace("-", "_")
+    module = f"{PLUGIN_FILE}{path.stem}".replace("-", "_")
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
         raise UsageError(f"--plugin {path}: Python cannot load it")

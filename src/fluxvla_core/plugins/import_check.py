@@ -32,8 +32,8 @@ def problems(
     limit_s: float,
     traces: bool,
     begins: Callable[[Plugins], object],
-) -> Iterator[str]:
-    """One text for each plugin that cannot be imported or breaks its contract, as they are found.
+) -> Iterator[tuple[Plugin, str]]:
+    """A text for each plugin that cannot be imported or breaks its contract, as they are found.
 
     Args:
         plugins: of groups that the core reads.
@@ -93,7 +93,7 @@ class _Importer:
     def done(self) -> bool:
         return not self._left
 
-    def new_problems(self) -> Iterator[str]:
+    def new_problems(self) -> Iterator[tuple[Plugin, str]]:
         """The problems since the last time."""
         while self._left and self.connection.poll():
             try:
@@ -104,7 +104,7 @@ class _Importer:
             plugin, *left = self._left
             self._left, self.deadline = tuple(left), time.monotonic() + self._limit_s
             if text:
-                yield f"{plugin.group}: {text}"
+                yield plugin, text
         if self._left and time.monotonic() > self.deadline:
             yield from self._hangs()
 
@@ -113,7 +113,7 @@ class _Importer:
         self._process.kill()
         self._process.join()
 
-    def _crashed(self) -> Iterator[str]:
+    def _crashed(self) -> Iterator[tuple[Plugin, str]]:
         self._process.join()
         module = self._left[0].module
         cause = _cause(self._process.exitcode)
@@ -122,18 +122,18 @@ class _Importer:
         self.rest = tuple(p for p in self._left if p.module != module)
         self._left = ()
 
-    def _hangs(self) -> Iterator[str]:
+    def _hangs(self) -> Iterator[tuple[Plugin, str]]:
         also = [p.name for p in self._left if p.module != self._left[0].module]
         untried = f"; {', '.join(also)} not tried after that" if also else ""
         yield from self._lost(f"did not end in {self._limit_s:g} s{untried}")
         self._left = ()
 
-    def _lost(self, how: str) -> Iterator[str]:
+    def _lost(self, how: str) -> Iterator[tuple[Plugin, str]]:
         module = self._left[0].module
         for plugin in self._left:
             if plugin.module == module:
                 provides = f"{plugin.origin} provides {plugin.name!r}"
-                yield f"{plugin.group}: {provides} but importing {module!r} {how}"
+                yield plugin, f"{provides} but importing {module!r} {how}"
 
 
 def _import(connection: Connection, plugins: Plugins, traces: bool) -> None:

@@ -10,7 +10,7 @@ import importlib
 import importlib.util
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,7 @@ from fluxvla_core.errors import (
 )
 from fluxvla_core.plugins import _metadata, first_party
 from fluxvla_core.plugins._metadata import CORE, Plugin, canonical
-from fluxvla_core.registries import PREFIX
+from fluxvla_core.registries import GROUPS, PREFIX
 
 LIST = "fluxvla plugins list"
 DOCTOR = "fluxvla plugins doctor"
@@ -40,25 +40,45 @@ _COMPARE: Final[Mapping[str, Any]] = {
 def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
     """The one installed plugin called ``name``, or ``distribution:name``.
 
+    A name that the core provides means the core's, whoever else provides it; theirs is reached as
+    ``distribution:name``. To install a package must not change what a config means.
+
     Args:
         also: names registered in this process, offered with the installed ones.
 
     Raises:
         MissingPlugin: with a did-you-mean, or the pip command when a first-party plugin has it.
-        AmbiguousPlugin: several distributions provide it.
+        AmbiguousPlugin: several distributions provide it, the core not among them.
     """
     dist, _, short = name.rpartition(":")
     providers = _metadata.index().plugins.get((group, short), ())
     hits = [p for p in providers if not dist or canonical(p.dist) == canonical(dist)]
+    hits = [p for p in hits if is_core(p)] or hits
     if len(hits) == 1:
         return hits[0]
     if hits:
         who = ", ".join(f"{p.origin} ({p.value})" for p in hits)
-        raise AmbiguousPlugin(
-            f"{group}: {short!r} is provided by {who}",
-            next=f"write type='<distribution>:{short}' to choose, or uninstall one",
-        )
+        raise AmbiguousPlugin(f"{group}: {short!r} is provided by {who}", next=choose(hits))
     raise MissingPlugin(*_missing(group, name, short, also), next=LIST)
+
+
+def is_core(plugin: Plugin) -> bool:
+    """Whether the core itself provides it."""
+    return canonical(plugin.dist) == CORE
+
+
+def core_provides(group: str, name: str) -> bool:
+    """Whether ``name`` means a class of the core, whatever else is installed."""
+    return any(is_core(p) for p in _metadata.index().plugins.get((group, name), ()))
+
+
+def choose(plugins: Sequence[Plugin]) -> str:
+    """How to say which of several plugins of one name is meant."""
+    names = [f"{p.dist}:{p.name}" for p in plugins]
+    if plugins[0].group == PREFIX + "commands":
+        ways = " or ".join(f"fluxvla {name}" for name in names)
+        return f"run {ways}, or uninstall one"
+    return f"write type={' or type='.join(map(repr, names))} to choose, or uninstall one"
 
 
 def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[str]:
@@ -66,7 +86,10 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
     text = f"no {group} plugin named {name!r}"
     provider = first_party.owner(registry, short)
-    if provider:
+    unread = in_unread_group(short)
+    if unread:
+        text += f"; {unread}"
+    elif provider:
         text += f"; {provider} provides it and is not installed: pip install {provider}"
     else:
         near = nearest(short, [*installed, *first_party.names(registry)])
@@ -81,12 +104,27 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     return (f"{text}\n  installed: {', '.join(installed) or '(none)'}",)
 
 
+def in_unread_group(name: str) -> str:
+    """What to say of a plugin called ``name`` that stands in a group that nothing reads, or ""."""
+    for (group, found), providers in sorted(_metadata.index().plugins.items()):
+        if found == name and group not in GROUPS:
+            return unread_group(providers[0])
+    return ""
+
+
+def unread_group(plugin: Plugin) -> str:
+    """That nothing reads a plugin's group, and which one its author may have meant."""
+    meant = _metadata.intended_group(plugin.group)
+    hint = f"; did its author mean {meant!r}?" if meant else ""
+    return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"
+
+
 def unmet(plugin: Plugin) -> str | None:
     """Why the plugin's own requirement on the core does not hold, or None.
 
     ``pip install --no-deps``, conda and ROS overlays go past pip's check, so it is made again.
     """
-    if canonical(plugin.dist) == CORE:
+    if is_core(plugin):
         return None
     return _unmet(plugin.origin, plugin.requires, _metadata.version(CORE))
 

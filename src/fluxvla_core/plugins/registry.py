@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from fluxvla_core.errors import LoadFailed, PluginError
 from fluxvla_core.plugins import _metadata
-from fluxvla_core.plugins._metadata import Plugin
-from fluxvla_core.plugins.load import find, load
+from fluxvla_core.plugins._metadata import Plugin, canonical
+from fluxvla_core.plugins.load import core_provides, find, load
 from fluxvla_core.registries import PREFIX, ROWS
 
 T = TypeVar("T", bound=Callable[..., Any])
@@ -30,8 +30,8 @@ class Registry:
         For notebooks, tests and ``fluxvla run --plugin FILE``; a distribution uses entry points.
 
         Raises:
-            LoadFailed: the name is taken in this process (``force=True`` replaces it), or the
-                class breaks the registry's contract.
+            LoadFailed: the name is the core's or is taken in this process (``force=True`` replaces
+                it), or the class breaks the registry's contract.
         """
 
         def register(cls: T) -> T:
@@ -42,6 +42,13 @@ class Registry:
                     f"{self.group}: {key!r} is already registered in this process, "
                     f"by {present.__module__}",
                     next="give one of them another name, or say force=True",
+                )
+            if not force and core_provides(self.group, key):
+                # An installed plugin may do this as it is imported, for another of its classes.
+                raise LoadFailed(
+                    f"{self.group}: {key!r} is the core's own and {cls.__module__} registers "
+                    "another class under that name",
+                    next="give it another name, or say force=True to replace the core's",
                 )
             self._check(cls, f"{cls.__module__}:{cls.__qualname__}")
             self._here[key] = cls
@@ -93,7 +100,12 @@ class Registry:
         check_class(self.name, cls, origin)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._here or (self.group, name) in _metadata.index().plugins
+        """Whether ``name``, or ``distribution:name``, is registered or installed."""
+        if name in self._here:
+            return True
+        dist, _, short = str(name).rpartition(":")
+        providers = _metadata.index().plugins.get((self.group, short), ())
+        return any(not dist or canonical(p.dist) == canonical(dist) for p in providers)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self._here, *self.installed()}))

@@ -1,17 +1,28 @@
-"""Dividing a robot between two processes: one commands it, the other reads its cameras."""
+"""Which process commands a robot: one of its own where that is possible.
+
+An operator may be divided: one process commands the robot, the other reads its cameras. One that
+cannot be divided runs as a whole in the process that commands, which shows its pictures to the
+other one.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
+from fluxvla_core.build import RunContext, parameters
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.robot import Operator
-from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS
-from fluxvla_core.robot.control.clock import clock_of, in_lockstep
+from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS, RUNNERS
+from fluxvla_core.robot.control.clock import MonotonicClock, clock_of, in_lockstep
+from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import import_path, not_plain
+from fluxvla_core.robot.robot import Robot
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Embodiment: TypeAlias = "EmbodimentSpec | Mapping[str, Any] | None"
 
 
 @dataclass(frozen=True)
@@ -35,49 +46,181 @@ class Division:
 
     Args:
         operator: what this process has of the robot.
+        robot: made of it; not connected.
         tables: what the other process builds its part from; None where there is no other.
         obstacle: why there is none; None where there is.
+        frames: ``operator``, where the other process has all of the robot.
+        runner: the table of the runner, where that process needs its methods too.
     """
 
     operator: Any
+    robot: Robot
     tables: Tables | None = None
     obstacle: str | None = None
+    frames: RemoteOperator | None = None
+    runner: Mapping[str, Any] | None = None
+
+    @property
+    def remark(self) -> str | None:
+        """What a person is to know of it, if anything."""
+        if self.frames is not None:
+            return f"{self.robot.name} is not divided: the control process reads its pictures too"
+        if self.obstacle is None or self.robot.lockstep:
+            return None
+        return f"no control process: {self.obstacle}"
+
+
+_SENDING = ("_execute_actions",)
+_OBSERVING = ("get_ros_observation", "update_observation_window")
+# What the control process has no use for, or builds itself.
+_BUILT_APART = ("policy", "action_filters")
+# Of every class.
+_USUAL = ("_abc_impl", "api")
+
+
+@dataclass(frozen=True)
+class RunnersOwn:
+    """What a runner does with its operator by methods of its own.
+
+    Args:
+        runner: the name of its class.
+        sends, observes: whether it has an ``_execute_actions``, or a ``get_ros_observation`` or
+            ``update_observation_window``.
+        table: what it is built from, without its policy and filters; None where nobody knows.
+        obstacle: why another process cannot have these methods; None where it can.
+    """
+
+    runner: str
+    sends: bool
+    observes: bool
+    table: Mapping[str, Any] | None
+    obstacle: str | None
+
+    @classmethod
+    def of(cls, runner: type, base: type, context: RunContext) -> RunnersOwn:
+        """Of a class that is derived from ``BaseInferenceRunner``; ``context`` is the run's."""
+        derived = runner.__mro__[: runner.__mro__.index(base)]
+        defined = {name for each in derived for name in vars(each)}
+        known = {*_SENDING, *_OBSERVING, *_USUAL}
+        changed = sorted(defined & set(vars(base)) - known)
+        more = [name for name in changed if not name.startswith("__")]
+        said = context.config.get(context.section)
+        table, name = None, runner.__name__
+        if isinstance(said, Mapping) and said.get("type") in RUNNERS:
+            found = RUNNERS.get(said["type"])
+            left = {key: value for key, value in said.items() if key not in _BUILT_APART}
+            table = {**left, "control_process": False} if found is runner else None
+        obstacle = None
+        if table is None:
+            obstacle = f"{name} was not built from the config"
+        elif "control_process" not in parameters(runner):
+            obstacle = f"{name} takes no control_process"
+        elif RUNNERS.registered(table["type"]) is not None and import_path(runner) is None:
+            obstacle = f"{name} is defined where no other process can import it"
+        elif more:
+            obstacle = f"{name} also has a {more[0]} of its own"
+        return cls(
+            name, bool(defined & {*_SENDING}), bool(defined & {*_OBSERVING}), table, obstacle
+        )
+
+    @property
+    def keeps_here(self) -> str | None:
+        """Why its methods keep the operator in this process; None if they do not."""
+        if self.obstacle is None or not (self.sends or self.observes):
+            return None
+        method = "sends commands" if self.sends else "reads the robot"
+        return f"{self.runner} {method} by a method of its own, and {self.obstacle}"
 
 
 def divide(
-    operator: Any, tables: Tables, config: Mapping[str, Any], obstacle: str | None
+    build: Callable[[], Any],
+    tables: Tables,
+    config: Mapping[str, Any],
+    embodiment: Embodiment,
+    own: RunnersOwn,
+    obstacle: str | None,
 ) -> Division:
-    """Divide a robot between two processes where that is possible.
+    """Choose what commands a robot.
 
     Args:
-        operator: the operator, not connected; the division's takes its place.
-        tables: what it was built from, or objects.
+        build: builds the operator in this process; it is not connected by that, if it has a
+            ``connect``. One that has none is built only where it is to run.
+        tables: what it is built from, or objects.
         config: the whole config.
-        obstacle: why it is not to be divided; None where that depends on the rest.
+        embodiment: what the config says of the robot.
+        own: what the runner does itself.
+        obstacle: why this process is to command it; None where that depends on the rest.
+
+    Raises:
+        ConfigError, PluginError: the operator cannot be built, or lacks something.
     """
-    obstacle = obstacle or _obstacle(operator, tables, config)
+    obstacle = obstacle or _obstacle(tables, config) or (own.keeps_here if own.sends else None)
+    # What is not there is an error of ``build``.
+    name: str = "" if obstacle else tables.operator.get("type", "")
+    cls = OPERATORS.get(name) if name in OPERATORS else None
+    known = None if cls is None else _known_before(cls, embodiment)
+    if cls is not None and known is not None and own.keeps_here is None:
+        return _whole(RemoteOperator(cls.__name__, known), embodiment, cls, tables, own)
+    made = build()
+    operator = Operator.adapt(made)
+    if obstacle is None and in_lockstep(clock_of(operator)):
+        obstacle = "the time of this simulation stands still between commands"
     if obstacle is not None:
-        return Division(operator, obstacle=obstacle)
-    part = Operator.adapt(operator).without_commands()
-    if part is None:
-        name = type(operator).__name__
-        return Division(operator, obstacle=f"{name}, as it is set, cannot be divided")
-    return Division(part, tables)
+        return Division(made, Robot(made, embodiment, own.sends), obstacle=obstacle)
+    if implements(made, Operator, "without_cameras") and not own.sends:
+        part = operator.without_commands()
+        if part is not None:
+            return Division(part, Robot(part, embodiment), tables)
+    # All that is wrong with it is found here, before another process is started.
+    robot = Robot(made, embodiment, own.sends)
+    obstacle = own.keeps_here or _keeps_here(robot, operator)
+    if obstacle is not None:
+        return Division(made, robot, obstacle=obstacle)
+    stand_in = RemoteOperator(robot.name, robot.embodiment, operator.domain_id)
+    return _whole(stand_in, None, type(made), tables, own)
 
 
-def _obstacle(operator: Any, tables: Tables, config: Mapping[str, Any]) -> str | None:
-    made = Operator.adapt(operator)
+def _whole(
+    frames: RemoteOperator, embodiment: Embodiment, cls: type, tables: Tables, own: RunnersOwn
+) -> Division:
+    runner = None
+    if own.table is not None and (own.sends or own.observes):
+        given = {"operator": tables.operator} if "operator" in own.table else {}
+        runner = {**own.table, **given}
+    robot = Robot(frames, embodiment, own.sends, kind=cls)
+    return Division(frames, robot, tables, frames=frames, runner=runner)
+
+
+def _known_before(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
+    """The embodiment of an operator that connects in its constructor, as far as it is known."""
+    if implements(cls, Operator, "connect"):
+        return None
+    own = getattr(cls, "embodiment", None)
+    if isinstance(own, EmbodimentSpec):
+        return own
+    return EmbodimentSpec.from_dict(embodiment) if isinstance(embodiment, Mapping) else embodiment
+
+
+def _keeps_here(robot: Robot, operator: Operator) -> str | None:
+    """Why an operator that cannot be divided does not run as a whole in another process."""
+    name = robot.name
+    if not robot.follows:
+        return f"{name} follows no commands"
+    if not isinstance(robot.clock, MonotonicClock):
+        return f"{name} cannot be divided, and has a clock of its own"
+    if not implements(operator, Operator, "connect"):
+        return f"{name} connects in its constructor, and the config has no embodiment for it"
+    return None
+
+
+def _obstacle(tables: Tables, config: Mapping[str, Any]) -> str | None:
     if sys.platform != "linux":
         return "this system has no memory that two processes share by a descriptor"
-    if in_lockstep(clock_of(made)):
-        return "the time of this simulation stands still between commands"
-    if not implements(made, Operator, "without_cameras"):
-        return f"{type(made).__name__} cannot be divided (Operator.without_cameras)"
     for registry, built in ((OPERATORS, [tables.operator]), (ACTION_FILTERS, tables.filters)):
         for each in built:
             if not isinstance(each, Mapping):
                 return f"{type(each).__name__} is an object, not a table"
-            cls = registry.registered(each["type"])
+            cls = registry.registered(each.get("type", ""))
             if cls is not None and import_path(cls) is None:
                 return f"{each['type']} is defined where no other process can import it"
     values = {

@@ -138,7 +138,7 @@ class LocalEngine(Engine):
         observers: Sequence[EpisodeObserver],
         folder: Path,
     ) -> None:
-        held, before = self.holding, self._history.commanded
+        held, before = self._holding, self._history.commanded
         self._holding = None
         episode = Episode(self._parts, self._settings, observers, task, number, seed, before, held)
         try:

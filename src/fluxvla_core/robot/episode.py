@@ -117,7 +117,7 @@ class Episode:
         number: how many episodes the run had before.
         seed: the seed of the policy.
         before: ``(D,)`` the last command of the run, None before any.
-        held: whether the arm was held by it since, without a stop.
+        held: the episode that has held the arm by it since, without a stop; None after a stop.
 
     Raises:
         RunFailed: an observer cannot take anything, for example write to its folder.
@@ -133,7 +133,7 @@ class Episode:
         number: int,
         seed: int,
         before: Array | None = None,
-        held: bool = False,
+        held: Episode | None = None,
     ) -> None:
         robot, safety = parts.robot, settings.safety
         self._parts, self._settings, self._observers = parts, settings, observers
@@ -198,6 +198,8 @@ class Episode:
         finally:
             self._end(outcome, problem)
             self._supervisor.phase = Phase.OVER
+            # Or every episode would keep all before it.
+            self._held = self._source.meanwhile = None
             interrupts.deferred = False
         interrupts.resume()
 
@@ -211,13 +213,17 @@ class Episode:
             SafetyStop: the latch was tripped, or the arm does not stay.
             OperatorError: the robot does not take it, or a stream fell silent.
         """
-        ticks = self._rate.ticks
         try:
-            self._sender.hold()
+            self.resend()
         except FluxError as error:
             self._note_stall(error)
             self._stop_held(error)
             raise
+
+    def resend(self) -> None:
+        """As ``hold``, but whoever calls it stops the robot where something goes wrong."""
+        ticks = self._rate.ticks
+        self._sender.hold()
         if self._rate.ticks == ticks:
             # A runner's own sending that has no tick of the rate's.
             time.sleep(self._rate.period)
@@ -231,6 +237,7 @@ class Episode:
         """Read where the arm is, and bring it to the start pose."""
         settings = self._settings
         self._robot.begin(self._task.instruction, self._number)
+        self._source.meanwhile = None if self._held is None else self._held.resend
         self._limiter.start(self._where(self._source.first_state()))
         self._source.reset()
         if settings.start_pose is not None:
@@ -248,6 +255,9 @@ class Episode:
 
     def _control_loop(self) -> ControlLoop:
         parts, settings = self._parts, self._settings
+        commanded = settings.start_pose is not None or self._held is not None
+        holds = commanded and not self._robot.lockstep
+        self._source.meanwhile = self.resend if holds else None
         return ControlLoop(
             robot=self._robot,
             source=self._source,
@@ -259,7 +269,7 @@ class Episode:
             keyframe_hz=settings.keyframe_hz,
             keyframes=settings.keyframes,
             latency_s=settings.latency_s,
-            holds=(settings.start_pose is not None or self._held) and not self._robot.lockstep,
+            holds=holds,
         )
 
     def _where(self, state: Array) -> Array:
@@ -276,7 +286,7 @@ class Episode:
         if commanded is None:
             return self._tracking.positions(state)
         kept = self._grippers
-        if self._held:
+        if self._held is not None:
             kept = kept | self._tracking.follows(commanded, state)
         elif self._robot.tells_hold:
             kept = kept | self._tracking.stayed(commanded, state)

@@ -189,18 +189,34 @@ class HookObserver(EpisodeObserver):
         if not self._hooks:
             return
         match event:
-            case EpisodeStarted():
-                self._hooks.call("episode_started", task=event.task.instruction)
-            case ChunkAccepted():
-                self._hooks.call("observed", observation=_frozen(event.reading.observation))
-                latency = event.stages["policy"]
-                self._hooks.call("inferred", chunk=event.keyframes, latency_s=latency)
-            case CommandSent():
-                action = event.sent.command.copy()
-                action.flags.writeable = False
-                self._hooks.call("action_sent", action=action, stamp=event.at)
-            case EpisodeEnded():
-                self._hooks.call("episode_finished", reason=event.problem or event.outcome)
+            case EpisodeStarted(at=at, task=task):
+                self._hooks.call("episode_started", task=task.instruction, stamp=at)
+            case ChunkAccepted(at=at, reading=reading, keyframes=chunk, stages=stages):
+                shown = _frozen(reading.observation)
+                self._hooks.call("observed", observation=shown, stamp=reading.measured)
+                latency = stages["policy"]
+                self._hooks.call("inferred", chunk=chunk, latency_s=latency, stamp=at)
+            case CommandSent(at=at, sent=sent, state=state):
+                self._hooks.call(
+                    "action_sent",
+                    action=_kept(sent.command),
+                    stamp=at,
+                    target=_kept(sent.target),
+                    state=None if state is None else _kept(state),
+                )
+            case Stopped(at=at, rule=rule, problem=problem):
+                self._hooks.call("stopped", rule=rule, problem=problem, stamp=at)
+            case StoppedWhileHeld(at=at, trip=trip):
+                self._hooks.call("stopped", rule=trip.rule, problem=trip.what, stamp=at)
+            case EpisodeEnded(at=at, problem=problem, outcome=outcome):
+                self._hooks.call("episode_finished", reason=problem or outcome, stamp=at)
+
+
+def _kept(array: Array) -> Array:
+    """A read-only copy: hooks see it when the loop may have gone on."""
+    copy = array.copy()
+    copy.flags.writeable = False
+    return copy
 
 
 def _frozen(observation: dict[str, Any]) -> dict[str, Any]:

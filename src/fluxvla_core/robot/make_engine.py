@@ -15,7 +15,7 @@ from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.division import Tables
+from fluxvla_core.robot.division import Division
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event
@@ -62,13 +62,13 @@ class RunParts:
 
 
 def make_engine(
-    parts: RunParts, tables: Tables | None, interrupts: Interrupts, thread: PolicyThread
+    parts: RunParts, division: Division, interrupts: Interrupts, thread: PolicyThread
 ) -> Engine:
     """What commands the robot in one run.
 
     Args:
         parts: what the run drives the robot with.
-        tables: for a process of its own; None commands the robot from this process.
+        division: whether another process commands the robot.
         interrupts: signals that ask the run to end.
         thread: the thread in which the policy computes.
     """
@@ -79,17 +79,22 @@ def make_engine(
         parts.settings.safety,
     )
 
+    observe = parts.observe
+    if division.frames is not None and division.runner is not None:
+        observe = division.frames.observe
+
     def make_source(
         task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
     ) -> LocalSource:
         reader = ObservationReader(
-            robot, parts.observe, task.instruction, parts.cameras, safety, parts.ready_s,
+            robot, observe, task.instruction, parts.cameras, safety, parts.ready_s,
             tracking, thread, interrupts, emit,
         )  # fmt: skip
         caller = PolicyCaller(policy, robot.embodiment, safety, robot.delays, seed)
         return LocalSource(robot, reader, caller, thread, emit)
 
     reporter, latch, history = parts.context.reporter, parts.latch, parts.history
+    tables, frames = division.tables, division.frames
     if tables is not None:
         setup = ControlSetup(
             config=parts.context.config,
@@ -103,9 +108,11 @@ def make_engine(
             settings=settings,
             before=history.commanded,
             python_path=sys.path,
-            registered=registered_here(tables.operator, tables.filters),
+            registered=registered_here(tables.operator, tables.filters, division.runner),
+            cameras=None if frames is None else parts.cameras,
+            runner=division.runner,
         )
-        return RemoteEngine(setup, robot, make_source, latch, interrupts, reporter, history)
+        return RemoteEngine(setup, robot, make_source, latch, interrupts, reporter, history, frames)
     joiner, filters = make_joiner(*parts.joining), parts.filters
     episode = EpisodeParts(
         robot, make_source, filters, joiner, parts.execute, latch, interrupts, reporter

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
@@ -100,6 +101,9 @@ class PolicyCaller:
         except FluxError:
             raise
         except (Exception, SystemExit) as error:
+            if isinstance(error, MemoryError):
+                # What the policy computed with is given back: the record needs some of it.
+                traceback.clear_frames(error.__traceback__)
             raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
         stages = {"policy": time.perf_counter() - began, **policy.stages}
         # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread

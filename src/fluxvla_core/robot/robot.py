@@ -48,6 +48,7 @@ class Robot:
         embodiment: what the config says about it; None when it has its own.
         sends: whether the runner has an ``_execute_actions`` of its own, and so needs no
             ``send_action``.
+        kind: the class of an operator in another process that ``operator`` stands in for.
 
     Raises:
         LoadFailed: the operator lacks something that nothing makes up for.
@@ -59,9 +60,11 @@ class Robot:
         operator: Any,
         embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
         sends: bool = False,
+        kind: type | None = None,
     ) -> None:
         self._operator = Operator.adapt(operator)
-        self.name = type(operator).__name__
+        self._described: Any = self._operator if kind is None else kind
+        self.name = (kind or type(operator)).__name__
         check_operator(operator)
         self.embodiment = self._embodiment(embodiment)
         moving = speeds(self.embodiment)
@@ -186,7 +189,7 @@ class Robot:
     @property
     def simulated(self) -> bool:
         """Whether the operator puts the scene in place itself (``begin_episode``)."""
-        return self._has("begin_episode")
+        return implements(self._described, Operator, "begin_episode")
 
     @property
     def tells_hold(self) -> bool:
@@ -228,7 +231,7 @@ class Robot:
         Only one of the specification's shape may not: its runner sends, and what stops it is that
         the runner's commands brake, and that the last of them holds it.
         """
-        return self._has("stop")
+        return implements(self._described, Operator, "stop")
 
     def stop(self) -> str | None:
         """Bring the robot to a safe stop; None, or what went wrong. Never raises, never hangs."""

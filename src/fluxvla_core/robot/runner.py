@@ -8,7 +8,7 @@ specification's shape overrides ``get_ros_observation``, ``update_observation_wi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,8 +34,8 @@ from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.control.sender import check_pose
-from fluxvla_core.robot.division import Tables, divide
+from fluxvla_core.robot.control.sender import Execute, check_pose
+from fluxvla_core.robot.division import RunnersOwn, Tables, divide
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
@@ -100,8 +100,9 @@ class BaseInferenceRunner(Runner):
             pictures; None records none.
         ready_timeout: seconds that the robot may take to give its first reading.
         control_process: let a process of its own command the robot, so that nothing that the
-            policy, a camera or a hook does keeps the arm from being held. By default wherever the
-            operator can be divided (``Operator.without_cameras``) and is named by the config.
+            policy or a hook does keeps the arm from being held. By default wherever that is
+            possible (docs/control.md). An operator that cannot be divided
+            (``Operator.without_cameras``) runs there as a whole, its pictures included.
 
     Raises:
         ConfigError, PluginError: the operator cannot be built, or the values do not fit it.
@@ -181,18 +182,19 @@ class BaseInferenceRunner(Runner):
                 raise self.config_error(name, f"must be at least 1, got {value}")
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
         scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
-        self.ros_operator = build_operator_from_cfg(operator, context, **scene)
-        own_sending = type(self)._execute_actions is not BaseInferenceRunner._execute_actions
         table = {**scene, **operator} if isinstance(operator, Mapping) else operator
         tables = Tables(table, list(action_filters), gripper_threshold)
-        obstacle = "control_process is False" if control_process is False else None
-        if own_sending:
-            obstacle = f"{type(self).__name__} has an _execute_actions of its own"
-        self._division = divide(self.ros_operator, tables, self.context.config, obstacle)
+        self._division = divide(
+            lambda: build_operator_from_cfg(operator, context, **scene),
+            tables,
+            self.context.config,
+            embodiment,
+            RunnersOwn.of(type(self), BaseInferenceRunner, self.context),
+            "control_process is False" if control_process is False else None,
+        )
         if control_process and self._division.obstacle is not None:
             raise self.config_error("control_process", f"is True, and {self._division.obstacle}")
-        self.ros_operator = self._division.operator
-        self.robot = Robot(self.ros_operator, embodiment, sends=own_sending)
+        self.ros_operator, self.robot = self._division.operator, self._division.robot
         self.embodiment = self.robot.embodiment
         self.publish_rate = self._checked_rate(publish_rate)
         if state_dim is not None and state_dim != self.embodiment.state_dim:
@@ -279,14 +281,14 @@ class BaseInferenceRunner(Runner):
         with Interrupts() as interrupts, watched:
             self._observers = (HookObserver(hooks),)
             engine = self._engine(interrupts, thread)
-            if not (self.divided or self.robot.lockstep):
-                self.context.reporter.info(f"no control process: {self._division.obstacle}")
+            if self._division.remark is not None:
+                self.context.reporter.info(self._division.remark)
             self._session = session = RobotSession(
                 source, self.task_descriptions, self.free_tasks, self.seed, self._history,
                 engine, self.latch, interrupts, thread,
             )  # fmt: skip
             try:
-                hooks.call("run_started")
+                hooks.call("run_started", embodiment=self.embodiment)
                 source.open()
                 engine.connect()
                 with engine.commanding():
@@ -337,6 +339,18 @@ class BaseInferenceRunner(Runner):
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
         self.robot.play(actions, rate)
 
+    def commanding_side(
+        self, robot: Robot, cameras: Sequence[str]
+    ) -> tuple[Execute, Callable[[], tuple[dict[str, Any], Frame | None]]]:
+        """In the control process, where there is no policy: what sends commands, and observes.
+
+        Args:
+            robot: takes the place of this runner's.
+            cameras: names of the cameras that the policy looks at.
+        """
+        self.robot, self._cameras = robot, tuple(cameras)
+        return self._execute_actions, self._observe
+
     def _run_episode(self, task: Task) -> dict[str, Any]:
         """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""
         assert self.policy is not None, "run_setup() comes before run()"
@@ -380,7 +394,7 @@ class BaseInferenceRunner(Runner):
             context=self.context,
             history=self._history,
         )
-        return make_engine(parts, self._division.tables, interrupts, thread)
+        return make_engine(parts, self._division, interrupts, thread)
 
     def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None

@@ -18,7 +18,7 @@ import secrets
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -59,6 +59,7 @@ def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
             be loaded (``rclpy.init`` would end the process then); says how to get them.
     """
     try:
+        _leave_out_generator()
         rclpy = importlib.import_module("rclpy")
     except ImportError as error:
         raise LoadFailed(
@@ -70,6 +71,23 @@ def require_rclpy(environ: Mapping[str, str] = os.environ) -> ModuleType:
         ) from error
     _require_middleware(environ)
     return rclpy
+
+
+def _leave_out_generator() -> None:
+    """Import what loads ROS's messages without what generates their code.
+
+    ``rosidl_generator_py`` imports its generator where it is installed: parsers and their tables
+    of 17 MB, which nothing needs that only uses messages.
+    """
+    generator = "rosidl_generator_py.generate_py_impl"
+    if generator in sys.modules:
+        return
+    sys.modules[generator] = None  # type: ignore[assignment]  # importing it raises ImportError
+    try:
+        with suppress(ImportError):  # not there, or another one: rclpy says what it misses
+            importlib.import_module("rosidl_generator_py")
+    finally:
+        del sys.modules[generator]
 
 
 @contextmanager

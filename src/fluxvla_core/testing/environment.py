@@ -11,7 +11,6 @@ its task and seed alone, not on earlier episodes or on which cameras are drawn.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,12 +20,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation.policies import RandomPolicy
 from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
-from fluxvla_core.plugins.registry import ENVIRONMENTS
+from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
 from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.testing._conformance import is_json, unequal_keys
 
 SEED = 11
 
@@ -116,27 +117,93 @@ class EnvironmentConformance:
         environment = self.make()
         spec = environment.spec
         environment.close()
-        assert isinstance(spec, EnvironmentSpec)
-        assert json.loads(json.dumps(dict(spec.details))) == dict(spec.details), "JSON values"
-        assert all(task.max_steps > 0 and task.instruction for task in spec.tasks)
+        assert isinstance(spec, EnvironmentSpec), (
+            f"spec is a {type(spec).__name__} before reset(), expected an EnvironmentSpec: policy "
+            "and environment are compared before a scene is built"
+        )
+        assert is_json(dict(spec.details)), (
+            f"spec.details is {dict(spec.details)!r:.200}, expected JSON values alone: they go "
+            "into "
+            "results.json"
+        )
+        for task in spec.tasks:
+            assert task.max_steps > 0, (
+                f"task {task.name} has max_steps = {task.max_steps}, expected at least 1: after so "
+                "many an episode ends"
+            )
+            assert task.instruction, f"task {task.name} has no instruction, which policies go by"
 
     def test_what_is_seen_is_what_the_spec_says(self, environment: Environment) -> None:
         spec = environment.spec
         for task in self.tried(environment):
             environment.reset(SEED, task.name)
-            state = environment.state
-            assert state.shape == (spec.embodiment.state_dim,)
-            assert state.dtype == np.float64
-            assert np.isfinite(state).all()
+            state, dim = environment.state, spec.embodiment.state_dim
+            assert state.shape == (dim,), (
+                f"state has the shape {state.shape}, expected ({dim},): one number for each of "
+                f"{', '.join(spec.embodiment.state_names)}"
+            )
+            assert state.dtype == np.float64, f"state is {state.dtype}, expected float64"
+            assert np.isfinite(state).all(), (
+                f"state is {state.tolist()} after reset(), expected finite numbers: the episode "
+                "counts as diverged otherwise"
+            )
             seen = environment.observe(self.cameras(environment))
-            assert seen["qpos"].dtype == np.float32
-            assert np.array_equal(seen["qpos"], state.astype(np.float32))
-            assert seen["task_description"] == task.instruction
+            qpos = seen["qpos"]
+            assert qpos.dtype == np.float32, f"observe()['qpos'] is {qpos.dtype}, expected float32"
+            assert np.array_equal(qpos, state.astype(np.float32)), (
+                f"observe()['qpos'] is {qpos.tolist()}, and state {state.tolist()}; expected the "
+                "same, rounded: demonstrations record the one, policies see the other"
+            )
+            assert seen["task_description"] == task.instruction, (
+                f"observe()['task_description'] is {seen['task_description']!r}, expected "
+                f"{task.instruction!r}, that of the task {task.name}"
+            )
             for camera in self.cameras(environment):
-                image = seen["images"][camera.name]
-                assert image.dtype == np.uint8
-                assert image.shape == (camera.height, camera.width, 3)
-            assert environment.observe(())["images"] == {}, "nothing is rendered unasked"
+                image = seen["images"].get(camera.name)
+                assert image is not None, (
+                    f"observe() of the camera {camera.name} gave the images "
+                    f"{sorted(seen['images'])}, expected that one: the policy looks at it"
+                )
+                assert image.dtype == np.uint8, (
+                    f"the picture of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
+                )
+                assert image.shape == (camera.height, camera.width, 3), (
+                    f"the picture of {camera.name} has the shape {image.shape}, expected "
+                    f"{(camera.height, camera.width, 3)}, as asked for"
+                )
+            unasked = environment.observe(())["images"]
+            assert unasked == {}, (
+                f"observe(()) gave the images {sorted(unasked)}, expected none: rendering is what "
+                "takes the time"
+            )
+
+    def test_a_step_says_what_it_did(self, environment: Environment) -> None:
+        task = self.tried(environment)[0]
+        environment.reset(SEED, task.name)
+        succeeded = False
+        for action in self._actions(environment):
+            given = action.copy()
+            step = environment.step(given)
+            assert isinstance(step, Step), (
+                f"step() gave a {type(step).__name__}, expected a Step: reward, success, ended"
+            )
+            assert np.array_equal(given, action), (
+                "step() changed the action that it was given, expected it untouched: it is a row "
+                "of the policy's chunk"
+            )
+            assert step.success or not succeeded, (
+                "step() said success, and then no more, expected it to stay: it says whether the "
+                "task is done now or was at any moment before"
+            )
+            succeeded = step.success
+            if step.ended:
+                break
+
+    def _actions(self, environment: Environment) -> npt.NDArray[np.float64]:
+        """``(steps, dim)`` at random within the limits."""
+        joints = environment.spec.embodiment.joints
+        low, high = [j.lower for j in joints], [j.upper for j in joints]
+        return np.random.default_rng(SEED).uniform(low, high, (self.steps, len(joints)))
 
     def test_states_belong_to_whoever_asked(self, environment: Environment) -> None:
         environment.reset(SEED, self.tried(environment)[0].name)
@@ -144,29 +211,113 @@ class EnvironmentConformance:
         kept = before.copy()
         joints = environment.spec.embodiment.joints
         environment.step(np.array([(joint.lower + joint.upper) / 2 for joint in joints]))
-        assert np.array_equal(before, kept), "a later step changed a state that was given out"
+        assert np.array_equal(before, kept), (
+            "a later step() changed a state that was given out, expected fresh arrays: a "
+            "demonstration would record the last one everywhere"
+        )
 
     def test_a_course_follows_from_task_and_seed_alone(self, environment: Environment) -> None:
         tasks = self.tried(environment)
         first = {task.name: self.episode(environment, task) for task in tasks}
+        why = "results follow from task and seed, whichever process ran what before"
         for task in reversed(tasks):
             self.episode(environment, task, SEED + 1)
-            assert self.episode(environment, task) == first[task.name], "after other episodes"
+            again = self.episode(environment, task)
+            differ = unequal_keys(first[task.name], again)
+            assert not differ, (
+                f"after reset({SEED}, {task.name!r}) the same actions gave another "
+                f"{', '.join(differ)} when other episodes had been run before, expected the same: "
+                f"{why}"
+            )
         other = self.make()
-        assert self.episode(other, tasks[0]) == first[tasks[0].name], "in a new environment"
+        differ = unequal_keys(first[tasks[0].name], self.episode(other, tasks[0]))
         other.close()
+        assert not differ, (
+            f"after reset({SEED}, {tasks[0].name!r}) the same actions gave another "
+            f"{', '.join(differ)} in a second environment, expected the same: {why}"
+        )
 
     def test_another_seed_is_another_course(self, environment: Environment) -> None:
         if not self.seeds_differ:
             pytest.skip("this environment begins every episode alike")
         task = self.tried(environment)[0]
         hashes = {self.episode(environment, task, seed)["state_hash"] for seed in (1, 2, 3)}
-        assert len(hashes) > 1
+        assert len(hashes) > 1, (
+            "reset() with the seeds 1, 2 and 3 gave the same course, expected others: the seed is "
+            "ignored, and fifty episodes would be one (set seeds_differ = False if that is meant)"
+        )
+        environment.reset(1, task.name)
+        starts = [environment.state]
+        environment.reset(1, task.name)
+        starts.append(environment.state)
+        assert np.array_equal(starts[0], starts[1]), (
+            f"reset(1, {task.name!r}) gave the state {starts[0].tolist()} and then "
+            f"{starts[1].tolist()}, expected the same: everything random follows from the seed"
+        )
 
     def test_looking_changes_nothing(self, environment: Environment) -> None:
         task = self.tried(environment)[0]
+        environment.reset(SEED, task.name)
+        for cameras in ((), self.cameras(environment)):
+            before = environment.state
+            environment.observe(cameras)
+            after = environment.state
+            assert np.array_equal(before, after), (
+                f"observe() with {len(cameras)} camera(s) took the state from {before.tolist()} to "
+                f"{after.tolist()}, expected no change: it is called when a policy or a video "
+                "looks, which must not move the world"
+            )
         unseen = self.episode(environment, task)
-        assert self.episode(environment, task, cameras=self.cameras(environment)) == unseen
+        seen = self.episode(environment, task, cameras=self.cameras(environment))
+        differ = unequal_keys(unseen, seen)
+        assert not differ, (
+            f"an episode with pictures has another {', '.join(differ)} than one without, expected "
+            "the same: observe() moves the world, or draws from its generator"
+        )
+
+    def test_other_tasks_are_others_and_can_be_instructed(self, environment: Environment) -> None:
+        tried = [(task, environment.other_tasks(task.name)) for task in self.tried(environment)]
+        if not any(others for _, others in tried):
+            pytest.skip("other_tasks() and set_instruction() would allow instruction_swap")
+        known = {task.name: task for task in environment.spec.tasks}
+        for task, others in tried:
+            assert task.name not in others, (
+                f"other_tasks({task.name!r}) gave {list(others)}, expected others than itself: a "
+                "swapped instruction would be the right one"
+            )
+            strangers = sorted(set(others) - set(known))
+            assert not strangers, (
+                f"other_tasks({task.name!r}) gave {strangers}, expected names of spec.tasks, "
+                f"{', '.join(known)}"
+            )
+            for other in others[:1]:
+                environment.reset(SEED, task.name)
+                environment.set_instruction(other)
+                said = environment.observe(())["task_description"]
+                assert said == known[other].instruction, (
+                    f"after set_instruction({other!r}) the policy is told {said!r}, expected "
+                    f"{known[other].instruction!r}: an evaluation would read as if no policy "
+                    "listened"
+                )
+                environment.reset(SEED, task.name)
+                said = environment.observe(())["task_description"]
+                assert said == task.instruction, (
+                    f"after the next reset() the policy is told {said!r}, expected "
+                    f"{task.instruction!r}: an instruction is for one episode"
+                )
+
+    def test_its_expert_is_there(self, environment: Environment) -> None:
+        expert = environment.expert
+        if expert is None:
+            pytest.skip("expert would name the policy that solves its tasks, for demonstrations")
+        problem = ""
+        try:
+            POLICIES.get(expert)
+        except FluxError as error:
+            problem = str(error)
+        assert not problem, (
+            f"expert is {expert!r}, and policy = 'expert' in a config says: {problem}"
+        )
 
     def test_a_simulation_that_diverges_is_an_error_and_no_outcome(
         self, environment: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -186,9 +337,17 @@ class EnvironmentConformance:
             "the simulation diverged and divergence() did not say so: inherit from "
             "fluxvla_mujoco.MujocoEnvironment, or return fluxvla_mujoco.divergence(data)"
         )
-        assert self.episode(environment, task), "the next episode is a whole one again"
+        assert self.episode(environment, task), "the next episode is no whole one again"
 
     def test_it_can_be_closed_any_number_of_times(self, environment: Environment) -> None:
         environment.reset(SEED, self.tried(environment)[0].name)
         environment.close()
-        environment.close()
+        problem = ""
+        try:
+            environment.close()
+        except Exception as error:  # noqa: BLE001 - said in the assertion
+            problem = f"{type(error).__name__}: {error}"
+        assert not problem, (
+            f"a second close() raised {problem}; expected it to do nothing: whatever ends an "
+            "evaluation closes"
+        )

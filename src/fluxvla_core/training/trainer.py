@@ -93,7 +93,7 @@ class Trainer:
         self._loader = iter(loader)
         self._batches: Iterator[Any] = self._loader
         run.vla.train()
-        run.hooks.call("run_started")
+        run.hooks.call("run_started", embodiment=None)
         # Last, so that nothing above has drawn from the generators that are restored.
         restore_rng(world, run.resume_checkpoint, options.seed)
 

@@ -8,8 +8,8 @@ import pytest
 from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
-from fluxvla_core.errors import ConfigError
 from fluxvla_core.plugins.registry import OPERATORS
+from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
@@ -50,13 +50,16 @@ def runner(tmp_path, **arguments):
     return BaseInferenceRunner(context=context, operator={"type": "Refusing"}, **arguments)
 
 
-def test_it_is_commanded_by_the_process_of_the_policy(tmp_path):
-    made = runner(tmp_path)
+def test_it_runs_as_a_whole_in_the_control_process(tmp_path):
+    made = runner(tmp_path, control_process=True)
+
+    assert made.divided
+    assert isinstance(made.ros_operator, RemoteOperator)
+    assert made.robot.name == "Refusing"
+
+
+def test_without_a_control_process_it_runs_here(tmp_path):
+    made = runner(tmp_path, control_process=False)
 
     assert not made.divided
     assert isinstance(made.ros_operator, Refusing)
-
-
-def test_to_ask_for_a_process_of_its_own_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="control_process is True, and Refusing, as it is set"):
-        runner(tmp_path, control_process=True)

@@ -15,6 +15,8 @@ from fluxvla_core.contracts.training import Tokenizer, Transform
 from fluxvla_core.errors import ConfigError
 
 Encoded = tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]
+KEPT = 4096
+"""Encoded texts that are kept: all instructions of a dataset, not every prompt with a state."""
 
 
 class ProcessPrompts(Transform):
@@ -54,6 +56,8 @@ class ProcessPrompts(Transform):
                 f"'task_description' is in the sample ({text!r})"
             )
         if text not in self._known:
+            if len(self._known) >= KEPT:
+                self._known.clear()
             self._known[text] = self._pad(self._encode(text), text)
         tokens, mask = self._known[text]
         return {**sample, "lang_tokens": tokens.copy(), "lang_masks": mask.copy()}

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import RandomTransform, Transform
 from fluxvla_core.data.statistics import (
+    EPS,
     Affine,
     check_norm_type,
     find_idle_dimensions,
@@ -34,13 +35,17 @@ class NormalizeStatesAndActions(Transform):
         state_key, action_key: entries of the statistics, usually ``proprio`` and ``action``.
         action_dim, state_dim: widths that the model wants; the data's own if None.
         norm_type: ``mean_std``, ``quantile``, ``min_max`` or ``none``.
+        state_norm_type: that of states, where it is another one.
         action_norm_mask: ``(D,)``, D being the data's own width; False neither shifts nor scales
             a dimension (relative ones are counted from the state all the same).
         std_floor: no dimension is divided by less than this, in the data's units.
+        epsilon: added to what is divided by: 1e-6 in openpi, 1e-8 in LeRobot.
+        epsilon_if_zero: ranges (``quantile``, ``min_max``) get it only where they are 0, as
+            LeRobot has it.
 
     Raises:
-        ConfigError: an unknown ``norm_type``, statistics that are missing or of another width,
-            or a width that would cut dimensions off.
+        ConfigError: an unknown ``norm_type``, an ``epsilon`` below 0, statistics that are missing
+            or of another width, or a width that would cut dimensions off.
     """
 
     keeps_images = True
@@ -55,8 +60,15 @@ class NormalizeStatesAndActions(Transform):
         pad_value: float = 0.0,
         action_norm_mask: Sequence[bool] | None = None,
         std_floor: float = 0.0,
+        state_norm_type: str | None = None,
+        epsilon: float = EPS,
+        epsilon_if_zero: bool = False,
     ) -> None:
-        check_norm_type(norm_type, type(self).__name__)
+        _check_settings(norm_type, epsilon, type(self).__name__)
+        _check_settings(state_norm_type or norm_type, epsilon, type(self).__name__)
+        self.state_norm_type = state_norm_type or norm_type
+        self.epsilon = epsilon
+        self.epsilon_if_zero = epsilon_if_zero
         self.state_key = state_key
         self.action_key = action_key
         self.action_dim = action_dim
@@ -89,6 +101,8 @@ class NormalizeStatesAndActions(Transform):
             norm_type=self.norm_type,
             action_norm_mask=self.action_norm_mask,
             std_floor=self.std_floor,
+            epsilon=self.epsilon,
+            epsilon_if_zero=self.epsilon_if_zero,
             statistic_name=statistic_name,
             action_key=self.action_key,
         )
@@ -139,10 +153,23 @@ class NormalizeStatesAndActions(Transform):
         if self._known is None or self._known[0] is not stats:
             who = type(self).__name__
             state = make_affine(
-                _entry(stats, self.state_key, who), self.norm_type, who, self.std_floor
+                _entry(stats, self.state_key, who),
+                self.state_norm_type,
+                who,
+                self.std_floor,
+                None,
+                self.epsilon,
+                self.epsilon_if_zero,
             )
-            entry = _entry(stats, self.action_key, who)
-            action = make_affine(entry, self.norm_type, who, self.std_floor, self.action_norm_mask)
+            action = make_affine(
+                _entry(stats, self.action_key, who),
+                self.norm_type,
+                who,
+                self.std_floor,
+                self.action_norm_mask,
+                self.epsilon,
+                self.epsilon_if_zero,
+            )
             self._known = (stats, state, action)
         return self._known[1:]
 
@@ -169,7 +196,7 @@ class DenormalizePrivateAction(Transform):
     Args:
         norm_stats: the statistics, or the path of ``dataset_statistics.json``.
         action_dim: the robot's width; what a model's padding added is cut off.
-        norm_type, action_norm_mask, std_floor: as in training.
+        norm_type, action_norm_mask, std_floor, epsilon, epsilon_if_zero: as in training.
         statistic_name, action_key: where in ``norm_stats`` the action's entry is.
 
     Raises:
@@ -185,8 +212,12 @@ class DenormalizePrivateAction(Transform):
         std_floor: float = 0.0,
         statistic_name: str = "private",
         action_key: str = "action",
+        epsilon: float = EPS,
+        epsilon_if_zero: bool = False,
     ) -> None:
-        check_norm_type(norm_type, type(self).__name__)
+        _check_settings(norm_type, epsilon, type(self).__name__)
+        self.epsilon = epsilon
+        self.epsilon_if_zero = epsilon_if_zero
         self.norm_stats = None if norm_stats is None else load_statistics(norm_stats)
         self.action_dim = action_dim
         self.norm_type = norm_type
@@ -221,7 +252,15 @@ class DenormalizePrivateAction(Transform):
                 )
             entries = _entry(self.norm_stats, self.statistic_name, who)
             stats = _entry(entries, self.action_key, who)
-            affine = make_affine(stats, self.norm_type, who, self.std_floor, self.action_norm_mask)
+            affine = make_affine(
+                stats,
+                self.norm_type,
+                who,
+                self.std_floor,
+                self.action_norm_mask,
+                self.epsilon,
+                self.epsilon_if_zero,
+            )
             if self.action_dim not in (None, affine.dim):
                 raise ConfigError(
                     f"{who}: action_dim is {self.action_dim}, "
@@ -338,6 +377,12 @@ def load_statistics(source: Mapping[str, Any] | str | Path) -> Mapping[str, Any]
         return read_json(path, dict[str, Any], ConfigError)
     except ConfigError as error:
         raise ConfigError(f"norm_stats: {path}: {error.what}") from error
+
+
+def _check_settings(norm_type: str, epsilon: float, who: str) -> None:
+    check_norm_type(norm_type, who)
+    if not epsilon >= 0:
+        raise ConfigError(f"{who}: epsilon must be at least 0, got {epsilon}")
 
 
 def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:

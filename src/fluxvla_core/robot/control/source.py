@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import ClassVar
@@ -49,7 +50,12 @@ class ChunkSource(ABC):
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
     return at once, ``late`` after a tenth of a second. Calls come from one thread at a time, but
     for ``ask``, which a control process has called from a thread of its own.
+
+    Where another process observes and thinks, ``meanwhile`` is called again and again while
+    ``first_state`` or ``reset`` waits for it, if it is set: an arm that is held hears commands.
     """
+
+    meanwhile: Callable[[], None] | None = None
 
     @abstractmethod
     def first_state(self) -> Array:

@@ -1,6 +1,7 @@
-"""Entry of the control process: ``python -m fluxvla_core.robot.process MEMORY SETUP``.
+"""Entry of the control process: ``python -m fluxvla_core.robot.process MEMORY SETUP [FRAMES]``.
 
-``MEMORY`` and ``SETUP`` are file descriptors: of the shared memory, and of a pipe with the setup.
+All are file descriptors: of the shared memory, of a pipe with the setup, and the three of
+``FrameMemory`` where the operator runs here as a whole.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import os
 import sys
 
 from fluxvla_core.robot.process.control import serve
+from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import error_fields
 from fluxvla_core.robot.process.setup import ControlSetup
@@ -16,12 +18,13 @@ from fluxvla_core.robot.process.setup import ControlSetup
 
 def main() -> None:
     """Build the robot's commanding side, and serve the main process."""
-    memory, setup = map(int, sys.argv[1:])
+    memory, setup, *frames = map(int, sys.argv[1:])
     link = Link(memory, control=True)
     with os.fdopen(setup, encoding="utf-8") as pipe:
         text = pipe.read()
     try:
-        serve(link, ControlSetup.from_json(text))
+        channel = FrameChannel(FrameMemory(*frames)) if frames else None
+        serve(link, ControlSetup.from_json(text), channel)
     except Exception as error:  # noqa: BLE001 - raised in the main process
         link.post("failed", **error_fields(error))
 

@@ -26,6 +26,7 @@ from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.interrupt import Interrupted
 from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.control.safety import Latch
+from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts
@@ -39,12 +40,14 @@ from fluxvla_core.robot.events import (
     Stopped,
 )
 from fluxvla_core.robot.process.event_messages import event_message
+from fluxvla_core.robot.process.frames import FrameChannel
 from fluxvla_core.robot.process.inbox import Inbox
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Message, error_fields
 from fluxvla_core.robot.process.remote_source import RemoteSource
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.process.timed_filters import timed_filters
+from fluxvla_core.robot.process.whole_robot import WholeRobot
 from fluxvla_core.robot.recording.logged import logged
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.tasks import Task
@@ -126,8 +129,13 @@ class LinkObserver(EpisodeObserver):
         file.close()
 
 
-def serve(link: Link, setup: ControlSetup) -> None:
+def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -> None:
     """Carry out the main process's orders until it says ``close``, or is dead.
+
+    Args:
+        link: this process's end.
+        setup: what it is built from.
+        frames: this process's end, for an operator that runs here as a whole.
 
     Raises:
         ConfigError, PluginError: the operator or a filter cannot be built.
@@ -136,9 +144,13 @@ def serve(link: Link, setup: ControlSetup) -> None:
     inbox = Inbox(link, setup.settings.safety)
     _take_signals(inbox)
     logging.getLogger().addHandler(LinkLog(link))
-    robot = setup.make_robot(reporter)
+    robot, execute = setup.make_side(reporter)
+    if isinstance(robot, WholeRobot):
+        assert frames is not None, "the main process shares memory for its pictures"
+        robot.serve(frames, setup.cameras or (), setup.settings.safety.max_age_s)
+        inbox.watch = robot.check_reading
     observer = LinkObserver(link, inbox)
-    parts = _parts(link, setup, robot, inbox, reporter, observer)
+    parts = _parts(link, setup, robot, execute, inbox, reporter, observer)
     history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
     engine = LocalEngine(parts, setup.settings, history)
     link.post("ready")
@@ -229,6 +241,7 @@ def _parts(
     link: Link,
     setup: ControlSetup,
     robot: Robot,
+    execute: Execute,
     inbox: Inbox,
     reporter: Reporter,
     observer: EpisodeObserver,
@@ -249,7 +262,7 @@ def _parts(
         source=make_source,
         filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
         joiner=make_joiner(*setup.joining),
-        execute=robot.play,
+        execute=execute,
         latch=Latch(robot.clock.now),
         interrupts=inbox,
         reporter=reporter,

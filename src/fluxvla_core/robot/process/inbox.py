@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from types import FrameType
@@ -39,6 +40,8 @@ class Inbox(Interrupts):
     Args:
         link: the control process's end.
         safety: how long the main process may be silent.
+
+    ``watch`` is called at every tick while the arm moves, and raises what is to stop it.
     """
 
     def __init__(self, link: Link, safety: SafetySettings) -> None:
@@ -51,6 +54,7 @@ class Inbox(Interrupts):
         self._safety = safety
         self._main = os.getppid()
         self._fault: FluxError | None = None
+        self.watch: Callable[[], None] = lambda: None
 
     def check(self) -> None:
         """Take what came.
@@ -58,7 +62,7 @@ class Inbox(Interrupts):
         Raises:
             Interrupted: the main process got a signal.
             MainSilent: it has not run for too long.
-            FluxError: what the main process says is wrong.
+            FluxError: what the main process, or ``watch``, says is wrong.
         """
         self.poll()
         super().check()
@@ -68,6 +72,8 @@ class Inbox(Interrupts):
             error, self._fault = self._fault, None
             raise error
         self._check_silence()
+        if self.phase.moving:
+            self.watch()
 
     @property
     def orphaned(self) -> bool:

@@ -10,6 +10,7 @@ import threading
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import SafetyStop
 from fluxvla_core.robot.control.safety import Rule
+from fluxvla_core.robot.process.frames import FrameMemory
 from fluxvla_core.robot.process.link import Link, make_memory
 from fluxvla_core.robot.process.setup import ControlSetup
 
@@ -23,8 +24,14 @@ class ControlProcessGone(SafetyStop):
     rule = Rule.CONTROL_PROCESS
 
 
-def launch(setup: ControlSetup) -> tuple[subprocess.Popen[bytes], Link]:
+def launch(
+    setup: ControlSetup, frames: FrameMemory | None = None
+) -> tuple[subprocess.Popen[bytes], Link]:
     """Start a control process; it, and this process's end of the memory that both share.
+
+    Args:
+        setup: what it is built from.
+        frames: for the pictures of an operator that runs there as a whole; remains open.
 
     Raises:
         OSError: the system has no room for it.
@@ -34,8 +41,8 @@ def launch(setup: ControlSetup) -> tuple[subprocess.Popen[bytes], Link]:
     try:
         link = Link(memory, control=False)
         process = subprocess.Popen(
-            [*_COMMAND, str(memory), str(reads)],
-            pass_fds=(memory, reads),
+            [*_COMMAND, *map(str, (memory, reads, *(frames or ())))],
+            pass_fds=(memory, reads, *(frames or ())),
             stdin=subprocess.DEVNULL,
             # Ctrl-C, and a terminal that closes, are for this process alone.
             start_new_session=True,
@@ -64,7 +71,10 @@ def stop_through_new_connection(
         try:
             robot = setup.make_robot(reporter)
             robot.connect()
-            found[:] = [text for text in (robot.stop(), robot.close()) if text]
+            failures = [robot.stop(), robot.close()]
+            if not robot.can_stop:
+                failures = [f"{robot.name} has no stop(): use the robot's emergency stop"]
+            found[:] = [text for text in failures if text]
         except (Exception, SystemExit) as error:  # noqa: BLE001 - reported by the caller
             found[:] = [f"the robot could not be stopped through a fresh connection: {error}"]
 

@@ -26,9 +26,17 @@ SIZE = _TIMES + TO_CONTROL_BYTES + TO_MAIN_BYTES
 
 
 def make_memory() -> int:
-    """A file descriptor of memory for both ends; it is gone with the processes that have it."""
+    """A file descriptor of memory for both ends; it is gone with the processes that have it.
+
+    Raises:
+        OSError: there is not so much memory. Pages that are missing later would crash a process.
+    """
     descriptor = os.memfd_create("fluxvla-robot")
-    os.ftruncate(descriptor, SIZE)
+    try:
+        os.posix_fallocate(descriptor, 0, SIZE)
+    except OSError:
+        os.close(descriptor)
+        raise
     return descriptor
 
 

@@ -37,6 +37,7 @@ from fluxvla_core.robot.process.event_messages import event_of
 from fluxvla_core.robot.process.launch import ControlProcessGone
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Message, error_fields, error_of
+from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.server import LinkServer
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
@@ -61,6 +62,7 @@ class RemoteEngine(Engine):
         interrupts: signals; passed on.
         reporter: shows progress and warnings.
         history: of the runner's earlier runs.
+        frames: shows this process the pictures of an operator that runs as a whole in the other.
     """
 
     def __init__(
@@ -72,8 +74,10 @@ class RemoteEngine(Engine):
         interrupts: Interrupts,
         reporter: Reporter,
         history: RunHistory,
+        frames: RemoteOperator | None = None,
     ) -> None:
         self._setup, self._robot, self._settings = setup, robot, setup.settings
+        self._frames = frames
         self._make_source = make_source
         self._latch, self._interrupts, self._reporter = latch, interrupts, reporter
         self._history = history
@@ -168,9 +172,18 @@ class RemoteEngine(Engine):
         """Start the process, and let it connect to the robot.
 
         Raises:
-            FluxError: its side of the robot cannot be built, or cannot be connected to.
+            FluxError: its side of the robot cannot be built, or cannot be connected to; or this
+                machine has no room for it.
         """
-        self._process, self._link = launch.launch(self._setup)
+        try:
+            cameras, frames = self._setup.cameras or (), self._frames
+            memory = None if frames is None else frames.open(cameras)
+            self._process, self._link = launch.launch(self._setup, memory)
+        except OSError as error:
+            raise RunFailed(
+                f"the control process could not be started: {error}",
+                cause="this machine has no memory or no process to spare",
+            ) from error
         self._lost = 0
         self._server = LinkServer(self._link, self._robot, self._interrupts)
         try:
@@ -442,6 +455,8 @@ class RemoteEngine(Engine):
         self._process.wait()
         self._process = None
         self._server.close()
+        if self._frames is not None:
+            self._frames.close()
 
 
 def _fault(error: BaseException) -> dict[str, Any]:

@@ -85,7 +85,10 @@ class RemoteSource(ChunkSource):
             self._inbox.check()
             if patience_s is not None and time.monotonic() - began > patience_s:
                 raise RunFailed(f"the policy's {what} did not return within {patience_s:g} s")
-            time.sleep(_POLL_S)
+            if self.meanwhile is None:
+                time.sleep(_POLL_S)
+            else:
+                self.meanwhile()
         if "error" in reply.fields:
             raise error_of(reply.fields)
         return reply

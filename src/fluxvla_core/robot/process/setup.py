@@ -14,14 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.build import RunContext, build_action_filter_from_cfg, build_operator_from_cfg
+from fluxvla_core.build import (
+    RunContext,
+    build_action_filter_from_cfg,
+    build_operator_from_cfg,
+    build_runner_from_cfg,
+)
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter, Operator
 from fluxvla_core.plugins.files import load_plugin_files, plugin_files
-from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS
+from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RUNNERS
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.safety import SafetySettings
+from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.episode import EpisodeSettings
+from fluxvla_core.robot.process.whole_robot import WholeRobot
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -45,6 +52,10 @@ class ControlSetup:
         registered: of the operator and the filters those that the main process registered itself:
             registry, name and import path.
         plugin_files: of ``--plugin``, which register their classes; those of this process.
+        cameras: of an operator that runs as a whole in the control process: names of the cameras
+            that the main process is shown. None where it is divided.
+        runner: table of a runner that sends commands, or makes observations, by methods of its own:
+            it is built here too, without a policy. None where there is none.
     """
 
     config: Mapping[str, Any]
@@ -60,6 +71,8 @@ class ControlSetup:
     python_path: Sequence[str] = ()
     registered: Sequence[tuple[str, str, str]] = ()
     plugin_files: Sequence[str] = field(default_factory=plugin_files)
+    cameras: Sequence[str] | None = None
+    runner: Mapping[str, Any] | None = None
 
     def to_json(self) -> str:
         """As JSON.
@@ -84,8 +97,28 @@ class ControlSetup:
         Raises:
             ConfigError, PluginError: the operator cannot be built.
         """
+        return self.make_side(reporter)[0]
+
+    def make_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
+        """The robot that this process commands, not connected, and what sends the commands.
+
+        Raises:
+            ConfigError, PluginError: the operator, or the runner, cannot be built.
+        """
         self._import_registered()
+        if self.runner is not None:
+            runner = build_runner_from_cfg(self.runner, self._context(reporter))
+            robot = WholeRobot(runner.ros_operator, self._spec(), sends=True)
+            execute, observe = runner.commanding_side(robot, self.cameras or ())
+            robot.observed_by(observe)
+            return robot, execute
+        made = self._operators_robot(reporter)
+        return made, made.play
+
+    def _operators_robot(self, reporter: Reporter) -> Robot:
         built = build_operator_from_cfg(self.operator, self._context(reporter))
+        if self.cameras is not None:
+            return WholeRobot(built, self._spec())
         return Robot(Operator.adapt(built).without_cameras() or built, self._spec())
 
     def make_filters(self, reporter: Reporter) -> list[ActionFilter]:
@@ -128,10 +161,13 @@ class ControlSetup:
 
 
 def registered_here(
-    operator: Mapping[str, Any], filters: Sequence[Mapping[str, Any]]
+    operator: Mapping[str, Any],
+    filters: Sequence[Mapping[str, Any]],
+    runner: Mapping[str, Any] | None = None,
 ) -> list[tuple[str, str, str]]:
     """``ControlSetup.registered`` for these tables."""
     tables = [(OPERATORS, operator), *((ACTION_FILTERS, table) for table in filters)]
+    tables += [] if runner is None else [(RUNNERS, runner)]
     found = [(reg.name, t["type"], reg.registered(t["type"])) for reg, t in tables]
     paths = [(registry, name, import_path(cls)) for registry, name, cls in found if cls]
     return [(registry, name, path) for registry, name, path in paths if path]

@@ -1,0 +1,253 @@
+"""GR00T's action head: flow matching by a diffusion transformer, for N1.5 and N1.7.
+
+The path is ``x_t = (1 - t) * noise + t * actions``; the network answers with the velocity
+``actions - noise``. It is told the time in thousandths. Bjorck et al. 2025, "GR00T N1: An Open
+Foundation Model for Generalist Humanoid Robots" (arXiv 2503.14734).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch
+from fluxvla_models.guidance import Guide
+from torch import Tensor, nn
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_gr00t.context import Context
+from fluxvla_gr00t.embodiments import ActionEncoder, EmbodimentMLP
+from fluxvla_gr00t.transformer import ContextBlock, DiT, Kept
+
+_BUCKETS = 1000
+
+
+class GR00TActionHead(nn.Module):
+    """Context and state to action chunk; the defaults are those of GR00T N1.5.
+
+    Everything random comes in with the batch, but for ``dropout`` and ``state_dropout``, which
+    act in training alone; 0 turns them off.
+
+    Args:
+        horizon: actions in a chunk; 16 in N1.5, 40 in N1.7.
+        action_dim, state_dim: widths that actions and states are padded to; 132 each in N1.7.
+        context_dim: width of the backbone's features; the model fills it in.
+        ori_action_dim: the robot's own width; the loss is the mean over these dimensions alone.
+            None: over all.
+        embodiments: kinds of robots with layers of their own.
+        layers: blocks of the diffusion transformer, an even number; 32 in N1.7.
+        heads, head_dim: its attention; the tokens are ``heads * head_dim`` wide.
+        hidden_dim: width inside the encoder of states and the decoder of actions.
+        context_layers, context_heads: of the transformer over the context.
+        future_tokens: learned tokens between state and actions; 0 in N1.7.
+        attend_text_every: of the blocks that attend to the context every so-many-th sees the words,
+            beginning with the first, and the others the pictures; 2 in N1.7. None: all see all.
+        max_steps: longest chunk that there are positions for.
+        num_steps: Euler steps from noise to actions.
+        dropout: 0.2, as published.
+        state_dropout: probability of training on a sample without its state; 0.2 in N1.7.
+        attend_padding: let attention see padding (but not where ``attend_text_every`` masks it),
+            as the published training code does. A sample's result then depends on how long the
+            longest of its batch is. False: it is what that code gives for the sample alone.
+        mean_over_valid: divide the loss by the number of unmasked actions of the batch, as the
+            published training code does. A sample's weight then depends on the others of its
+            batch, so that several processes train another loss than one. False: by all actions.
+    """
+
+    def __init__(
+        self,
+        horizon: int = 16,
+        action_dim: int = 32,
+        state_dim: int = 64,
+        context_dim: int | None = None,
+        ori_action_dim: int | None = None,
+        embodiments: int = 32,
+        layers: int = 16,
+        heads: int = 32,
+        head_dim: int = 48,
+        hidden_dim: int = 1024,
+        context_layers: int = 4,
+        context_heads: int = 32,
+        future_tokens: int = 32,
+        attend_text_every: int | None = None,
+        max_steps: int = 1024,
+        num_steps: int = 4,
+        dropout: float = 0.2,
+        state_dropout: float = 0.0,
+        attend_padding: bool = False,
+        mean_over_valid: bool = False,
+    ) -> None:
+        super().__init__()
+        _check(
+            horizon=(horizon, 1, max_steps),
+            ori_action_dim=(
+                action_dim if ori_action_dim is None else ori_action_dim,
+                1,
+                action_dim,
+            ),
+            num_steps=(num_steps, 1, _BUCKETS),
+            embodiments=(embodiments, 1, None),
+            attend_text_every=(2 if attend_text_every is None else attend_text_every, 2, None),
+        )
+        if context_dim is None or context_dim % context_heads:
+            raise ConfigError(
+                f"GR00TActionHead: context_dim {context_dim} is not a multiple of context_heads "
+                f"{context_heads}",
+                cause="the model fills in the width of its backbone's features",
+            )
+        if layers % 2:
+            raise ConfigError(
+                f"GR00TActionHead: layers {layers} is odd",
+                cause="blocks that see the context and blocks that do not stand in pairs",
+            )
+        width = heads * head_dim
+        self.horizon, self.action_dim, self.state_dim = horizon, action_dim, state_dim
+        self.loss_dim = action_dim if ori_action_dim is None else ori_action_dim
+        self.embodiments = embodiments
+        self.attend_text_every, self.attend_padding = attend_text_every, attend_padding
+        self.num_steps, self.state_dropout = num_steps, state_dropout
+        self.mean_over_valid = mean_over_valid
+        self.context_norm = nn.LayerNorm(context_dim)
+        self.context_blocks = nn.ModuleList(
+            ContextBlock(context_heads, context_dim // context_heads, dropout)
+            for _ in range(context_layers)
+        )
+        self.state_encoder = EmbodimentMLP(embodiments, state_dim, hidden_dim, width)
+        self.action_encoder = ActionEncoder(embodiments, action_dim, width)
+        self.positions = nn.Embedding(max_steps, width)
+        self.future_tokens = nn.Embedding(future_tokens, width) if future_tokens else None
+        self.dit = DiT(layers, heads, head_dim, context_dim, hidden_dim, dropout)
+        self.action_decoder = EmbodimentMLP(embodiments, hidden_dim, hidden_dim, action_dim)
+        for table in (self.positions, self.future_tokens):
+            if table is not None:
+                nn.init.normal_(table.weight, std=0.02)
+
+    def read(self, context: Context) -> Context:
+        """The context with its features as the diffusion transformer attends to them."""
+        features = self.context_norm(context.features)
+        mask = None if self.attend_padding else context.mask
+        for block in self.context_blocks:
+            features = block(features, mask)
+        return Context(features, context.mask, context.pictures)
+
+    def encode_states(self, states: Tensor, ids: Tensor) -> Tensor:
+        """``(B, S)`` and ``ids`` ``(B,)`` -> tokens ``(B, 1, W)``."""
+        tokens = self.state_encoder(states[:, None], ids)
+        if self.training and self.state_dropout > 0:
+            kept = torch.rand(len(tokens), 1, 1, device=tokens.device) >= self.state_dropout
+            tokens = tokens * kept.to(tokens.dtype)
+        return tokens
+
+    def velocity(
+        self,
+        x: Tensor,
+        steps: Tensor,
+        context: Context,
+        state: Tensor,
+        ids: Tensor,
+        kept: list[Kept] | None = None,
+    ) -> Tensor:
+        """The velocity ``(B, T, D)`` at ``x`` ``(B, T, D)``.
+
+        Args:
+            steps: ``(B,)`` int64, the time in thousandths.
+            context: what ``read`` gave; state: what ``encode_states`` gave; ids: ``(B,)`` int64.
+            kept: what the blocks keep of the context from one step to the next.
+        """
+        actions = self.action_encoder(x, steps, ids)
+        actions = actions + self.positions.weight[: x.shape[1]].to(actions.dtype)
+        tokens = [state, actions]
+        if self.future_tokens is not None:
+            future = self.future_tokens.weight.to(actions.dtype)
+            tokens.insert(1, future.expand(len(x), -1, -1))
+        joined = torch.cat(tokens, dim=1)
+        found = self.dit(joined, steps, context.features, self._masks(context), kept)
+        return self.action_decoder(found[:, -x.shape[1] :], ids)
+
+    def errors(
+        self,
+        context: Context,
+        states: Tensor,
+        ids: Tensor,
+        actions: Tensor,
+        noise: Tensor,
+        time: Tensor,
+    ) -> Tensor:
+        """Squared errors of the velocity ``(B * K, T, ori_action_dim)``, a sample's draws in a row.
+
+        Args:
+            states: ``(B, S)``; ids: ``(B,)`` int64; actions: ``(B, T, D)`` normalised.
+            noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1.
+        """
+        draws = noise.shape[1]
+        read = self.read(context).repeated(draws)
+        state = self.encode_states(states, ids).repeat_interleave(draws, 0)
+        clean = actions[:, None].expand_as(noise)
+        t = time[..., None, None]
+        mixed = ((1 - t) * noise + t * clean).flatten(0, 1)
+        target = (clean - noise).flatten(0, 1)
+        steps = (time.flatten() * _BUCKETS).long()
+        found = self.velocity(mixed, steps, read, state, ids.repeat_interleave(draws, 0))
+        return (found - target)[..., : self.loss_dim].float().square()
+
+    def loss(self, errors: Tensor, masks: Tensor) -> Tensor:
+        """The mean of ``errors`` ``(B * K, T, D)``, where ``masks`` ``(B, T)`` is 0 counted as 0.
+
+        See ``mean_over_valid`` for what it is divided by.
+        """
+        weights = masks.to(errors.dtype).repeat_interleave(len(errors) // len(masks), 0)[..., None]
+        if not self.mean_over_valid:
+            return (errors * weights).mean()
+        return (errors * weights).sum() / (weights.sum() * errors.shape[-1]).clamp(min=1)
+
+    def sample(
+        self,
+        context: Context,
+        states: Tensor,
+        ids: Tensor,
+        noise: Tensor,
+        guide: Guide | None = None,
+    ) -> Tensor:
+        """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps.
+
+        With ``guide`` to one that goes on from another; that takes a backward pass for each step.
+        """
+        read = self.read(context)
+        state = self.encode_states(states, ids)
+        kept = [Kept() for _ in range(len(self.dit.blocks) // 2)]
+        x = noise
+        for step in range(self.num_steps):
+            share = step / self.num_steps
+            steps = torch.full((len(x),), int(share * _BUCKETS), device=x.device)
+            at = partial(self.velocity, steps=steps, context=read, state=state, ids=ids, kept=kept)
+            if guide is None:
+                x = x + at(x) / self.num_steps
+                continue
+            found, pull = guide.pull(partial(_estimate, at, share), x, share)
+            x = x + (found - x) / (self.num_steps - step) + pull / self.num_steps
+        return x if guide is None else guide.freeze(x)
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        return [*self.context_blocks, *self.dit.blocks]
+
+    def _masks(self, context: Context) -> list[Tensor | None]:
+        """What of the context each block sees that attends to it."""
+        pairs = len(self.dit.blocks) // 2
+        if self.attend_text_every is None:
+            return [None if self.attend_padding else context.mask] * pairs
+        words, pictures = context.mask & ~context.pictures, context.mask & context.pictures
+        every = self.attend_text_every
+        return [pictures if pair % every else words for pair in range(pairs)]
+
+
+def _estimate(velocity: Any, share: float, x: Tensor) -> Tensor:
+    """The clean chunk behind ``x`` at time ``share``."""
+    return x + (1 - share) * velocity(x)
+
+
+def _check(**numbers: tuple[int, int, int | None]) -> None:
+    for name, (value, least, most) in numbers.items():
+        if value < least or (most is not None and value > most):
+            between = f"at least {least}" if most is None else f"in {least}..{most}"
+            raise ConfigError(f"GR00TActionHead: {name} must be {between}, got {value}")

@@ -1,0 +1,133 @@
+"""Eagle 2.5, what GR00T N1.5 sees and reads with: SigLIP2, a linear layer and layers of Qwen3."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from transformers import Qwen3Config, Qwen3Model, SiglipVisionConfig, SiglipVisionModel
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_gr00t.context import Context
+from fluxvla_gr00t.places import check_tokens, fill_places, seen_places
+
+
+class EagleBackbone(nn.Module):
+    """Pictures and tokens to features; the defaults are those of GR00T N1.5.
+
+    The vision tower is SigLIP2's without its pooling head, the language model Qwen3-1.7B's first
+    layers and its last norm. Weights of the published model that nothing here reads (the pooling
+    head, the output layer over words) are not in it.
+
+    Args:
+        image_size, patch_size: pixels of a picture's side and of a patch's; a picture takes
+            ``(image_size / patch_size)^2`` places between the words: 256.
+        vision_dim, vision_layers, vision_heads, vision_mlp: the vision tower.
+        text_dim, text_layers, text_heads, text_kv_heads, text_head_dim, text_mlp, vocabulary: the
+            language model; ``text_layers`` is the published ``select_layer``.
+        rope_theta: base of its rotary positions.
+        picture_token: the token that stands for a part of a picture, ``<IMG_CONTEXT>``.
+    """
+
+    def __init__(
+        self,
+        image_size: int = 224,
+        patch_size: int = 14,
+        vision_dim: int = 1152,
+        vision_layers: int = 27,
+        vision_heads: int = 16,
+        vision_mlp: int = 4304,
+        text_dim: int = 2048,
+        text_layers: int = 12,
+        text_heads: int = 16,
+        text_kv_heads: int = 8,
+        text_head_dim: int = 128,
+        text_mlp: int = 6144,
+        vocabulary: int = 151680,
+        rope_theta: float = 1e6,
+        picture_token: int = 151669,
+    ) -> None:
+        super().__init__()
+        if image_size % patch_size:
+            raise ConfigError(
+                f"EagleBackbone: image_size {image_size} is not a multiple of patch_size "
+                f"{patch_size}"
+            )
+        check_tokens("EagleBackbone", picture_token, vocabulary)
+        self.out_dim = text_dim
+        self.image_size = image_size
+        self.picture_token = picture_token
+        self.places = (image_size // patch_size) ** 2
+        self.vision = SiglipVisionModel(
+            SiglipVisionConfig(
+                image_size=image_size,
+                patch_size=patch_size,
+                hidden_size=vision_dim,
+                num_hidden_layers=vision_layers,
+                num_attention_heads=vision_heads,
+                intermediate_size=vision_mlp,
+                vision_use_head=False,
+                attn_implementation="sdpa",
+            )
+        )
+        self.connect = nn.Linear(vision_dim, text_dim)
+        self.text = Qwen3Model(
+            Qwen3Config(
+                vocab_size=vocabulary,
+                hidden_size=text_dim,
+                num_hidden_layers=text_layers,
+                num_attention_heads=text_heads,
+                num_key_value_heads=text_kv_heads,
+                head_dim=text_head_dim,
+                intermediate_size=text_mlp,
+                rms_norm_eps=1e-6,
+                rope_parameters={"rope_type": "default", "rope_theta": rope_theta},
+                attn_implementation="sdpa",
+                use_cache=False,
+            )
+        )
+
+    def forward(
+        self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor, img_masks: Tensor | None
+    ) -> Context:
+        """What is seen and read, as it is behind the last layer and its norm.
+
+        Args:
+            images: ``(B, 3N, H, W)`` normalised.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the places of N pictures.
+            img_masks: ``(B, N)`` bool, False where a camera's picture is absent; None: all there.
+
+        Raises:
+            ConfigError: pictures of another size, or tokens with places for another number.
+        """
+        count = _count(images, self.image_size)
+        where, mask = seen_places(
+            lang_tokens, lang_masks, img_masks, self.picture_token, count, self.places
+        )
+        pictures = images.unflatten(1, (count, 3)).flatten(0, 1)
+        seen = self.connect(self.vision(pixel_values=pictures).last_hidden_state)
+        words = self.text.embed_tokens(lang_tokens)
+        embedded = fill_places(words, where, seen.flatten(0, 1))
+        # Positions count real tokens alone, so that padding shifts nothing.
+        positions = (lang_masks.long().cumsum(1) - 1).clamp(min=0)
+        read = self.text(
+            inputs_embeds=embedded,
+            attention_mask=mask.long(),
+            position_ids=positions,
+            use_cache=False,
+        )
+        return Context(read.last_hidden_state, mask, where)
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        return [*self.vision.encoder.layers, *self.text.layers]
+
+
+def _count(images: Tensor, size: int) -> int:
+    """How many pictures there are in ``images`` ``(B, 3N, H, W)``."""
+    planes, height, width = images.shape[1:]
+    if planes % 3 or (height, width) != (size, size):
+        raise ConfigError(
+            f"EagleBackbone: images have shape {tuple(images.shape)}, (B, 3N, {size}, {size}) "
+            "expected",
+            next=f"ResizeImages(height={size}, width={size}) among the transforms",
+        )
+    return planes // 3

@@ -1,0 +1,198 @@
+"""The checkpoints that NVIDIA publishes, and its Isaac-GR00T saves, of GR00T N1.5 and N1.7."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fluxvla_core.errors import CheckpointError, FluxError
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.results import read_json
+from fluxvla_gr00t.robots import n15_robot, n17_robot
+from fluxvla_gr00t.tables import (
+    checkpoint,
+    model_table,
+    n15_transforms,
+    n17_transforms,
+    resize_table,
+)
+
+_FIXED = {
+    "add_pos_embed": True,
+    "use_vlln": True,
+    "num_timestep_buckets": 1000,
+    "state_history_length": 1,
+    "expand_batch": None,
+    "exclude_state": False,
+    "apply_sincos_state_encoding": False,
+}
+"""Settings that change what the model computes, and the values that are known here."""
+_FIXED_DIT = {
+    "norm_type": "ada_norm",
+    "positional_embeddings": None,
+    "interleave_self_attention": True,
+}
+
+
+class GR00TN15Format(CheckpointFormat):
+    """Folders of GR00T N1.5: ``config.json``, ``model*.safetensors``, ``experiment_cfg``."""
+
+    name: ClassVar[str] = "gr00t"
+    model_types: ClassVar[tuple[str, ...]] = ("GR00T",)
+
+    def recognizes(self, folder: Path) -> bool:
+        """Whether its ``config.json`` is of GR00T N1.5."""
+        return _model_type(folder) == "gr00t_n1_5"
+
+    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+        """The checkpoint in ``folder``.
+
+        Args:
+            tokenizer: the folder of Eagle's tokenizer.
+
+        Raises:
+            CheckpointError: it is damaged, or does something that GR00T here does not.
+        """
+        file = folder / "config.json"
+        config = read_json(file, dict[str, Any], CheckpointError)
+        robot = n15_robot(folder)
+        settings = _Settings(config.get("action_head_cfg"), str(file))
+        backbone = _Settings(config.get("backbone_cfg"), str(file))
+        if backbone.get("project_to_dim") is not None:
+            raise CheckpointError(
+                f"backbone_cfg.project_to_dim is {backbone.get('project_to_dim')}, None is known",
+                where=str(file),
+            )
+        head = {
+            **_head(settings),
+            "action_dim": settings.count("action_dim"),
+            "future_tokens": settings.count("num_target_vision_tokens"),
+        }
+        model = model_table("n1.5", head, robot, backbone.count("select_layer"))
+        transforms = n15_transforms(model, robot, tokenizer)
+        return checkpoint("n1.5", safetensors_in(folder), model, transforms, robot, str(folder))
+
+
+class GR00TN17Format(CheckpointFormat):
+    """Folders of GR00T N1.7: ``config.json``, ``model*.safetensors``, ``processor_config.json``,
+    ``statistics.json`` and ``embodiment_id.json``."""
+
+    name: ClassVar[str] = "gr00t"
+    model_types: ClassVar[tuple[str, ...]] = ("GR00T",)
+
+    def recognizes(self, folder: Path) -> bool:
+        """Whether its ``config.json`` is of GR00T N1.7."""
+        return _model_type(folder) == "Gr00tN1d7"
+
+    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+        """The checkpoint in ``folder``.
+
+        Args:
+            tokenizer: the folder of Qwen3-VL's tokenizer.
+
+        Raises:
+            CheckpointError: it is damaged, or does something that GR00T here does not.
+        """
+        file = folder / "config.json"
+        settings = _Settings(read_json(file, dict[str, Any], CheckpointError), str(file))
+        processing = folder / "processor_config.json"
+        kwargs: Mapping[str, Any] = {"modality_configs": {}}
+        if processing.is_file():
+            content = read_json(processing, dict[str, Any], CheckpointError)
+            kwargs = _Settings(content.get("processor_kwargs"), str(processing)).values
+        robot = n17_robot(folder, kwargs)
+        alternate = settings.get("use_alternate_vl_dit", True)
+        head = {
+            **_head(settings),
+            "action_dim": settings.count("max_action_dim"),
+            "future_tokens": 0,
+            "attend_text_every": settings.count("attend_text_every_n_blocks")
+            if alternate
+            else None,
+            "state_dropout": float(settings.get("state_dropout_prob", 0.0)),
+        }
+        model = model_table("n1.7", head, robot, settings.count("select_layer"))
+        both = {**settings.values, **kwargs}
+        _Settings(both, str(processing)).square("image_target_size")
+        transforms = n17_transforms(
+            model,
+            robot,
+            tokenizer,
+            resize_table(both),
+            bool(kwargs.get("formalize_language", True)),
+            bool(kwargs.get("clip_outliers", True)),
+        )
+        return checkpoint("n1.7", safetensors_in(folder), model, transforms, robot, str(folder))
+
+
+class _Settings:
+    """Settings of a ``config.json``, read one by one."""
+
+    def __init__(self, values: Any, where: str) -> None:
+        if not isinstance(values, dict):
+            raise CheckpointError("the settings of the model are no table", where=where)
+        self.values: dict[str, Any] = values
+        self.where = where
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self.values.get(name, default)
+
+    def count(self, name: str) -> int:
+        value = self.values.get(name)
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise CheckpointError(
+                f"{name} is {value!r}, a whole number is expected", where=self.where
+            )
+        return value
+
+    def table(self, name: str) -> _Settings:
+        return _Settings(self.values.get(name), self.where)
+
+    def square(self, name: str) -> None:
+        value = self.values.get(name)
+        if value is not None and (len(value) != 2 or value[0] != value[1]):
+            raise CheckpointError(f"{name} {value} is not square", where=self.where)
+
+    def require(self, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
+            found = self.values.get(name, value)
+            if found != value:
+                raise CheckpointError(
+                    f"{name} is {found!r}, {value!r} is known here",
+                    where=self.where,
+                    cause="the model computes something else than GR00T as it is built here",
+                )
+
+
+def _head(settings: _Settings) -> dict[str, Any]:
+    """What both versions say of the head in the same words."""
+    dit, context = settings.table("diffusion_model_cfg"), settings.table("vl_self_attention_cfg")
+    settings.require(_FIXED)
+    dit.require({**_FIXED_DIT, "output_dim": settings.count("hidden_size")})
+    context.require({"positional_embeddings": None, "dropout": dit.get("dropout")})
+    return {
+        "type": "GR00TActionHead",
+        "horizon": settings.count("action_horizon"),
+        "state_dim": settings.count("max_state_dim"),
+        "embodiments": settings.count("max_num_embodiments"),
+        "layers": dit.count("num_layers"),
+        "heads": dit.count("num_attention_heads"),
+        "head_dim": dit.count("attention_head_dim"),
+        "hidden_dim": settings.count("hidden_size"),
+        "context_layers": context.count("num_layers"),
+        "context_heads": context.count("num_attention_heads"),
+        "max_steps": settings.count("max_seq_len"),
+        "num_steps": settings.count("num_inference_timesteps"),
+        "dropout": float(dit.get("dropout", 0.0)),
+    }
+
+
+def _model_type(folder: Path) -> str | None:
+    """``model_type`` of ``config.json``; None if there is none, or it is LeRobot's config."""
+    try:
+        config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
+    except FluxError:
+        return None
+    kind = config.get("model_type")
+    return kind if isinstance(kind, str) and "type" not in config else None

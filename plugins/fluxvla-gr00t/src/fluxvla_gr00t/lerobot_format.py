@@ -1,0 +1,184 @@
+"""GR00T as LeRobot saves it: ``config.json``, ``model.safetensors`` and two processors.
+
+N1.5 was saved by LeRobot up to 0.5, N1.7 is by LeRobot 0.6. The sizes of the model are not in the
+files; they are those that NVIDIA publishes. The step that packs inputs has what is known of the
+robot in ``policy_preprocessor.json``, and statistics as ``feature.statistic`` in a file of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from fluxvla_core.errors import CheckpointError, FluxError
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.results import read_json
+from fluxvla_gr00t.robots import GRIPPER, Robot, flat_robot, grouped_robot
+from fluxvla_gr00t.tables import (
+    checkpoint,
+    model_table,
+    n15_transforms,
+    n17_transforms,
+    resize_table,
+)
+
+PACKS = {"groot_pack_inputs_v3": "n1.5", "groot_n1_7_pack_inputs_v1": "n1.7"}
+"""The step that packs inputs -> the version."""
+HEADS: dict[str, dict[str, Any]] = {
+    "n1.5": {"type": "GR00TActionHead", "horizon": 16},
+    "n1.7": {
+        "type": "GR00TActionHead",
+        "horizon": 40,
+        "layers": 32,
+        "future_tokens": 0,
+        "attend_text_every": 2,
+        "state_dropout": 0.2,
+    },
+}
+_PREFIX = "_groot_model."
+_IMAGES = "observation.images."
+_PRE, _POST = "policy_preprocessor.json", "policy_postprocessor.json"
+
+
+class LeRobotGR00TFormat(CheckpointFormat):
+    """Folders of LeRobot's ``save_pretrained``."""
+
+    name: ClassVar[str] = "lerobot"
+    model_types: ClassVar[tuple[str, ...]] = ("GR00T",)
+
+    def recognizes(self, folder: Path) -> bool:
+        """Whether its ``config.json`` says ``"type": "groot"``."""
+        try:
+            config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
+        except FluxError:
+            return False
+        return config.get("type") == "groot"
+
+    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+        """The checkpoint in ``folder``.
+
+        Args:
+            tokenizer: the folder of the backbone's tokenizer.
+
+        Raises:
+            CheckpointError: it is damaged, or has steps that are not LeRobot's for GR00T.
+        """
+        config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
+        steps, packing, version = _preprocessor(folder)
+        pack = _config_of(packing)
+        robot = _robot(folder, packing, config)
+        head = {
+            **HEADS[version],
+            "action_dim": _count(pack, "max_action_dim", folder / _PRE),
+            "state_dim": _count(pack, "max_state_dim", folder / _PRE),
+        }
+        if config.get("num_inference_timesteps") is not None:
+            head["num_steps"] = _count(config, "num_inference_timesteps", folder / "config.json")
+        model = model_table(version, head, robot)
+        if version == "n1.5":
+            transforms = n15_transforms(model, robot, tokenizer)
+        else:
+            encode = _config_of(steps.get("groot_n1_7_vlm_encode_v1", {}))
+            transforms = n17_transforms(
+                model,
+                robot,
+                tokenizer,
+                resize_table(encode),
+                bool(pack.get("formalize_language", True)),
+                bool(pack.get("clip_outliers", True)),
+            )
+        stored = {n.removeprefix(_PREFIX): t for n, t in safetensors_in(folder).items()}
+        return checkpoint(version, stored, model, transforms, robot, str(folder))
+
+
+def _preprocessor(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """All steps by their names, the one that packs inputs, and the version that it is of."""
+    content = read_json(folder / _PRE, dict[str, Any], CheckpointError)
+    listed = content.get("steps")
+    if not isinstance(listed, list) or not all(isinstance(step, dict) for step in listed):
+        raise CheckpointError("steps: no list of tables", where=str(folder / _PRE))
+    steps = {str(step.get("registry_name")): step for step in listed}
+    found = [name for name in PACKS if name in steps]
+    if len(found) != 1:
+        raise CheckpointError(
+            f"the processor has the steps {', '.join(steps)}; one of {', '.join(PACKS)} is "
+            "expected",
+            where=str(folder / _PRE),
+            cause="it was saved by another version of LeRobot",
+        )
+    return steps, steps[found[0]], PACKS[found[0]]
+
+
+def _robot(folder: Path, packing: Mapping[str, Any], config: Mapping[str, Any]) -> Robot:
+    """The robot, without statistics where something is done to its actions that is not here."""
+    where = str(folder / _PRE)
+    pack = _config_of(packing)
+    tag, numbers = pack.get("embodiment_tag"), pack.get("embodiment_mapping")
+    # LeRobot takes 0 for a tag that is not listed.
+    number = numbers.get(tag, 0) if isinstance(numbers, dict) else None
+    if not isinstance(tag, str) or not isinstance(number, int):
+        raise CheckpointError("embodiment_mapping: no number for embodiment_tag", where=where)
+    content = read_json(folder / _POST, dict[str, Any], CheckpointError)
+    post = {str(s.get("registry_name")): _config_of(s) for s in content.get("steps") or []}
+    grouped = "groot_n1_7_action_decode_v1"
+    if grouped in post and pack.get("raw_stats") and pack.get("modality_config"):
+        settings = {
+            "use_percentiles": pack.get("use_percentiles"),
+            "use_relative_action": post[grouped].get("use_relative_action"),
+        }
+        tables = pack["modality_config"], pack["raw_stats"]
+        robot = grouped_robot(tag, number, *tables, settings, where)
+    else:
+        robot = flat_robot(tag, number, _state_of(folder, packing), where)
+    trained = pack.get("valid_action_horizon")
+    horizon = trained if isinstance(trained, int) else robot.horizon
+    robot = replace(robot, img_keys=_cameras(config, pack), horizon=horizon)
+    changed = ("libero_gripper_action", "action_decode_transform")
+    if any(step.get(name) for step in post.values() for name in changed):
+        return replace(robot, statistics={}, notes=(GRIPPER,))
+    if "absolute_actions_processor" in post:
+        return replace(robot, statistics={}, notes=(*robot.notes, _RELATIVE))
+    return robot
+
+
+_RELATIVE = (
+    "LeRobot counts its actions from the state by a step of its own, which is not done here: it "
+    "can be trained on, and drives no robot"
+)
+
+
+def _cameras(config: Mapping[str, Any], pack: Mapping[str, Any]) -> tuple[str, ...]:
+    """Cameras in the order of the model: as listed, otherwise by their names."""
+    features = config.get("input_features") or {}
+    names = sorted(n.removeprefix(_IMAGES) for n in features if n.startswith(_IMAGES))
+    wanted = pack.get("video_modality_keys") or []
+    # LeRobot's conversions of LIBERO call the wrist's camera so.
+    alias = {"wrist_image": "image2"}
+    ordered = [n if n in names else alias.get(n) for n in wanted]
+    listed = tuple(name for name in ordered if name in names)
+    return listed or tuple(names)
+
+
+def _state_of(folder: Path, packing: Mapping[str, Any]) -> dict[str, Any]:
+    """The statistics of a step: ``feature.statistic`` -> list; nothing if it has none."""
+    file = packing.get("state_file")
+    if not isinstance(file, str):
+        return {}
+    if Path(file).name != file:
+        raise CheckpointError(f"{file!r} is not a file next to it", where=str(folder / _PRE))
+    stored = safetensors_in(folder, file.removesuffix(".safetensors"))
+    return {name: t[tuple(slice(None) for _ in t.shape)].tolist() for name, t in stored.items()}
+
+
+def _config_of(step: Mapping[str, Any]) -> dict[str, Any]:
+    config = step.get("config")
+    return config if isinstance(config, dict) else {}
+
+
+def _count(config: Mapping[str, Any], name: str, file: Path) -> int:
+    value = config.get(name)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise CheckpointError(f"{name} is {value!r}, a whole number is expected", where=str(file))
+    return value

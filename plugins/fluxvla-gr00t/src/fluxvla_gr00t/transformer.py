@@ -1,0 +1,196 @@
+"""The transformers of GR00T's action head: a diffusion transformer, and one over the context.
+
+The diffusion transformer (DiT, Peebles and Xie 2023) takes the time through adaptive layer
+normalisation. Its even blocks attend to the context, its odd ones to their own tokens. What each
+number is (epsilons, order of sines and cosines, order of shift and scale) follows the published
+models, whose weights are of use with these alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+_SINES = 256
+_LONGEST = 10000.0
+
+
+@dataclass
+class Kept:
+    """Keys and values of a context, ``(B, heads, L, head_dim)``, once they have been computed.
+
+    They do not depend on the noisy actions, so that the steps of an integration share them.
+    """
+
+    key: Tensor | None = None
+    value: Tensor | None = None
+
+
+class Attention(nn.Module):
+    """Multi-head attention of ``x`` ``(B, T, W)`` to itself or to ``context`` ``(B, L, C)``."""
+
+    def __init__(self, width: int, context_dim: int, heads: int, head_dim: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, heads * head_dim)
+        self.key = nn.Linear(context_dim, heads * head_dim)
+        self.value = nn.Linear(context_dim, heads * head_dim)
+        self.out = nn.Linear(heads * head_dim, width)
+
+    def forward(
+        self, x: Tensor, context: Tensor, mask: Tensor | None = None, kept: Kept | None = None
+    ) -> Tensor:
+        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it.
+
+        ``kept``: keys and values of this same context from before; it is filled if it is empty.
+        """
+        query = self._heads(self.query(x))
+        if kept is None or kept.key is None or kept.value is None:
+            key, value = self._heads(self.key(context)), self._heads(self.value(context))
+            if kept is not None:
+                kept.key, kept.value = key.detach(), value.detach()
+        else:
+            key, value = kept.key, kept.value
+        seen = None if mask is None else mask[:, None, None, :]
+        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=seen)
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+    def _heads(self, made: Tensor) -> Tensor:
+        return made.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+
+class FeedForward(nn.Module):
+    """Two layers with a GELU (its tanh form) between them, four times as wide."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.expand = nn.Linear(width, 4 * width)
+        self.contract = nn.Linear(4 * width, width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        hidden = self.dropout(functional.gelu(self.expand(x), approximate="tanh"))
+        return self.dropout(self.contract(hidden))
+
+
+class DiTBlock(nn.Module):
+    """One block of the diffusion transformer.
+
+    Args:
+        width: of the tokens, ``heads * head_dim``.
+        context_dim: width of the context; None: it attends to its own tokens.
+        dropout: behind the attention (twice, as the published models were trained) and in the MLP.
+    """
+
+    def __init__(
+        self, width: int, heads: int, head_dim: int, context_dim: int | None, dropout: float
+    ) -> None:
+        super().__init__()
+        self.modulate = nn.Linear(width, 2 * width)
+        self.attention = Attention(width, context_dim or width, heads, head_dim)
+        self.feed_forward = FeedForward(width, dropout)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        x: Tensor,
+        time: Tensor,
+        context: Tensor | None = None,
+        mask: Tensor | None = None,
+        kept: Kept | None = None,
+    ) -> Tensor:
+        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``."""
+        scale, shift = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
+        normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
+        attended = self.attention(normal, normal if context is None else context, mask, kept)
+        x = x + self.dropout(self.dropout(attended))
+        return x + self.feed_forward(functional.layer_norm(x, x.shape[-1:], eps=1e-5))
+
+
+class ContextBlock(nn.Module):
+    """One block of plain self-attention over what the backbone saw and read."""
+
+    def __init__(self, heads: int, head_dim: int, dropout: float) -> None:
+        super().__init__()
+        width = heads * head_dim
+        self.attention_norm = nn.LayerNorm(width, eps=1e-5)
+        self.attention = Attention(width, width, heads, head_dim)
+        self.feed_forward_norm = nn.LayerNorm(width, eps=1e-5)
+        self.feed_forward = FeedForward(width, dropout)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
+        """``x`` ``(B, L, C)``, ``mask`` ``(B, L)`` bool: what is seen; None: all."""
+        normal = self.attention_norm(x)
+        x = x + self.dropout(self.dropout(self.attention(normal, normal, mask)))
+        return x + self.feed_forward(self.feed_forward_norm(x))
+
+
+class TimeEncoder(nn.Module):
+    """Time step ``(B,)`` int64 -> ``(B, W)``: 128 cosines, 128 sines and two layers."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(_SINES, width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, steps: Tensor) -> Tensor:
+        half = _SINES // 2
+        powers = torch.arange(half, device=steps.device, dtype=torch.float32) / (half - 1)
+        angles = steps[:, None].float() * torch.exp(-math.log(_LONGEST) * powers)
+        waves = torch.cat([angles.cos(), angles.sin()], dim=-1).to(self.hidden.weight.dtype)
+        return self.out(functional.silu(self.hidden(waves)))
+
+
+class DiT(nn.Module):
+    """The diffusion transformer: tokens ``(B, T, W)`` -> ``(B, T, out_dim)``.
+
+    Args:
+        layers, heads, head_dim: its size; ``W`` is ``heads * head_dim``.
+        context_dim: width of the context that the even blocks attend to.
+        out_dim: width of the result.
+        dropout: see ``DiTBlock``.
+    """
+
+    def __init__(
+        self, layers: int, heads: int, head_dim: int, context_dim: int, out_dim: int, dropout: float
+    ) -> None:
+        super().__init__()
+        width = heads * head_dim
+        self.time = TimeEncoder(width)
+        self.blocks = nn.ModuleList(
+            DiTBlock(width, heads, head_dim, None if layer % 2 else context_dim, dropout)
+            for layer in range(layers)
+        )
+        self.modulate = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, out_dim)
+
+    def forward(
+        self,
+        x: Tensor,
+        steps: Tensor,
+        context: Tensor,
+        masks: list[Tensor | None],
+        kept: list[Kept] | None = None,
+    ) -> Tensor:
+        """``x`` ``(B, T, W)`` at ``steps`` ``(B,)`` int64.
+
+        Args:
+            context: ``(B, L, C)``.
+            masks: for each even block ``(B, L)`` bool, what of the context it sees; None: all.
+            kept: for each even block its keys and values of this same context.
+        """
+        time = self.time(steps)
+        for layer, block in enumerate(self.blocks):
+            if layer % 2:
+                x = block(x, time)
+            else:
+                pair = layer // 2
+                x = block(x, time, context, masks[pair], None if kept is None else kept[pair])
+        shift, scale = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
+        normal = functional.layer_norm(x, x.shape[-1:], eps=1e-6)
+        return self.out(normal * (1 + scale) + shift)

@@ -1,0 +1,44 @@
+"""Names of the tensors of LeRobot's ACT and Diffusion Policy, and of ours.
+
+Each function takes LeRobot's name and gives ours; None for what is no weight: tables of positions
+that follow from the architecture, and statistics that older versions kept among the weights.
+"""
+
+from __future__ import annotations
+
+import re
+
+_NETWORK = {
+    "0": "conv1",
+    "1": "bn1",
+    "4": "layer1",
+    "5": "layer2",
+    "6": "layer3",
+    "7": "layer4",
+}
+"""Places in LeRobot's sequence of a residual network's parts (2 and 3 have no weights)."""
+_BACKBONE = re.compile(r"^(rgb_encoders\.\d+\.backbone\.)(\d+)\.")
+STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+"""How names of statistics begin, in checkpoints from before processors were saved."""
+
+
+def act_name(name: str) -> str | None:
+    """``model.encoder.…`` -> ``encoder.…``."""
+    if name.startswith(STATISTICS) or name == "model.vae_encoder_pos_enc":
+        return None
+    return name.removeprefix("model.")
+
+
+def diffusion_name(name: str) -> str | None:
+    """``diffusion.rgb_encoder.0.backbone.4.0.conv1.weight`` ->
+    ``rgb_encoders.0.backbone.layer1.0.conv1.weight``; a shared encoder is number 0."""
+    if name.startswith(STATISTICS) or name.endswith(".pool.pos_grid"):
+        return None
+    ours = name.removeprefix("diffusion.")
+    if ours.startswith("rgb_encoder."):
+        rest = ours.removeprefix("rgb_encoder.")
+        ours = f"rgb_encoders.{rest}" if rest[0].isdigit() else f"rgb_encoders.0.{rest}"
+    place = _BACKBONE.match(ours)
+    if place is None or place[2] not in _NETWORK:
+        return ours
+    return f"{place[1]}{_NETWORK[place[2]]}.{ours[place.end() :]}"

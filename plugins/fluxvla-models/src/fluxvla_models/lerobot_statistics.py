@@ -1,0 +1,225 @@
+"""What a LeRobot policy is normalised by, as this project's statistics and transforms.
+
+LeRobot saves statistics with the processors, ``policy_preprocessor.json`` and the safetensors file
+that its ``normalizer_processor`` names (``<feature>.<statistic>``); before version 0.4 they were
+among the weights (``normalize_inputs.buffer_<feature>.<statistic>``, with ``_`` for each ``.``).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_models.lerobot_names import STATISTICS
+
+Floats = npt.NDArray[np.float64]
+STATE, ACTION = "observation.state", "action"
+CONFIG, BEFORE, AFTER = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"
+_ADDED = 1e-6
+"""What ``NormalizeStatesAndActions`` adds to a standard deviation."""
+_RANGES = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """How each feature of a policy is normalised.
+
+    Args:
+        modes: ``VISUAL``, ``STATE``, ``ACTION`` -> ``MEAN_STD``, ``MIN_MAX``, ``IDENTITY``, …
+        statistics: feature -> statistic -> numbers. A feature that has none stays as it is.
+        eps: what LeRobot adds to a standard deviation.
+        renamed: the robot's name of a feature -> the policy's.
+    """
+
+    modes: Mapping[str, str]
+    statistics: Mapping[str, Mapping[str, Floats]]
+    eps: float = 1e-8
+    renamed: Mapping[str, str] | None = None
+
+    def affine(self, feature: str, kind: str, width: int) -> tuple[Floats, Floats]:
+        """Offset and scale ``(width,)``: normalised is ``(x - offset) / scale``.
+
+        Raises:
+            CheckpointError: the mode is unknown, or a statistic of it is missing.
+        """
+        mode = self.modes.get(kind, "IDENTITY")
+        have = self.statistics.get(feature)
+        if mode == "IDENTITY" or have is None:
+            return np.zeros(width), np.ones(width)
+        if mode == "MEAN_STD":
+            mean, std = self._numbers(feature, mode, ("mean", "std"), width)
+            return mean, std + self.eps
+        if mode not in _RANGES:
+            raise CheckpointError(f"{feature} is normalised by {mode}, which is not known here")
+        low, high = self._numbers(feature, mode, _RANGES[mode], width)
+        wide = np.where(high == low, self.eps, high - low)
+        return low + wide / 2, wide / 2
+
+    def _numbers(
+        self, feature: str, mode: str, names: Sequence[str], width: int
+    ) -> tuple[Floats, ...]:
+        have = self.statistics[feature]
+        missing = [name for name in names if name not in have]
+        if missing:
+            raise CheckpointError(
+                f"{feature} is normalised by {mode}, and the checkpoint's statistics have no "
+                f"{missing[0]}; they have {', '.join(sorted(have)) or 'nothing'}"
+            )
+        found = tuple(np.asarray(have[name], np.float64).reshape(-1) for name in names)
+        for name, numbers in zip(names, found, strict=True):
+            if len(numbers) != width or not np.isfinite(numbers).all():
+                raise CheckpointError(
+                    f"{feature}.{name} of the checkpoint's statistics is {numbers.tolist()}; "
+                    f"{width} finite numbers are expected"
+                )
+        return found
+
+
+def read_normalization(folder: Path, config: Mapping[str, Any]) -> Normalization:
+    """The policy's normalisation, from the processors' files or from among the weights.
+
+    Raises:
+        CheckpointError: there is none, or a file is damaged.
+    """
+    if (folder / BEFORE).is_file():
+        return _of_processors(folder, config)
+    features = [*config.get("input_features", {}), *config.get("output_features", {})]
+    names = {f"buffer_{feature.replace('.', '_')}": feature for feature in features}
+    statistics: dict[str, dict[str, Floats]] = {}
+    for name, stored in safetensors_in(folder).items():
+        _, _, rest = name.partition(".")
+        feature, _, statistic = rest.rpartition(".")
+        if name.startswith(STATISTICS) and feature in names:
+            statistics.setdefault(names[feature], {})[statistic] = _array(stored)
+    if not statistics:
+        raise CheckpointError(
+            f"there is neither {BEFORE} nor statistics among the weights",
+            where=str(folder),
+            cause="the folder was copied without the processors' files",
+        )
+    return Normalization(_modes(config), statistics)
+
+
+def tables(
+    normalization: Normalization,
+    cameras: Sequence[str],
+    size: tuple[int, int],
+    joints: int,
+    dim: int,
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Transforms from a robot's observation to a batch, and their statistics.
+
+    Args:
+        cameras: the pictures' features, in the order of the model; size: their height and width.
+        joints, dim: widths of state and action.
+    """
+    scales = [normalization.affine(name, "VISUAL", 3) for name in cameras]
+    entries = {
+        "proprio": _entry(normalization, STATE, "STATE", joints),
+        "action": _entry(normalization, ACTION, "ACTION", dim),
+    }
+    transforms: list[dict[str, Any]] = [
+        {"type": "ResizeImages", "height": size[0], "width": size[1]},
+        {
+            "type": "NormalizeImages",
+            "means": [offset.tolist() for offset, _ in scales],
+            # 1e-8 is added there, as here; of one camera's numbers none is 0.
+            "stds": [(scale - 1e-8).tolist() for _, scale in scales],
+            "scale_to_unit_interval": True,
+        },
+        {
+            "type": "NormalizeStatesAndActions",
+            "state_key": "proprio",
+            "action_key": "action",
+            "norm_type": "mean_std",
+        },
+    ]
+    return transforms, {"private": entries}
+
+
+def _entry(
+    normalization: Normalization, feature: str, kind: str, width: int
+) -> dict[str, list[float]]:
+    """An entry of which ``mean_std`` makes exactly LeRobot's numbers, whatever its mode is."""
+    offset, scale = normalization.affine(feature, kind, width)
+    have = normalization.statistics.get(feature, {})
+    kept = {name: have[name].reshape(-1).tolist() for name in ("min", "max") if name in have}
+    std = np.maximum(scale - _ADDED, 0.0)
+    return {**kept, "mean": offset.tolist(), "std": std.tolist()}
+
+
+def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
+    statistics: dict[str, dict[str, Floats]] = {}
+    modes, eps, names = _modes(config), 1e-8, {}
+    for file, kind in ((AFTER, "unnormalizer_processor"), (BEFORE, "normalizer_processor")):
+        if not (folder / file).is_file():
+            continue
+        for step in _steps(folder / file):
+            settings = _table(step, "config", folder / file)
+            if step.get("registry_name") == "rename_observations_processor":
+                names = dict(_table(settings, "rename_map", folder / file))
+            if step.get("registry_name") != kind:
+                continue
+            modes = {**modes, **_table(settings, "norm_map", folder / file)}
+            eps = settings.get("eps", eps)
+            if not isinstance(eps, float):
+                raise CheckpointError(f"eps is {eps!r}, no number", where=str(folder / file))
+            state = step.get("state_file")
+            if state is None:
+                continue
+            if Path(str(state)).name != state:
+                raise CheckpointError(f"{state!r} is not a file next to it", where=file)
+            for name, stored in safetensors_in(
+                folder, str(state).removesuffix(".safetensors")
+            ).items():
+                feature, _, statistic = name.rpartition(".")
+                statistics.setdefault(feature, {})[statistic] = _array(stored)
+    return Normalization(modes, statistics, eps, names)
+
+
+def _modes(config: Mapping[str, Any]) -> dict[str, str]:
+    found = _table(config, "normalization_mapping", Path(CONFIG))
+    return {str(kind): str(mode) for kind, mode in found.items()}
+
+
+def _table(values: Mapping[str, Any], name: str, where: Path) -> Mapping[str, Any]:
+    found = values.get(name) or {}
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{name} is no table", where=str(where))
+    return found
+
+
+def _steps(path: Path) -> list[Mapping[str, Any]]:
+    content = read_table(path)
+    steps = content.get("steps")
+    if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+        raise CheckpointError("steps: no list of tables", where=str(path))
+    return steps
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """A JSON table.
+
+    Raises:
+        CheckpointError: it is missing, or not one.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"cannot be read as JSON: {error}", where=str(path)) from error
+    if not isinstance(content, dict):
+        raise CheckpointError("it is no table", where=str(path))
+    return content
+
+
+def _array(stored: Stored) -> Floats:
+    numbers = stored[tuple(slice(0, length) for length in stored.shape)]
+    return np.asarray(numbers.double().numpy())

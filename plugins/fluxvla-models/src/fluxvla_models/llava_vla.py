@@ -1,0 +1,166 @@
+"""A VLA composed of pretrained parts: a vision-language model, or its two halves, and a head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import (
+    VLA,
+    build_head_from_cfg,
+    build_llm_backbone_from_cfg,
+    build_projector_from_cfg,
+    build_vision_backbone_from_cfg,
+    build_vlm_backbone_from_cfg,
+)
+
+Part = Mapping[str, Any] | nn.Module
+
+
+class LlavaVLA(VLA, nn.Module):
+    """Pictures and an instruction through a vision-language model, its hidden states to actions.
+
+    Either ``vlm_backbone``, or ``vision_backbone``, ``projector`` and ``llm_backbone``, whose input
+    are then the projected patches followed by the instruction (Liu et al. 2023, LLaVA).
+
+    Args:
+        vision_backbone: ``(B, 3N, H, W)`` -> ``(B, L, out_dim)``.
+        projector: ``(B, L, in_dim)`` -> ``(B, L, out_dim)``; both widths are filled in here.
+        llm_backbone: ``embed(tokens)``, and embeddings and masks -> ``(B, L, out_dim)``.
+        vlm_backbone: images, img_masks, tokens and masks -> ``(B, L, out_dim)`` and masks.
+        vla_head: as ``LlavaActionHead``; its ``context_dim`` is filled in here.
+        freeze_vision_backbone, freeze_llm_backbone, freeze_vlm_backbone, freeze_projector: keep a
+            part as it is.
+        pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
+
+    Raises:
+        ConfigError: parts that do not go together.
+    """
+
+    def __init__(
+        self,
+        vla_head: Part,
+        vision_backbone: Part | None = None,
+        projector: Part | None = None,
+        llm_backbone: Part | None = None,
+        vlm_backbone: Part | None = None,
+        freeze_vision_backbone: bool = False,
+        freeze_llm_backbone: bool = False,
+        freeze_vlm_backbone: bool = False,
+        freeze_projector: bool = False,
+        pretrained_name_or_path: str | None = None,
+    ) -> None:
+        super().__init__()
+        halves = {
+            "vision_backbone": vision_backbone,
+            "projector": projector,
+            "llm_backbone": llm_backbone,
+        }
+        given = [name for name, part in halves.items() if part is not None]
+        if len(given) != (3 if vlm_backbone is None else 0):
+            told = ", ".join([*given, *(["vlm_backbone"] if vlm_backbone is not None else [])])
+            raise ConfigError(
+                "LlavaVLA takes vlm_backbone, or all of vision_backbone, projector and "
+                f"llm_backbone; it was given {told or 'none of them'}"
+            )
+        frozen = {
+            "vision_backbone": freeze_vision_backbone,
+            "projector": freeze_projector,
+            "llm_backbone": freeze_llm_backbone,
+            "vlm_backbone": freeze_vlm_backbone,
+        }
+        used = ["vlm_backbone"] if vlm_backbone is not None else given
+        unused = [name for name, asked in frozen.items() if asked and name not in used]
+        if unused:
+            raise ConfigError(f"freeze_{unused[0]}: the model has no {unused[0]}")
+        if vlm_backbone is not None:
+            self.vlm_backbone = build_vlm_backbone_from_cfg(vlm_backbone)
+            width = self.vlm_backbone.out_dim
+        else:
+            self.vision_backbone = build_vision_backbone_from_cfg(vision_backbone)
+            self.llm_backbone = build_llm_backbone_from_cfg(llm_backbone)
+            width = self.llm_backbone.out_dim
+            self.projector = build_projector_from_cfg(
+                projector, in_dim=self.vision_backbone.out_dim, out_dim=width
+            )
+        self.vla_head = build_head_from_cfg(vla_head, context_dim=width)
+        self.pretrained_name_or_path = pretrained_name_or_path
+        self._parts = [*used, "vla_head"]
+        self._frozen = [name for name in used if frozen[name]]
+        for name in self._frozen:
+            self.get_submodule(name).requires_grad_(False)
+
+    def train(self, mode: bool = True) -> LlavaVLA:
+        """Frozen parts stay in evaluation mode."""
+        super().train(mode)
+        for name in self._frozen:
+            self.get_submodule(name).eval()
+        return self
+
+    def forward(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        actions: Tensor,
+        action_masks: Tensor,
+        img_masks: Tensor | None = None,
+        noise: Tensor | None = None,
+        time: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
+
+        Args:
+            images: ``(B, 3N, H, W)`` in -1..1; img_masks: ``(B, N)`` bool, all True if None.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool.
+            states: ``(B, S)``, actions: ``(B, T, D)``, normalised; action_masks: ``(B, T)``.
+            noise, time: ``(B, K, T, D)`` and ``(B, K)``, for heads that need them.
+        """
+        hidden, masks = self._hidden(images, img_masks, lang_tokens, lang_masks)
+        errors = self.vla_head.errors(hidden, masks, states, actions, action_masks, noise, time)
+        each = errors.detach().reshape(len(actions), -1).mean(1)
+        return {"loss": errors.mean(), "sample_losses": each}
+
+    def predict_action(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        img_masks: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Observation -> normalised actions ``(B, T, D)``; ``noise`` for heads that need it."""
+        hidden, masks = self._hidden(images, img_masks, lang_tokens, lang_masks)
+        return self.vla_head.sample(hidden, masks, states, noise)
+
+    @property
+    def action_shape(self) -> tuple[int, int]:
+        """``(T, D)`` of a chunk."""
+        return self.vla_head.horizon, self.vla_head.action_dim
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        units: list[nn.Module] = []
+        for name in self._parts:
+            part = self.get_submodule(name)
+            units += part.fsdp_units() if hasattr(part, "fsdp_units") else [part]
+        return units
+
+    def _hidden(
+        self, images: Tensor, img_masks: Tensor | None, tokens: Tensor, masks: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden states ``(B, L, C)`` of pictures and words, and what of them is real."""
+        cameras = images.shape[1] // 3
+        known = masks.new_ones(len(images), cameras) if img_masks is None else img_masks.bool()
+        if "vlm_backbone" in self._parts:
+            return self.vlm_backbone(images, known, tokens, masks)
+        seen = self.projector(self.vision_backbone(images))
+        both = torch.cat([seen, self.llm_backbone.embed(tokens)], dim=1)
+        real = torch.cat([known.repeat_interleave(seen.shape[1] // cameras, 1), masks], dim=1)
+        return self.llm_backbone(both, real), real

@@ -1,0 +1,283 @@
+"""Vision and language models of transformers as backbones, built from a folder's ``config.json``.
+
+Nothing is fetched, and no code that comes with weights is run. A folder is a path, or
+``package:<module>/<folder>`` for one that an installed package carries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import model_folder as checked_folder
+
+
+class SigLIPBackbone(nn.Module):
+    """SigLIP's picture encoder (Zhai et al. 2023): a feature for each patch of each camera.
+
+    Args:
+        model_folder: of a ``siglip`` or ``siglip_vision_model``.
+        num_cameras: pictures per sample, all seen by the same encoder.
+        pretrained: load the folder's weights; else they are drawn anew, which is right where a
+            checkpoint overwrites them.
+
+    Raises:
+        ConfigError: there is no such folder, it wants code of its own run, is of another kind, or
+            lacks weights.
+    """
+
+    def __init__(self, model_folder: str, num_cameras: int = 1, pretrained: bool = True) -> None:
+        super().__init__()
+        folder = checked_folder(model_folder)
+        config = read_config(folder, ("siglip", "siglip_vision_model"))
+        if config.model_type == "siglip":
+            config = config.vision_config
+        config.vision_use_head = False  # it pools all patches into one feature
+        from transformers import SiglipVisionModel
+
+        self.model = built(SiglipVisionModel, folder, config, pretrained)
+        self.num_cameras = num_cameras
+        self.image_size = config.image_size
+        self.tokens_per_image = (config.image_size // config.patch_size) ** 2
+        self.out_dim: int = config.hidden_size
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``(B, 3N, H, W)`` in -1..1 -> ``(B, N * patches, out_dim)``, camera by camera.
+
+        Raises:
+            ConfigError: another number of cameras, or another size than the encoder's.
+        """
+        views = split_views(images, self.num_cameras, self.image_size)
+        features = self.model(pixel_values=views).last_hidden_state
+        return features.reshape(len(images), -1, self.out_dim)
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        return layers_of(self.model)
+
+
+class LanguageBackbone(nn.Module):
+    """A decoder-only language model without the layer that predicts words.
+
+    Args:
+        model_folder, pretrained: as of ``SigLIPBackbone``.
+        num_layers: use the first ones only; all by default.
+    """
+
+    kinds: ClassVar[Sequence[str]] = ()
+
+    def __init__(
+        self, model_folder: str, pretrained: bool = True, num_layers: int | None = None
+    ) -> None:
+        super().__init__()
+        folder = checked_folder(model_folder)
+        config = read_config(folder, self.kinds)
+        if num_layers is not None:
+            if not 1 <= num_layers <= config.num_hidden_layers:
+                raise ConfigError(
+                    f"num_layers {num_layers} is not between 1 and the model's "
+                    f"{config.num_hidden_layers}",
+                    where=str(folder),
+                )
+            config.num_hidden_layers = num_layers
+            if config.to_dict().get("layer_types"):
+                config.layer_types = config.layer_types[:num_layers]
+        from transformers import AutoModel
+
+        self.model = built(AutoModel, folder, config, pretrained)
+        self.out_dim: int = config.hidden_size
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        """``(B, L)`` int64 -> ``(B, L, out_dim)``."""
+        return self.model.get_input_embeddings()(tokens)
+
+    def forward(self, embeddings: Tensor, masks: Tensor) -> Tensor:
+        """``(B, L, out_dim)`` and ``masks`` ``(B, L)`` bool -> hidden states ``(B, L, out_dim)``.
+
+        Positions count what the masks leave, so that padding does not matter, on either side.
+        """
+        positions = (masks.long().cumsum(1) - 1).clamp(min=0)
+        found = self.model(
+            inputs_embeds=embeddings,
+            attention_mask=masks.long(),
+            position_ids=positions,
+            use_cache=False,
+        )
+        return found.last_hidden_state
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        return layers_of(self.model)
+
+
+class Qwen3Backbone(LanguageBackbone):
+    """Qwen3 (arXiv 2505.09388)."""
+
+    kinds = ("qwen3",)
+
+
+class Qwen2Backbone(LanguageBackbone):
+    """Qwen2 and Qwen2.5 (arXiv 2412.15115)."""
+
+    kinds = ("qwen2",)
+
+
+class LlamaBackbone(LanguageBackbone):
+    """Llama 2 and 3 (arXiv 2307.09288, 2407.21783)."""
+
+    kinds = ("llama",)
+
+
+class PaliGemmaBackbone(nn.Module):
+    """PaliGemma (Beyer et al. 2024): pictures and words in one model, all seeing each other.
+
+    Args:
+        model_folder, num_cameras, pretrained: as of ``SigLIPBackbone``.
+    """
+
+    def __init__(self, model_folder: str, num_cameras: int = 1, pretrained: bool = True) -> None:
+        super().__init__()
+        folder = checked_folder(model_folder)
+        config = read_config(folder, ("paligemma",))
+        config.vision_config.vision_use_head = False
+        from transformers import AutoModel
+
+        self.model = built(AutoModel, folder, config, pretrained)
+        vision = config.vision_config
+        self.num_cameras = num_cameras
+        self.image_size = vision.image_size
+        self.image_token = int(config.image_token_id)
+        self.tokens_per_image = (vision.image_size // vision.patch_size) ** 2
+        self.out_dim: int = config.text_config.hidden_size
+
+    def forward(
+        self, images: Tensor, img_masks: Tensor, tokens: Tensor, masks: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden states ``(B, L, out_dim)`` and their masks ``(B, L)``, pictures first.
+
+        Args:
+            images: ``(B, 3N, H, W)`` in -1..1; img_masks: ``(B, N)``; tokens, masks: ``(B, L)``.
+        """
+        places = self.num_cameras * self.tokens_per_image
+        seen = tokens.new_full((len(tokens), places), self.image_token)
+        known = torch.cat([img_masks.repeat_interleave(self.tokens_per_image, 1), masks], dim=1)
+        ids = torch.cat([seen, tokens], dim=1)
+        found = self.model(
+            input_ids=ids,
+            pixel_values=split_views(images, self.num_cameras, self.image_size),
+            attention_mask=known.long(),
+            position_ids=known.long().cumsum(1).clamp(min=1),  # it counts from 1
+            token_type_ids=torch.zeros_like(ids),
+            use_cache=False,
+        )
+        return found.last_hidden_state, known
+
+    def fsdp_units(self) -> list[nn.Module]:
+        """Blocks to shard one by one."""
+        return layers_of(self.model)
+
+
+def read_config(folder: Path, kinds: Sequence[str]) -> Any:
+    """The transformers configuration in ``folder``.
+
+    Raises:
+        ConfigError: there is none, or its ``model_type`` is not one of ``kinds``.
+    """
+    from transformers import AutoConfig
+
+    try:
+        config = AutoConfig.from_pretrained(
+            str(folder), local_files_only=True, trust_remote_code=False
+        )
+    except Exception as error:  # whatever damaged files make transformers raise
+        raise ConfigError(
+            f"no model can be built from it: {type(error).__name__}: {error}", where=str(folder)
+        ) from error
+    if config.model_type not in kinds:
+        raise ConfigError(
+            f"the model is a {config.model_type}; {' or '.join(kinds)} is expected",
+            where=str(folder / "config.json"),
+        )
+    return config
+
+
+def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
+    """A transformers model in float32, with the folder's weights or, if not ``pretrained``, new
+    ones.
+
+    Raises:
+        ConfigError: the folder has no weights, or not all of them.
+    """
+    if not pretrained:
+        if hasattr(kind, "from_config"):
+            return kind.from_config(config, trust_remote_code=False)
+        return kind(config)
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()
+    verbosity = logging.get_verbosity()
+    logging.set_verbosity_error()  # heads that are left out are no news
+    try:
+        model, info = kind.from_pretrained(
+            str(folder),
+            config=config,
+            dtype=torch.float32,
+            local_files_only=True,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+        )
+    except Exception as error:  # whatever damaged files make transformers raise
+        raise ConfigError(
+            f"its weights cannot be read: {type(error).__name__}: {error}",
+            where=str(folder),
+            next="pretrained=False, where a checkpoint has them",
+        ) from error
+    finally:
+        logging.set_verbosity(verbosity)
+    wrong = _listed(info, ("missing_keys", "mismatched_keys"))
+    if wrong:
+        raise ConfigError(
+            f"its weights are not all there: {', '.join(wrong[:4])}{' …' if wrong[4:] else ''}",
+            where=str(folder),
+        )
+    return model
+
+
+def split_views(images: Tensor, cameras: int, size: int) -> Tensor:
+    """``(B, 3N, H, W)`` -> ``(B * N, 3, H, W)``.
+
+    Raises:
+        ConfigError: N is not ``cameras``, or H and W not ``size``.
+    """
+    if images.shape[1] != 3 * cameras:
+        raise ConfigError(
+            f"num_cameras is {cameras}, the batch has {images.shape[1]} image channels "
+            f"({images.shape[1] // 3} cameras)",
+            next="num_cameras is the number of img_keys",
+        )
+    if tuple(images.shape[2:]) != (size, size):
+        raise ConfigError(
+            f"pictures are {images.shape[2]} x {images.shape[3]}, the encoder sees {size} x {size}",
+            next=f"dict(type='ResizeImages', height={size}, width={size})",
+        )
+    return images.reshape(len(images) * cameras, 3, size, size)
+
+
+def layers_of(model: nn.Module) -> list[nn.Module]:
+    """The layers of every transformer in ``model``."""
+    return [
+        layer
+        for name, module in model.named_modules()
+        if isinstance(module, nn.ModuleList) and name.rpartition(".")[2] == "layers"
+        for layer in module
+    ]
+
+
+def _listed(info: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
+    return sorted(str(name) for kind in kinds for name in info.get(kind, ()))

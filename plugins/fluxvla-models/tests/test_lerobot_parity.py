@@ -1,0 +1,208 @@
+"""ACT and Diffusion Policy compute what LeRobot's do, number by number.
+
+``tests/oracles/make_lerobot.py`` wrote what is compared with.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fluxvla_models.act import ACT
+from fluxvla_models.diffusion_policy import DiffusionPolicy
+from fluxvla_models.diffusion_schedule import BETAS, KINDS, PREDICTIONS, DiffusionSchedule
+from fluxvla_models.lerobot_format import LeRobotACT, LeRobotDiffusion
+from fluxvla_models.lerobot_names import act_name, diffusion_name
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from fluxvla_core import EmbodimentSpec
+from fluxvla_core.models import load_policy
+from fluxvla_core.spec.embodiment import Camera, Joint
+from fluxvla_core.training.foreign import import_checkpoint
+from tests.oracles import fill
+
+GOLDEN = Path(__file__).parent / "golden"
+KEYS = Path(__file__).parent / "keys"
+BATCH, JOINTS = 3, 6
+CASES = sorted(p.stem for p in GOLDEN.glob("lerobot_*.safetensors"))
+ACTING = [case for case in CASES if not case.endswith("history")]
+CONSTANTS = ("vae_encoder_pos_enc", "pos_grid")
+ARM = EmbodimentSpec(
+    "arm",
+    tuple(Joint(f"j{i}", "rad", -20.0, 20.0, 1.0, 1.0) for i in range(JOINTS)),
+    (Camera("front", 72, 96), Camera("wrist", 72, 96)),
+    50.0,
+)
+
+
+def filled(name: str, shape: list[int]) -> torch.Tensor:
+    """As the program fills LeRobot's policy."""
+    if name.endswith("running_var"):
+        return torch.from_numpy(fill.uniform(name, shape, 0.5, 1.5))
+    if name.endswith("num_batches_tracked"):
+        return torch.zeros((), dtype=torch.int64)
+    scale = len(shape) == 1 and name.endswith(".weight")
+    return torch.from_numpy(fill.weight(name, shape)) + float(scale)
+
+
+def shapes(case: str) -> dict[str, list[int]]:
+    """Names and shapes of LeRobot's tensors."""
+    with safe_open(GOLDEN / f"{case}.safetensors", "np") as file:
+        return json.loads(file.metadata()["names"])
+
+
+@lru_cache
+def tensors(case: str) -> dict[str, torch.Tensor]:
+    """LeRobot's tensors, by its names."""
+    return {
+        name: torch.zeros(shape) if name.endswith(CONSTANTS) else filled(name, shape)
+        for name, shape in shapes(case).items()
+    }
+
+
+def our_name(case: str, name: str) -> str | None:
+    return (act_name if case.startswith("lerobot_act") else diffusion_name)(name)
+
+
+@lru_cache
+def model_of(case: str) -> ACT | DiffusionPolicy:
+    config = json.loads((GOLDEN / case / "config.json").read_text())
+    act = case.startswith("lerobot_act")
+    table = (LeRobotACT() if act else LeRobotDiffusion()).model(config, case)
+    assert table.pop("type") == ("ACT" if act else "DiffusionPolicy")
+    model = (ACT if act else DiffusionPolicy)(**table)
+    named = {our_name(case, name): tensor for name, tensor in tensors(case).items()}
+    named.pop(None, None)
+    model.load_state_dict(named)
+    return model
+
+
+def batch_of(case: str, model: ACT | DiffusionPolicy) -> dict[str, torch.Tensor]:
+    history = ()
+    if isinstance(model, DiffusionPolicy) and model.n_obs_steps > 1:
+        history = (model.n_obs_steps,)
+    chunk = (BATCH, *model.action_shape)
+    masks = torch.ones(chunk[:2])
+    masks[1, model.horizon - 3 :] = 0
+    cameras = ("front", "wrist")[: model.num_cameras]
+    views = [fill.normal(f"observation.images.{c}", (BATCH, *history, 3, 72, 96)) for c in cameras]
+    batch = {
+        "images": torch.from_numpy(np.concatenate(views, axis=-3)),
+        "states": torch.from_numpy(fill.normal("states", (BATCH, *history, JOINTS))),
+        "actions": torch.from_numpy(fill.normal("actions", chunk)),
+        "action_masks": masks,
+    }
+    if isinstance(model, ACT):
+        size = (BATCH, model.latent_dim)
+        return {**batch, "latent_noise": torch.from_numpy(fill.normal("latent_noise", size))}
+    return {
+        **batch,
+        "noise": torch.from_numpy(fill.normal("noise", chunk))[:, None],
+        "timesteps": torch.from_numpy(fill.integers("timesteps", (BATCH,), 100))[:, None],
+    }
+
+
+def step_noise(model: DiffusionPolicy, rows: int) -> torch.Tensor:
+    shape = (BATCH, model.schedule.count - 1, *model.action_shape)
+    return torch.from_numpy(fill.normal("step_noise", shape))[:rows]
+
+
+def close(found: torch.Tensor, expected: torch.Tensor) -> None:
+    scale = expected.abs().max().item()
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_loss_and_gradients(case: str) -> None:
+    golden = load_file(GOLDEN / f"{case}.safetensors")
+    model = model_of(case).train()
+    found = model(**batch_of(case, model))
+    close(found["loss"].detach().reshape(1), golden["loss"])
+    close(found["sample_losses"].mean().reshape(1), golden["loss"])
+    found["loss"].backward()
+    gradients = dict(model.named_parameters())
+    named = [key for key in golden if key.startswith("gradient ")]
+    assert len(named) >= 3
+    for key in named:
+        own = gradients[our_name(case, key.removeprefix("gradient "))].grad.flatten()
+        close(own[:: -(-len(own) // 4096)], golden[key])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_actions(case: str) -> None:
+    golden = load_file(GOLDEN / f"{case}.safetensors")
+    model = model_of(case).eval()
+    batch = batch_of(case, model)
+    asked = {"images": batch["images"], "states": batch["states"]}
+    start = 0
+    if isinstance(model, DiffusionPolicy):
+        asked["noise"] = batch["noise"][:, 0]
+        asked["step_noise"] = step_noise(model, BATCH)
+        start = model.n_obs_steps - 1
+    with torch.inference_mode():
+        found = model.predict_action(**asked)
+    assert found.shape == (BATCH, *model.action_shape)
+    close(found[:, start : start + golden["actions"].shape[1]], golden["actions"])
+
+
+def published(case: str, folder: Path) -> Path:
+    """The folder as LeRobot saves it, with the weights, which are too many to be stored."""
+    shutil.copytree(GOLDEN / case, folder)
+    save_file(tensors(case), folder / "model.safetensors")
+    return folder
+
+
+def observation(cameras: tuple[str, ...]) -> dict[str, object]:
+    return {
+        "qpos": fill.normal("raw state", (JOINTS,)),
+        "images": {
+            name: fill.integers(f"raw observation.images.{name}", (72, 96, 3), 256).astype(np.uint8)
+            for name in cameras
+        },
+        "task_description": "lift",
+    }
+
+
+@pytest.mark.parametrize("case", ACTING)
+def test_raw_pictures_and_joints_to_commands(case: str, tmp_path: Path, monkeypatch) -> None:
+    golden = load_file(GOLDEN / f"{case}.safetensors")
+    source = published(case, tmp_path / "theirs")
+    import_checkpoint(
+        source, tmp_path / "ours", format="lerobot", embodiment=ARM, action_rate_hz=50.0
+    )
+    policy = load_policy(tmp_path / "ours")
+    model = policy.model
+    if isinstance(model, DiffusionPolicy):
+        start = fill.normal("noise", (BATCH, *model.action_shape))[:1]
+        monkeypatch.setattr(policy, "_noise", lambda seed, call: start)
+        monkeypatch.setattr(
+            "fluxvla_models.diffusion_policy.following",
+            lambda noise, count: step_noise(model, len(noise)),
+        )
+    chunk = policy.predict_action(observation(policy.cameras))
+    close(torch.from_numpy(chunk).float()[: len(golden["commands"])], golden["commands"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("betas", BETAS)
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+@pytest.mark.parametrize("clip", [True, False])
+def test_schedules(kind: str, betas: str, prediction: str, clip: bool) -> None:
+    golden = load_file(GOLDEN / "diffusers_schedulers.safetensors")
+    key = f"{kind} {betas} {prediction} {clip}"
+    schedule = DiffusionSchedule(
+        kind, 100, 7, betas, prediction=prediction, clip=1.0 if clip else None
+    )
+    x, output, added = (
+        torch.from_numpy(fill.normal(n, (2, 4, 3))) for n in ("x", "output", "added")
+    )
+    assert schedule.timesteps == golden[f"{key} timesteps"].tolist()
+    steps = [schedule.step(output, step, x, added) for step in schedule.timesteps]
+    close(torch.stack(steps), golden[f"{key} steps"])
+    close(schedule.add_noise(x, added, torch.tensor([3, 97])), golden[f"{key} noisy"])

@@ -1,0 +1,1 @@
+"""OpenVLA and OpenVLA-OFT: models, transforms, and their published checkpoints."""

@@ -1,0 +1,116 @@
+"""``OpenVLA``: actions as tokens of a vision-language model, one after the other.
+
+Source: Kim et al., "OpenVLA: An Open-Source Vision-Language-Action Model" (2024).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from fluxvla_openvla.action_tokens import ActionTokens
+from fluxvla_openvla.language import Prompt, decode, hidden_states
+from fluxvla_openvla.prismatic import Prismatic
+from fluxvla_openvla.sizes import LanguageSize, TowerSize
+
+
+class OpenVLA(Prismatic):
+    """One picture and an instruction in, one action out, as ``action_dim`` tokens.
+
+    The defaults are OpenVLA-7B (7.54 billion parameters).
+
+    Args:
+        action_dim: dimensions of an action; each is one token.
+        image_size: pixels of a picture's side.
+        dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
+        predict_stop_token: learn the token after the actions too, as OpenVLA does.
+        pretrained_name_or_path: a folder that a training starts from, as published or of FluxVLA.
+
+    Raises:
+        ConfigError: sizes that do not fit together.
+    """
+
+    def __init__(
+        self,
+        action_dim: int = 7,
+        image_size: int = 224,
+        dino: Mapping[str, Any] | TowerSize | None = None,
+        siglip: Mapping[str, Any] | TowerSize | None = None,
+        language: Mapping[str, Any] | LanguageSize | None = None,
+        predict_stop_token: bool = True,
+        pretrained_name_or_path: str | None = None,
+    ) -> None:
+        super().__init__(1, action_dim, 1, image_size, dino, siglip, language, use_film=False)
+        self.pretrained_name_or_path = pretrained_name_or_path
+        self.predict_stop_token = predict_stop_token
+        self.action_tokens = ActionTokens(self.size.text_vocab_size)
+
+    def forward(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        actions: Tensor,
+        action_masks: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """Cross entropy of the action tokens, and of the stop token.
+
+        Args:
+            images: ``(B, 3, H, W)`` in -1..1.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool.
+            actions: ``(B, 1, D)`` normalised to -1..1.
+            action_masks: ``(B, 1)``; a sample with 0 does not count.
+
+        Returns:
+            ``loss``, scalar, and ``sample_losses`` ``(B,)``.
+
+        Raises:
+            ConfigError: pictures or actions of another shape.
+        """
+        self.check_actions(actions)
+        prompt = self.read_prompt(images, lang_tokens, lang_masks)
+        tokens = self.action_tokens.encode(actions[:, 0])
+        embeddings, real = self._sequence(images, prompt)
+        embeddings = torch.cat([embeddings, self.embed(tokens)], 1)
+        real = torch.cat([real, torch.ones_like(tokens, dtype=torch.bool)], 1)
+        targets = tokens
+        if self.predict_stop_token:
+            targets = torch.cat([tokens, self.stop_tokens(len(tokens))], 1)
+        states = hidden_states(self.language_model, embeddings, real, causal=True)
+        # Each token is predicted at the place before it.
+        begin = states.shape[1] - self.action_dim - 1
+        states = states[:, begin : begin + targets.shape[1]]
+        logits = self.language_model.lm_head(states).float()
+        losses = functional.cross_entropy(logits.transpose(1, 2), targets, reduction="none").mean(1)
+        if action_masks is not None:
+            losses = losses * action_masks[:, 0]
+        return {"loss": losses.mean(), "sample_losses": losses.detach()}
+
+    def predict_action(self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor) -> Tensor:
+        """Greedy decoding: observation -> normalised action ``(B, 1, D)`` float32.
+
+        Only tokens of actions are chosen. OpenVLA's code takes any token, and clips what is none to
+        the outermost bins: an end of text would become the highest action.
+        """
+        prompt = self.read_prompt(images, lang_tokens, lang_masks)
+        embeddings, real = self._sequence(images, prompt)
+        tokens = decode(
+            self.language_model,
+            embeddings,
+            real,
+            self.action_dim,
+            self.action_tokens.first,
+            self.size.text_vocab_size,
+        )
+        return self.action_tokens.decode(tokens).unsqueeze(1)
+
+    def _sequence(self, images: Tensor, prompt: Prompt) -> tuple[Tensor, Tensor]:
+        """Embeddings ``(B, S, width)`` of pictures and prompt, and which of them are real."""
+        seen = self.see(images, prompt)
+        embeddings = torch.cat([self.embed(prompt.first), seen, self.embed(prompt.rest)], 1)
+        front = torch.ones(len(seen), 1 + seen.shape[1], dtype=torch.bool, device=seen.device)
+        return embeddings, torch.cat([front, prompt.mask], 1)

@@ -1,0 +1,325 @@
+"""PI0 and PI0.5 as LeRobot saves them: ``config.json``, weights, and its processors' files."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from safetensors.torch import save_file
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.results import read_json
+from fluxvla_pi.lerobot_processors import (
+    ACTION,
+    BUFFERS,
+    KEYS,
+    MODES,
+    PREPROCESSOR,
+    STATE,
+    STATISTICS,
+    TOKENIZER,
+    Preparation,
+    from_buffers,
+    from_files,
+    write_processors,
+)
+from fluxvla_pi.names import LEROBOT
+from fluxvla_pi.published import FAMILIES, weights_in
+from fluxvla_pi.writing import action_names, only, table_of, weights_to_write
+
+CONFIG = "config.json"
+IMAGES = "observation.images."
+_EMPTY = f"{IMAGES}empty_camera_"
+_FIXED = {"n_obs_steps": 1, "min_period": 4e-3, "max_period": 4.0, "use_peft": False}
+
+
+class LeRobotPiFormat(CheckpointFormat):
+    """LeRobot's ``pi0`` and ``pi05`` policies."""
+
+    name: ClassVar[str] = "lerobot"
+    model_types: ClassVar[Sequence[str]] = tuple(kind.__name__ for kind in FAMILIES.values())
+
+    def recognizes(self, folder: Path) -> bool:
+        """Whether ``config.json`` is of such a policy."""
+        try:
+            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
+        except CheckpointError:
+            return False
+        return config.get("type") in FAMILIES
+
+    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+        """The checkpoint in ``folder``; see ``CheckpointFormat``."""
+        where = str(folder / CONFIG)
+        config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
+        for key, value in _FIXED.items():
+            if config.get(key, value) != value:
+                raise CheckpointError(f"{key} is {config[key]!r}; {value!r} is read", where=where)
+        family = config["type"]
+        inputs, outputs = (
+            _features(config, f"{way}_features", where) for way in ("input", "output")
+        )
+        old = [name for name in safetensors_in(folder) if name.startswith(BUFFERS)]
+        weights = weights_in(folder, old)
+        if weights.family != family:
+            raise CheckpointError(
+                f"type is {family}, the weights are those of {weights.family}", where=where
+            )
+        widths = {
+            STATE: _width(inputs, STATE, where),
+            ACTION: _width(outputs, ACTION, where),
+        }
+        default = 48 if family == "pi0" else 200
+        max_length = _whole(config, "tokenizer_max_length", default, where)
+        if os.path.lexists(folder / f"{PREPROCESSOR}.json"):
+            preparation = from_files(folder, widths)
+        else:
+            preparation = from_buffers(folder, config, widths, max_length)
+        horizon = _whole(config, "chunk_size", 50, where)
+        model = {
+            **weights.model,
+            "n_action_steps": horizon,
+            "num_steps": _whole(config, "num_inference_steps", 10, where),
+            "ori_action_dim": widths[ACTION],
+        }
+        size = config.get("image_resolution", [224, 224])
+        if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
+            raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
+        return ForeignCheckpoint(
+            model=model,
+            tensors=weights.tensors,
+            img_keys=_cameras(inputs, where),
+            transforms=_transforms(model, preparation, size, tokenizer),
+            statistics={"private": _statistics(preparation, widths)},
+            horizon=horizon,
+            notes=_notes(preparation, tokenizer),
+        )
+
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write ``checkpoint`` into ``folder``; see ``CheckpointFormat``."""
+        family = next(
+            f for f, kind in FAMILIES.items() if kind.__name__ in checkpoint.model["type"]
+        )
+        config = _config(checkpoint, family)
+        tensors = weights_to_write(checkpoint, LEROBOT)
+        narrow = tensors[f"{LEROBOT.root}action_in_proj.weight"].dtype == torch.bfloat16
+        config["dtype"] = "bfloat16" if narrow else "float32"
+        features = {**config["input_features"], **config["output_features"]}
+        names = action_names(checkpoint)
+        write_processors(folder, family, features, _preparation(checkpoint, family), names)
+        save_file(tensors, folder / "model.safetensors", {"format": "pt"})
+        (folder / CONFIG).write_text(json.dumps(config, indent=4), encoding="utf-8")
+
+
+def _whole(config: Mapping[str, Any], key: str, default: int, where: str) -> int:
+    value = config.get(key, default)
+    if not isinstance(value, int) or value < 1:
+        raise CheckpointError(f"{key} is {value!r}, not a number from 1", where=where)
+    return value
+
+
+def _features(config: Mapping[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:
+    features = config.get(key)
+    if not isinstance(features, dict) or not all(isinstance(f, dict) for f in features.values()):
+        raise CheckpointError(f"{key} is no table of features", where=where)
+    return features
+
+
+def _width(features: Mapping[str, Mapping[str, Any]], key: str, where: str) -> int:
+    shape = features.get(key, {}).get("shape")
+    if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
+        raise CheckpointError(f"the feature {key!r} has no shape of one number", where=where)
+    return shape[0]
+
+
+def _cameras(features: Mapping[str, Mapping[str, Any]], where: str) -> list[str]:
+    """Cameras in the model's order, without those that are never there: they are masked."""
+    found = [
+        key
+        for key, feature in features.items()
+        if feature.get("type") == "VISUAL" and not key.startswith(_EMPTY)
+    ]
+    if not found:
+        raise CheckpointError("input_features: there is no camera", where=where)
+    return found
+
+
+def _transforms(
+    model: Mapping[str, Any],
+    preparation: Preparation,
+    size: Sequence[int],
+    tokenizer: str | None,
+) -> list[dict[str, Any]]:
+    height, width = size
+    numbers: dict[str, Any] = {
+        "type": "NormalizeStatesAndActions",
+        "norm_type": preparation.modes[ACTION],
+        "state_norm_type": preparation.modes[STATE],
+        "action_dim": model["max_action_dim"],
+        "epsilon": preparation.epsilon,
+        "epsilon_if_zero": preparation.epsilon_if_zero,
+    }
+    if "max_state_dim" in model:
+        numbers["state_dim"] = model["max_state_dim"]
+        prompt: dict[str, Any] = {"type": "PreparePrompt", "clean": False}
+    else:
+        prompt = {"type": "PreparePromptWithState"}
+    path = tokenizer or preparation.tokenizer
+    return [
+        {
+            "type": "ResizeImagesWithPad",
+            "height": height,
+            "width": width,
+            "interpolation": "linear",
+        },
+        {"type": "SimpleNormalizeImages"},
+        numbers,
+        prompt,
+        {
+            "type": "ProcessPrompts",
+            "tokenizer": {"type": "PretrainedTokenizer", "model_path": path},
+            "max_len": preparation.max_length,
+        },
+    ]
+
+
+def _statistics(preparation: Preparation, widths: Mapping[str, int]) -> dict[str, Any]:
+    """Of each of our entries; zeros and ones where nothing is normalised."""
+    found: dict[str, Any] = {}
+    for key, entry in KEYS.items():
+        rows = dict(preparation.statistics.get(key, {}))
+        if preparation.modes[key] == "none":
+            rows = {"mean": [0.0] * widths[key], "std": [1.0] * widths[key]}
+        elif "mean" not in rows:
+            low, high = (rows[name] for name in list(rows)[:2])
+            rows["mean"] = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+        found[entry] = {name: list(row) for name, row in rows.items()}
+    if preparation.relative is not None:
+        found["action"]["relative"] = [float(counted) for counted in preparation.relative]
+    return found
+
+
+def _notes(preparation: Preparation, tokenizer: str | None) -> list[str]:
+    notes = []
+    none = [key for key in KEYS if not preparation.statistics.get(key)]
+    if none:
+        notes.append(
+            f"there are no statistics of {', '.join(none)}: it is a base model, to be fine-tuned"
+        )
+    if tokenizer is None:
+        notes.append(
+            f"its tokenizer is {preparation.tokenizer}; --tokenizer names the folder that has it"
+        )
+    if preparation.renamed:
+        pairs = ", ".join(f"{theirs} -> {ours}" for theirs, ours in preparation.renamed.items())
+        notes.append(f"LeRobot renamed observations before: {pairs}")
+    return notes
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
+    model = checkpoint.model
+    sizes = {key: model.get(key, default) for key, default in _VARIANTS.items()}
+    if sizes != _VARIANTS or model.get("vocab_size", 257152) != VOCABULARY:
+        raise CheckpointError(
+            f"LeRobot's policies have the sizes {', '.join(_VARIANTS.values())}; this one has "
+            f"{', '.join(map(str, sizes.values()))}"
+        )
+    resize = table_of(checkpoint, "ResizeImagesWithPad")
+    only(resize, "interpolation", "linear", "antialias")
+    size = [int(resize["height"]), int(resize["width"])]
+    robot = checkpoint.embodiment
+    seen = {} if robot is None else {c.name: [c.height, c.width] for c in robot.cameras}
+    inputs: dict[str, Any] = {
+        IMAGES + name: {"type": "VISUAL", "shape": [3, *seen.get(name, size)]}
+        for name in checkpoint.img_keys
+    }
+    entries = checkpoint.statistics["private"]
+    widths = {key: len(entries[entry]["mean"]) for key, entry in KEYS.items()}
+    inputs[STATE] = {"type": "STATE", "shape": [widths[STATE]]}
+    preparation = _preparation(checkpoint, family)
+    theirs = {ours: mode for mode, ours in MODES.items()}
+    names = action_names(checkpoint)
+    config: dict[str, Any] = {
+        "type": family,
+        "n_obs_steps": 1,
+        "input_features": inputs,
+        "output_features": {ACTION: {"type": "ACTION", "shape": [widths[ACTION]]}},
+        "device": "cpu",
+        "paligemma_variant": "gemma_2b",
+        "action_expert_variant": "gemma_300m",
+        "chunk_size": checkpoint.horizon,
+        "n_action_steps": checkpoint.horizon,
+        "max_action_dim": model.get("max_action_dim", 32),
+        "num_inference_steps": model.get("num_steps", 10),
+        "image_resolution": size,
+        "normalization_mapping": {
+            "VISUAL": "IDENTITY",
+            "STATE": theirs[preparation.modes[STATE]],
+            "ACTION": theirs[preparation.modes[ACTION]],
+        },
+        "tokenizer_max_length": preparation.max_length,
+    }
+    if family == "pi0":
+        config["max_state_dim"] = model.get("max_state_dim", 32)
+    if preparation.relative is not None:
+        config["use_relative_actions"] = True
+        config["action_feature_names"] = None if names is None else list(names)
+    return config
+
+
+VOCABULARY = 257152
+_VARIANTS = {"variant": "gemma_2b", "expert_variant": "gemma_300m", "vision_variant": "so400m"}
+
+
+def _preparation(checkpoint: ForeignCheckpoint, family: str) -> Preparation:
+    """What LeRobot's processors must do to act as ``checkpoint``.
+
+    Raises:
+        CheckpointError: LeRobot's cannot.
+    """
+    numbers = table_of(checkpoint, "NormalizeStatesAndActions")
+    only(numbers, "std_floor", 0.0, 0.0)
+    only(numbers, "action_norm_mask", None, None)
+    if family == "pi0":
+        only(table_of(checkpoint, "PreparePrompt"), "clean", False, True)
+    else:
+        only(table_of(checkpoint, "PreparePromptWithState"), "state_dim", None, None)
+    words = table_of(checkpoint, "ProcessPrompts")
+    mode = numbers.get("norm_type", "mean_std")
+    modes = {STATE: numbers.get("state_norm_type") or mode, ACTION: mode}
+    entries = checkpoint.statistics["private"]
+    rows = {
+        key: {name: list(entries[entry][name]) for name in STATISTICS if name in entries[entry]}
+        for key, entry in KEYS.items()
+        if modes[key] != "none"
+    }
+    relative = entries["action"].get("relative")
+    found = Preparation(
+        modes=modes,
+        statistics=rows,
+        epsilon=float(numbers.get("epsilon", 1e-6)),
+        epsilon_if_zero=bool(numbers.get("epsilon_if_zero", False)),
+        relative=None if relative is None else [bool(counted) for counted in relative],
+        tokenizer=TOKENIZER,
+        max_length=int(words.get("max_len", 180)),
+        renamed={},
+    )
+    return found if found.epsilon_if_zero else _with_lerobots_epsilon(found)
+
+
+def _with_lerobots_epsilon(found: Preparation) -> Preparation:
+    """The same numbers by LeRobot's formula, which adds 1e-8, and only where it must."""
+    added = {"std": found.epsilon - 1e-8, "max": found.epsilon, "q99": found.epsilon}
+    rows = {
+        key: {name: [x + added.get(name, 0.0) for x in row] for name, row in table.items()}
+        for key, table in found.statistics.items()
+    }
+    return replace(found, statistics=rows, epsilon=1e-8, epsilon_if_zero=True)

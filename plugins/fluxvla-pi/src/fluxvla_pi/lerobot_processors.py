@@ -1,0 +1,343 @@
+"""LeRobot's processors of PI0 and PI0.5: what they do to observations and actions, and their files.
+
+``policy_preprocessor.json`` lists steps; the statistics lie next to it, in the file that the
+normalizer's step names, flat as ``<feature>.<statistic>`` (LeRobot 0.4 and later). Before, they
+were buffers among the weights, ``normalize_inputs.buffer_<feature with _>.<statistic>``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import torch
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_core.results import read_json
+
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
+STATE, ACTION = "observation.state", "action"
+KEYS = {STATE: "proprio", ACTION: "action"}
+"""Their features -> entries of our statistics."""
+MODES = {
+    "IDENTITY": "none",
+    "MEAN_STD": "mean_std",
+    "MIN_MAX": "min_max",
+    "QUANTILES": "quantile",
+}
+NEEDS = {
+    "none": (),
+    "mean_std": ("mean", "std"),
+    "min_max": ("min", "max"),
+    "quantile": ("q01", "q99"),
+}
+STATISTICS = ("mean", "std", "min", "max", "q01", "q10", "q50", "q90", "q99")
+TOKENIZER = "google/paligemma-3b-pt-224"
+BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+_KNOWN = {
+    "rename_observations_processor",
+    "to_batch_processor",
+    "pi0_new_line_processor",
+    "pi05_prepare_state_tokenizer_processor_step",
+    "tokenizer_processor",
+    "device_processor",
+    "relative_actions_processor",
+    "normalizer_processor",
+}
+SUFFIX = ".safetensors"
+_NORMALIZER = "normalizer_processor"
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What happens to states, actions and words.
+
+    Args:
+        modes: feature -> ``norm_type``.
+        statistics: feature -> statistic -> numbers.
+        epsilon: added to what is divided by.
+        epsilon_if_zero: only where a range is 0.
+        relative: which actions are counted from the state; None if none is.
+        tokenizer: its name.
+        max_length: tokens of a prompt.
+        renamed: names of observations that are changed first.
+    """
+
+    modes: Mapping[str, str]
+    statistics: Mapping[str, Mapping[str, Sequence[float]]]
+    epsilon: float
+    epsilon_if_zero: bool
+    relative: Sequence[bool] | None
+    tokenizer: str
+    max_length: int
+    renamed: Mapping[str, str]
+
+
+def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
+    """The preparation that ``policy_preprocessor.json`` in ``folder`` describes.
+
+    Args:
+        widths: of states and actions.
+
+    Raises:
+        CheckpointError: steps or settings that are not known here, or statistics that are missing.
+    """
+    file = folder / f"{PREPROCESSOR}.json"
+    where = str(file)
+    content = read_json(file, dict[str, Any], CheckpointError)
+    listed = content.get("steps")
+    if not isinstance(listed, list) or not all(isinstance(step, dict) for step in listed):
+        raise CheckpointError("steps: no list of steps", where=where)
+    steps: dict[str, dict[str, Any]] = {}
+    for step in listed:
+        name = step.get("registry_name")
+        if name not in _KNOWN or not isinstance(step.setdefault("config", {}), dict):
+            raise CheckpointError(
+                f"the step {name or step.get('class')!r} is not one of PI0's or PI0.5's",
+                where=where,
+                cause="the policy was prepared for by code of its own, or a newer LeRobot",
+            )
+        steps[name] = step
+    missing = sorted({_NORMALIZER, "tokenizer_processor"} - set(steps))
+    if missing:
+        raise CheckpointError(f"there is no step {', '.join(missing)}", where=where)
+    normalizer, words = steps[_NORMALIZER]["config"], steps["tokenizer_processor"]["config"]
+    modes = _modes(normalizer.get("norm_map", {}), where)
+    found: dict[str, dict[str, Sequence[float]]] = {}
+    if steps[_NORMALIZER].get("state_file") is not None:
+        tensors = _state_file(folder, steps[_NORMALIZER]["state_file"], where)
+        found = {key: _rows(tensors, f"{key}.", widths[key], where) for key in KEYS}
+    _check(found, modes, where)
+    relative = steps.get("relative_actions_processor", {}).get("config", {})
+    for key in ("exclude_joints", "action_names"):
+        _setting(relative, key, [], (list, type(None)), where)
+    names = steps.get("rename_observations_processor", {}).get("config", {})
+    return Preparation(
+        modes={key: modes[key] if found.get(key) else "none" for key in KEYS},
+        statistics=found,
+        epsilon=_setting(normalizer, "eps", 1e-8, (int, float), where),
+        epsilon_if_zero=True,
+        relative=_relative(relative, widths[ACTION]) if relative.get("enabled") else None,
+        tokenizer=_setting(words, "tokenizer_name", TOKENIZER, str, where),
+        max_length=_setting(words, "max_length", 512, int, where),
+        renamed=_setting(names, "rename_map", {}, dict, where),
+    )
+
+
+def from_buffers(
+    folder: Path, config: Mapping[str, Any], widths: Mapping[str, int], max_length: int
+) -> Preparation:
+    """The preparation of LeRobot before 0.4, whose statistics are among the weights.
+
+    Raises:
+        CheckpointError: modes that are not known here, or statistics that are missing.
+    """
+    where = str(folder)
+    modes = _modes(config.get("normalization_mapping", {}), where)
+    tensors = safetensors_in(folder)
+    prefixes = {
+        STATE: "normalize_inputs.buffer_observation_state.",
+        ACTION: "unnormalize_outputs.buffer_action.",
+    }
+    found = {key: _rows(tensors, prefixes[key], widths[key], where) for key in KEYS}
+    _check(found, modes, where)
+    return Preparation(
+        modes={key: modes[key] if found[key] else "none" for key in KEYS},
+        statistics=found,
+        epsilon=1e-8,
+        epsilon_if_zero=False,
+        relative=None,
+        tokenizer=TOKENIZER,
+        max_length=max_length,
+        renamed={},
+    )
+
+
+def write_processors(
+    folder: Path,
+    family: str,
+    features: Mapping[str, Mapping[str, Any]],
+    preparation: Preparation,
+    names: Sequence[str] | None,
+) -> None:
+    """Write both processors of ``family`` into ``folder``.
+
+    Args:
+        features: all of them as LeRobot's config has them, those of actions last.
+        preparation: with ``epsilon_if_zero`` and LeRobot's epsilon.
+        names: of the actions, where some are relative.
+    """
+    import json
+
+    from safetensors.torch import save_file
+
+    theirs = {ours: mode for mode, ours in MODES.items()}
+    normalizer = {
+        "eps": preparation.epsilon,
+        "features": features,
+        "norm_map": {
+            "VISUAL": "IDENTITY",
+            "STATE": theirs[preparation.modes[STATE]],
+            "ACTION": theirs[preparation.modes[ACTION]],
+        },
+    }
+    relative = preparation.relative is not None
+    apart = [] if preparation.relative is None else _apart(preparation.relative, names or ())
+    words: list[tuple[str, dict[str, Any]]] = [
+        (
+            "tokenizer_processor",
+            {
+                "max_length": preparation.max_length,
+                "task_key": "task",
+                "padding_side": "right",
+                "padding": "max_length",
+                "truncation": True,
+                "tokenizer_name": TOKENIZER,
+            },
+        ),
+        ("device_processor", {"device": "cpu", "float_dtype": None}),
+    ]
+    numbers: list[tuple[str, dict[str, Any]]] = [
+        (
+            "relative_actions_processor",
+            {
+                "enabled": relative,
+                "exclude_joints": apart if relative else ["gripper"],
+                "action_names": list(names) if relative and names else None,
+            },
+        ),
+        (_NORMALIZER, normalizer),
+    ]
+    first: list[tuple[str, dict[str, Any]]] = [
+        ("rename_observations_processor", {"rename_map": {}}),
+        ("to_batch_processor", {}),
+    ]
+    if family == "pi0":
+        steps = [*first, ("pi0_new_line_processor", {}), *words, *numbers]
+    else:
+        steps = [*first, *numbers, ("pi05_prepare_state_tokenizer_processor_step", {}), *words]
+    action = {ACTION: features[ACTION]}
+    after: list[tuple[str, dict[str, Any]]] = [
+        ("unnormalizer_processor", {**normalizer, "features": action}),
+        ("absolute_actions_processor", {"enabled": relative}),
+        ("device_processor", {"device": "cpu", "float_dtype": None}),
+    ]
+    tensors = {
+        f"{key}.{name}": torch.tensor(row, dtype=torch.float32)
+        for key, rows in preparation.statistics.items()
+        for name, row in rows.items()
+    }
+    for name, listed in ((PREPROCESSOR, steps), (POSTPROCESSOR, after)):
+        written = []
+        for place, (step, config) in enumerate(listed):
+            entry: dict[str, Any] = {"registry_name": step, "config": config}
+            if step.endswith("normalizer_processor") and tensors:
+                entry["state_file"] = f"{name}_step_{place}_{step}.safetensors"
+                save_file(tensors, folder / entry["state_file"])
+            written.append(entry)
+        text = json.dumps({"name": name, "steps": written}, indent=2)
+        (folder / f"{name}.json").write_text(text, encoding="utf-8")
+
+
+def _setting(
+    config: Mapping[str, Any], key: str, default: Any, kind: type | tuple[type, ...], where: str
+) -> Any:
+    """A step's setting, of the type that LeRobot gives it."""
+    value = config.get(key, default)
+    if not isinstance(value, kind):
+        raise CheckpointError(f"{key} is {value!r}", where=where)
+    return value
+
+
+def _modes(given: Any, where: str) -> dict[str, str]:
+    """Feature -> ``norm_type``, of a table by kinds of features."""
+    if not isinstance(given, Mapping):
+        raise CheckpointError(f"no table of normalizations: {given!r}", where=where)
+    unknown = {key: mode for key, mode in given.items() if mode not in MODES}
+    if unknown:
+        raise CheckpointError(
+            f"normalizations {unknown} are not known here; {', '.join(MODES)} are", where=where
+        )
+    if given.get("VISUAL", "IDENTITY") != "IDENTITY":
+        raise CheckpointError(
+            f"pictures are normalized by {given['VISUAL']}; PI0 and PI0.5 take them as they are",
+            where=where,
+        )
+    return {
+        STATE: MODES[given.get("STATE", "IDENTITY")],
+        ACTION: MODES[given.get("ACTION", "IDENTITY")],
+    }
+
+
+def _state_file(folder: Path, name: Any, where: str) -> Mapping[str, Stored]:
+    if (
+        not isinstance(name, str)
+        or PurePath(name).name != name
+        or not name.endswith(".safetensors")
+    ):
+        raise CheckpointError(f"state_file {name!r} is not a file next to it", where=where)
+    if not os.path.lexists(folder / name):
+        raise CheckpointError(f"state_file {name} is missing", where=where)
+    return safetensors_in(folder, name.removesuffix(SUFFIX))
+
+
+def _rows(
+    tensors: Mapping[str, Stored], prefix: str, width: int, where: str
+) -> dict[str, Sequence[float]]:
+    """The statistics whose names begin with ``prefix``; none where they were never filled."""
+    found: dict[str, Sequence[float]] = {}
+    for name in STATISTICS:
+        stored = tensors.get(prefix + name)
+        if stored is None:
+            continue
+        row = stored[tuple(slice(0, n) for n in stored.shape)].float()
+        if row.shape != (width,):
+            raise CheckpointError(
+                f"{prefix}{name} has shape {tuple(row.shape)}, {width} numbers are expected",
+                where=where,
+            )
+        if torch.isfinite(row).all():  # LeRobot before 0.4 marks empty ones by infinity
+            found[name] = row.tolist()
+    return found
+
+
+def _check(found: Mapping[str, Mapping[str, Any]], modes: Mapping[str, str], where: str) -> None:
+    """Statistics are there as a whole for a feature, or not at all, as in base models."""
+    for key, rows in found.items():
+        lacks = [name for name in NEEDS[modes[key]] if name not in rows]
+        if rows and lacks:
+            raise CheckpointError(
+                f"{key} is normalized by {modes[key]}, and has no {', '.join(lacks)} but "
+                f"{', '.join(rows)}",
+                where=where,
+            )
+
+
+def _relative(config: Mapping[str, Any], width: int) -> list[bool]:
+    """Which actions are relative: all but those whose names hold an excluded joint's."""
+    apart = [str(name).lower() for name in config.get("exclude_joints") or () if name]
+    names = [str(name).lower() for name in config.get("action_names") or ()][:width]
+    found = [not any(token in name for token in apart) for name in names]
+    return found + [True] * (width - len(found))
+
+
+def _apart(relative: Sequence[bool], names: Sequence[str]) -> list[str]:
+    """Names of the joints that are not relative.
+
+    Raises:
+        CheckpointError: joints are told apart by names, and these do not.
+    """
+    if all(relative):
+        return []
+    apart = [name for name, counted in zip(names, relative, strict=False) if not counted]
+    config = {"exclude_joints": apart, "action_names": list(names)}
+    if not apart or _relative(config, len(relative)) != list(relative):
+        raise CheckpointError(
+            "some actions are relative to the state and some are not; LeRobot tells them apart by "
+            f"names, which {', '.join(names) or 'no names'} do not"
+        )
+    return apart

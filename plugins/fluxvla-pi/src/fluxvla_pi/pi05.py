@@ -1,0 +1,59 @@
+"""PI0.5 (Physical Intelligence 2025, arXiv 2504.16054): the state stands in the prompt, the time
+conditions every normalisation of the expert."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fluxvla_pi.flow_matching import PiFlowMatching, Suffix, time_features
+
+
+class PI05FlowMatching(PiFlowMatching):
+    """PI0.5; arguments as of ``PiFlowMatching``. ``states`` reach it as words of the prompt."""
+
+    adaptive = True
+
+    def __init__(
+        self,
+        variant: str | Mapping[str, int] = "gemma_2b",
+        expert_variant: str | Mapping[str, int] = "gemma_300m",
+        vision_variant: str | Mapping[str, int] = "so400m",
+        n_action_steps: int = 50,
+        max_action_dim: int = 32,
+        ori_action_dim: int | None = None,
+        num_steps: int = 10,
+        prefix_conditioning: bool = False,
+        vocab_size: int = 257152,
+        freeze_vision_backbone: bool = False,
+        freeze_llm_backbone: bool = False,
+        pretrained_name_or_path: str | None = None,
+    ) -> None:
+        super().__init__(
+            variant=variant,
+            expert_variant=expert_variant,
+            vision_variant=vision_variant,
+            n_action_steps=n_action_steps,
+            max_action_dim=max_action_dim,
+            ori_action_dim=ori_action_dim,
+            num_steps=num_steps,
+            prefix_conditioning=prefix_conditioning,
+            vocab_size=vocab_size,
+            freeze_vision_backbone=freeze_vision_backbone,
+            freeze_llm_backbone=freeze_llm_backbone,
+            pretrained_name_or_path=pretrained_name_or_path,
+        )
+        width = self.llm_expert.size.width
+        self.time_mlp_in = nn.Linear(width, width)
+        self.time_mlp_out = nn.Linear(width, width)
+
+    def embed_suffix(self, states: Tensor, x: Tensor, tau: Tensor) -> Suffix:
+        """Actions, all of which see all; the time is the condition."""
+        hidden = self.action_in_proj(x)
+        times = time_features(tau, hidden.shape[-1]).to(hidden.dtype)
+        condition = functional.silu(self.time_mlp_out(functional.silu(self.time_mlp_in(times))))
+        blocks = torch.zeros(hidden.shape[1], dtype=torch.long, device=x.device)
+        return Suffix(hidden, condition, blocks)

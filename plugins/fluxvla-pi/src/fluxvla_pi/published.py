@@ -1,0 +1,144 @@
+"""Weights of published files: which model they are of, and its tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from math import isqrt
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_pi.flow_matching import PiFlowMatching
+from fluxvla_pi.names import Layout, actual_names, layout_of, sources
+from fluxvla_pi.pi0 import PI0FlowMatching
+from fluxvla_pi.pi05 import PI05FlowMatching
+from fluxvla_pi.sizes import GEMMA, SIGLIP, GemmaSize, SiglipSize
+
+FAMILIES: Mapping[str, type[PiFlowMatching]] = {"pi0": PI0FlowMatching, "pi05": PI05FlowMatching}
+# Neither follows from shapes: all published towers have 16 heads, and all their code 1 key.
+VISION_HEADS, KEY_HEADS = 16, 1
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The weights of a file.
+
+    Args:
+        family: ``pi0`` or ``pi05``.
+        model: the config's table, without ``n_action_steps``, which no shape tells.
+        tensors: by our names.
+    """
+
+    family: str
+    model: dict[str, Any]
+    tensors: Mapping[str, Stored]
+
+
+def weights_in(folder: Path, besides: Iterable[str] = ()) -> Weights:
+    """The weights of ``model.safetensors`` in ``folder``, of the model that their shapes tell.
+
+    Args:
+        besides: tensors in the file that are none of the model's.
+
+    Raises:
+        CheckpointError: they are of another model, or there are more or fewer of them.
+    """
+    left_out = set(besides)
+    tensors = {n: t for n, t in safetensors_in(folder).items() if n not in left_out}
+    where = str(folder)
+    layout = layout_of(tensors, where)
+    shapes = {name: tuple(t.shape) for name, t in tensors.items()}
+    found = _Shapes(shapes, layout, where)
+    family = "pi05" if found.has("time_mlp_in.weight") else "pi0"
+    table = found.table(family)
+    with torch.device("meta"):
+        wanted = FAMILIES[family](**table).state_dict()
+    names = sources(wanted, tensors, where)
+    wrong = [
+        f"{theirs}: {shapes[theirs]}, expected {tuple(wanted[ours].shape)}"
+        for ours, theirs in names.items()
+        if shapes[theirs] != tuple(wanted[ours].shape)
+    ]
+    if wrong:
+        raise CheckpointError(f"tensors of another size: {'; '.join(wrong[:5])}", where=where)
+    model = {"type": FAMILIES[family].__name__, **table}
+    return Weights(family, model, {ours: tensors[theirs] for ours, theirs in names.items()})
+
+
+class _Shapes:
+    """Shapes of a file's tensors, by our names."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], layout: Layout, where: str) -> None:
+        self._shapes = {long: shapes[name] for long, name in actual_names(shapes, layout).items()}
+        self._layout = layout
+        self._where = where
+
+    def has(self, ours: str) -> bool:
+        return self._layout.theirs(ours) in self._shapes
+
+    def table(self, family: str) -> dict[str, Any]:
+        """The model's arguments that shapes tell."""
+        action, _ = self._two("action_out_proj.weight")
+        vocabulary, _ = self._two(self._embedding())
+        table: dict[str, Any] = {
+            "variant": _named(self._gemma("llm_backbone"), GEMMA),
+            "expert_variant": _named(self._gemma("llm_expert"), GEMMA),
+            "vision_variant": _named(self._siglip(), SIGLIP),
+            "max_action_dim": action,
+            "vocab_size": vocabulary,
+        }
+        if family == "pi0":
+            table["max_state_dim"] = self._two("state_proj.weight")[1]
+        return table
+
+    def _gemma(self, part: str) -> GemmaSize:
+        queries, width = self._two(f"{part}.layers.0.self_attn.q_proj.weight")
+        keys, _ = self._two(f"{part}.layers.0.self_attn.k_proj.weight")
+        hidden, _ = self._two(f"{part}.layers.0.mlp.gate_proj.weight")
+        head = keys // KEY_HEADS
+        depth = self._depth(f"{part}.layers", "self_attn.q_proj.weight")
+        return GemmaSize(width, depth, hidden, queries // head, KEY_HEADS, head)
+
+    def _siglip(self) -> SiglipSize:
+        tower = "vision_backbone"
+        width, _, patch, _ = self._shape(f"{tower}.patch_embedding.weight", 4)
+        patches, _ = self._two(f"{tower}.position_embedding.weight")
+        hidden, _ = self._two(f"{tower}.layers.0.mlp.fc1.weight")
+        depth = self._depth(f"{tower}.layers", "mlp.fc1.weight")
+        return SiglipSize(width, depth, hidden, VISION_HEADS, isqrt(patches) * patch, patch)
+
+    def _depth(self, layers: str, name: str) -> int:
+        depth = 0
+        while self.has(f"{layers}.{depth}.{name}"):
+            depth += 1
+        return depth
+
+    def _embedding(self) -> str:
+        name = "llm_backbone.embed_tokens.weight"
+        head = self._layout.head
+        return name if self.has(name) or not head else head.removeprefix(self._layout.root)
+
+    def _two(self, ours: str) -> tuple[int, int]:
+        rows, columns = self._shape(ours, 2)
+        return rows, columns
+
+    def _shape(self, ours: str, dimensions: int) -> tuple[int, ...]:
+        name = self._layout.theirs(ours)
+        shape = self._shapes.get(name)
+        if shape is None or len(shape) != dimensions or 0 in shape:
+            what = "is missing" if shape is None else f"has shape {shape}"
+            raise CheckpointError(
+                f"{name} {what}, by which the size of the model is known",
+                where=self._where,
+                cause="the file is damaged, or of another model",
+            )
+        return shape
+
+
+def _named(size: Any, known: Mapping[str, Any]) -> Any:
+    """The name of ``size`` where it has one, else its numbers."""
+    return next((name for name, other in known.items() if other == size), asdict(size))

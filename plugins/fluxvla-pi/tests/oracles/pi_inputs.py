@@ -1,0 +1,106 @@
+"""Sizes and inputs of tiny models that every reference can make alike; numpy alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.oracles import fill
+
+GEMMA = {"width": 32, "depth": 3, "mlp_dim": 48, "heads": 8, "kv_heads": 1, "head_dim": 8}
+EXPERT = {**GEMMA, "width": 24, "mlp_dim": 40}
+VISION = {
+    "width": 32,
+    "depth": 2,
+    "mlp_dim": 48,
+    "heads": 16,
+    "image_size": 28,
+    "patch_size": 14,
+}
+VOCABULARY = 64
+HORIZON, ACTIONS, STATES = 5, 8, 8
+BATCH, CAMERAS, WORDS = 3, 2, 6
+PATCHES = (VISION["image_size"] // VISION["patch_size"]) ** 2
+SIZES = {
+    "variant": GEMMA,
+    "expert_variant": EXPERT,
+    "vision_variant": VISION,
+    "vocab_size": VOCABULARY,
+    "n_action_steps": HORIZON,
+    "max_action_dim": ACTIONS,
+}
+
+
+def inputs():
+    """A batch. ``tau`` has few bits, so that ``1 - tau`` is exact in float32.
+
+    The second sample has but one camera, and samples have 6, 4 and 5 words.
+    """
+    side = VISION["image_size"]
+    return {
+        "images": fill.uniform("images", (BATCH, 3 * CAMERAS, side, side), -1, 1),
+        "img_masks": np.array([[True, True], [True, False], [True, True]]),
+        "lang_tokens": fill.integers("lang_tokens", (BATCH, WORDS), VOCABULARY),
+        "lang_masks": np.arange(WORDS)[None] < np.array([[6], [4], [5]]),
+        "states": fill.normal("states", (BATCH, STATES)),
+        "actions": fill.normal("actions", (BATCH, HORIZON, ACTIONS)),
+        "noise": fill.normal("noise", (BATCH, HORIZON, ACTIONS)),
+        "tau": np.array([0.125, 0.6875, 0.9375], np.float32),
+    }
+
+
+# -- a policy with everything around it ----------------------------------------------------------
+
+SIZES_OF_CAMERAS = {"front": (48, 64), "wrist": (40, 30)}
+ROBOT_ACTIONS, ROBOT_STATES = 7, 7
+TASKS = {"pi0": "put the red_block away", "pi05": " put the red_block\naway "}
+SEED = 5
+LETTERS = "abcdefghijklmnopqrstuvwxyzTSA0123456789 ,:;_-\n"
+
+
+def tokenizer():
+    """A tokenizer of single letters, with PaliGemma's special ones in its places."""
+    from tokenizers import Regex, Tokenizer, models, pre_tokenizers, processors
+
+    special = ["<pad>", "<eos>", "<bos>", "<unk>"]
+    vocabulary = {token: i for i, token in enumerate([*special, *LETTERS])}
+    made = Tokenizer(models.WordLevel(vocabulary, unk_token="<unk>"))
+    made.pre_tokenizer = pre_tokenizers.Split(Regex(r"[\s\S]"), "isolated")
+    made.post_processor = processors.TemplateProcessing("<bos> $A", None, [("<bos>", 2)])
+    made.add_special_tokens(special)
+    return made
+
+
+def statistics():
+    """As LeRobot has them: key -> name -> numbers; one action never moved."""
+    found = {}
+    for key, width in (("observation.state", ROBOT_STATES), ("action", ROBOT_ACTIONS)):
+        mean = fill.normal(f"{key}.mean", (width,), 0.5)
+        std = fill.uniform(f"{key}.std", (width,), 0.2, 1.0)
+        if key == "action":
+            std[2] = 0
+        found[key] = {"mean": mean, "std": std}
+        for name, times in (("min", -3), ("max", 3), ("q01", -2), ("q99", 2)):
+            found[key][name] = mean + np.float32(times) * std
+    return found
+
+
+def observation():
+    """Pictures ``(H, W, 3)`` uint8 by camera, and the state in a robot's units."""
+    images = {
+        name: fill.integers(f"picture.{name}", (*size, 3), 256).astype(np.uint8)
+        for name, size in SIZES_OF_CAMERAS.items()
+    }
+    mean, std = (statistics()["observation.state"][name] for name in ("mean", "std"))
+    return images, mean + fill.normal("state", (ROBOT_STATES,)) * std
+
+
+def chunk():
+    """Actions in a robot's units ``(1, T, D)``, some beyond all that the statistics saw."""
+    mean, std = (statistics()["action"][name] for name in ("mean", "std"))
+    return (mean + 2 * fill.normal("chunk", (1, HORIZON, ROBOT_ACTIONS)) * std).astype(np.float32)
+
+
+def first_noise():
+    """``(1, T, D)``: what a policy here draws in an episode of ``SEED`` for its first chunk."""
+    generator = np.random.Generator(np.random.Philox(key=np.array([SEED, 0], np.uint64)))
+    return generator.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32)

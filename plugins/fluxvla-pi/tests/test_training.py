@@ -1,0 +1,143 @@
+"""Training by every strategy: two processes equal one, and a run goes on bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fluxvla_core import build_runner_from_cfg
+from fluxvla_core.checkpoints.checkpoint import folders, latest
+from fluxvla_core.operators import RunContext
+from fluxvla_core.testing.training import OneProcessRunner, checkpoint_differences, run_ranks
+
+from .oracles.pi_inputs import (
+    ACTIONS,
+    CAMERAS,
+    HORIZON,
+    SIZES,
+    STATES,
+    VISION,
+    VOCABULARY,
+    WORDS,
+)
+
+KEYS = (
+    "images",
+    "img_masks",
+    "lang_tokens",
+    "lang_masks",
+    "states",
+    "actions",
+    "action_masks",
+    "noise",
+    "time",
+)
+MODELS = {
+    "pi0": {"type": "PI0FlowMatching", **SIZES, "max_state_dim": STATES},
+    "pi05": {"type": "PI05FlowMatching", **SIZES},
+}
+assert OneProcessRunner  # registers itself
+
+
+class Samples:
+    """Samples that follow from their index, and noise from the epoch, too."""
+
+    fps = 10.0
+
+    def __len__(self):
+        return 16
+
+    def get_sample(self, index, epoch):
+        rng, drawn = np.random.default_rng(index), np.random.default_rng((epoch, index))
+        side = VISION["image_size"]
+        words = np.arange(WORDS) < 3 + index % 4
+        sample = {
+            "images": rng.uniform(-1, 1, (3 * CAMERAS, side, side)),
+            "states": rng.standard_normal(STATES),
+            "actions": rng.standard_normal((HORIZON, ACTIONS)),
+            "action_masks": np.arange(HORIZON) < 2 + index % 4,
+            "noise": drawn.standard_normal((2, HORIZON, ACTIONS)),
+            "time": drawn.uniform(0, 0.999, 2),
+        }
+        sample = {key: value.astype(np.float32) for key, value in sample.items()}
+        sample["lang_tokens"] = rng.integers(0, VOCABULARY, WORDS)
+        sample["lang_masks"], sample["img_masks"] = words, np.array([True, index % 3 > 0])
+        return sample
+
+
+def train(work_dir, family, runner, batch, resume=None):
+    """One run of four steps."""
+    config = {
+        "model": MODELS[family],
+        "train_dataloader": {"per_device_batch_size": batch},
+        "runner": {
+            "learning_rate": 1e-3,
+            "weight_decay": 0.01,
+            "max_grad_norm": 1.0,
+            "max_steps": 4,
+            "save_iter_interval": 2,
+            "max_keep_ckpts": 0,
+            "seed": 3,
+            "enable_mixed_precision_training": False,
+            "collator": {"type": "DictCollator", "keys": list(KEYS)},
+            **runner,
+        },
+    }
+    context = RunContext(config=config, section="runner", work_dir=work_dir, resume=resume)
+    built = build_runner_from_cfg(config["runner"], context)
+    built.run_setup(len(Samples()))
+    built.run(Samples())
+
+
+STRATEGIES = {
+    "ddp": {"type": "DDPTrainRunner"},
+    "fsdp": {"type": "FSDPTrainRunner", "sharding_strategy": "full-shard"},
+    "recomputed": {
+        "type": "FSDPTrainRunner",
+        "sharding_strategy": "full-shard",
+        "enable_gradient_checkpointing": True,
+    },
+}
+
+
+def every_strategy(root, family):
+    torch.distributed.init_process_group("gloo")
+    for name, runner in STRATEGIES.items():
+        train(root / name, family, runner, 4)
+    middle = str(folders(root / "fsdp")[0])
+    train(root / "goes_on", family, STRATEGIES["fsdp"], 4, middle)
+
+
+@pytest.fixture(scope="module", params=["pi05", pytest.param("pi0", marks=pytest.mark.slow)])
+def trained(request, tmp_path_factory):
+    root = Path(tmp_path_factory.mktemp(request.param))
+    assert run_ranks(2, every_strategy, root, request.param) == [0, 0]
+    train(root / "alone", request.param, {"type": "OneProcessRunner"}, 8)
+    return root
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_two_processes_train_as_one(trained, name):
+    alone, found = (latest(trained / part).tensors("model.safetensors") for part in ("alone", name))
+    assert alone.keys() == found.keys()
+    gaps = {
+        key: float((alone[key] - found[key]).abs().max())
+        for key in alone
+        # It shifts all scores of a softmax alike: its gradient is rounding, which Adam enlarges.
+        if not key.endswith("self_attn.k_proj.bias")
+    }
+    assert max(gaps.values()) < 1e-5, max(gaps, key=gaps.get)
+
+
+def test_it_goes_on_bit_for_bit(trained):
+    whole, on = (latest(trained / part).path for part in ("fsdp", "goes_on"))
+    assert checkpoint_differences(whole, on) == []
+
+
+def test_the_weights_moved(trained):
+    first, last = (folders(trained / "alone")[i] for i in (0, -1))
+    assert first != last
+    assert checkpoint_differences(first, last)

@@ -1,0 +1,49 @@
+"""Our tiny models with the weights and inputs that the references get."""
+
+from __future__ import annotations
+
+import torch
+from fluxvla_pi.pi0 import PI0FlowMatching
+from fluxvla_pi.pi05 import PI05FlowMatching
+
+from tests.oracles import fill
+
+from .oracles.pi_inputs import SIZES, STATES, inputs
+
+
+def model_of(family, layout=None, **settings):
+    """A tiny ``pi0`` or ``pi05``; of a layout with every tensor by its published name.
+
+    The embedding's name is ``embed_tokens`` there, which every reference has when it is built.
+    """
+    torch.manual_seed(0)
+    if family == "pi0":
+        model = PI0FlowMatching(**{**SIZES, "max_state_dim": STATES, **settings})
+    else:
+        model = PI05FlowMatching(**{**SIZES, **settings})
+    if layout is not None:
+        state = {
+            name: torch.from_numpy(fill.weight(layout.theirs(name), tuple(tensor.shape)))
+            for name, tensor in model.state_dict().items()
+        }
+        model.load_state_dict(state)
+    return model.eval()
+
+
+def training_batch():
+    """``inputs`` as ``forward`` takes them: one draw for each sample."""
+    batch = {key: torch.from_numpy(value) for key, value in inputs().items()}
+    batch["time"] = 1 - batch.pop("tau")[:, None]
+    batch["noise"] = batch["noise"][:, None]
+    return batch
+
+
+def acting_batch():
+    """``inputs`` as ``predict_action`` takes them."""
+    batch = {key: torch.from_numpy(value) for key, value in inputs().items()}
+    return {key: v for key, v in batch.items() if key not in ("actions", "tau")}
+
+
+def relative(found, expected):
+    """The largest difference, by the largest number that is expected."""
+    return ((found - expected).abs().max() / expected.abs().max()).item()

@@ -1,0 +1,1 @@
+"""FluxVLA runs in the Rerun viewer (https://rerun.io), live and as ``.rrd`` files."""

@@ -1,0 +1,251 @@
+"""``fluxvla plugins check``: run the conformance kit that fits a class.
+
+pytest runs the kit, in this process, and says nothing itself: what the checks say is printed here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import io
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+from fluxvla_core.cli.parser import Parser, add_plugin_files
+from fluxvla_core.cli.terminal import say
+from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, UsageError, nearest
+
+KITS: Mapping[str, str] = {
+    "action_filters": "ActionFilterConformance",
+    "datasets": "DatasetConformance",
+    "environments": "EnvironmentConformance",
+    "hooks": "HookConformance",
+    "metrics": "MetricConformance",
+    "operators": "OperatorConformance",
+    "policies": "PolicyConformance",
+    "runners": "TrainRunnerConformance",
+    "transforms": "TransformConformance",
+    "vlas": "ModelConformance",
+}
+"""Registry -> its kit in ``fluxvla_core.testing``; of runners, that of train runners."""
+INSTALL = "pip install 'fluxvla-core[testing]'"
+_MODULE = "test_plugin.py"
+_SOURCE = """\
+import fluxvla_core.testing
+
+
+class TestPlugin(fluxvla_core.testing.{kit}):
+    entry_point = {name!r}
+    arguments = {arguments!r}
+"""
+
+
+class Outcome(NamedTuple):
+    """What one check said: ``ok``, ``skipped`` or ``FAILED``, and why."""
+
+    check: str
+    state: str
+    words: str
+
+
+class CheckPlugin:
+    api = "1.0"
+    help = (
+        "Run the conformance kit that fits a class, and say in words what is wrong. An operator's "
+        "kit moves the robot that --set arguments reach: every joint by 0.03 of its unit."
+    )
+
+    def add_arguments(self, parser: Parser) -> None:
+        parser.add_argument("name", help="a class's name, or distribution:name")
+        parser.add_argument(
+            "--set",
+            dest="arguments",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help="an argument of its constructor (a TOML value)",
+        )
+        parser.once(
+            "--kit",
+            metavar="FILE",
+            help="a Python file with subclasses of the kits, such as a plugin's own tests: those "
+            "for this class are run",
+        )
+        add_plugin_files(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        from fluxvla_core.plugins.files import load_plugin_files
+
+        if importlib.util.find_spec("pytest") is None:
+            raise UsageError("the kits need pytest, which is not installed", next=INSTALL)
+        load_plugin_files(args.plugin_files)
+        registry = _registry_of(args.name)
+        kit = _kit_of(registry, args.name)
+        if args.kit is not None and args.arguments:
+            raise UsageError("--set is for a kit without a file; --kit has arguments of its own")
+        found = list(_run(args, kit))
+        if not found:
+            raise UsageError(f"--kit {args.kit}: it has no kit whose entry_point is {args.name!r}")
+        for outcome in found:
+            say("\n".join(_lines(outcome)))
+        counts = {state: sum(o.state == state for o in found) for state in _STATES}
+        say(f"{args.name}: {', '.join(f'{n} {state}' for state, n in counts.items() if n)}")
+        return EXIT_FAILED if counts["FAILED"] else EXIT_DONE
+
+
+_STATES = ("ok", "skipped", "FAILED")
+
+
+def _registry_of(name: str) -> str:
+    """The registry that has ``name``; of several the first that has a kit.
+
+    Raises:
+        UsageError: none has it.
+        MissingPlugin: a first-party plugin would, that is not installed.
+    """
+    from fluxvla_core.plugins.registry import BY_NAME
+
+    short = name.rpartition(":")[2]
+    having = [registry for registry, one in BY_NAME.items() if short in one]
+    if not having:
+        from fluxvla_core.cli.plugin_commands import providers
+
+        here = [n for one in BY_NAME.values() for n in one if one.registered(n) is not None]
+        near = nearest(short, here)
+        if near is not None:
+            raise UsageError(f"nothing is called {name!r}; did you mean {near!r}?")
+        providers(name)
+    return next((registry for registry in having if registry in KITS), having[0])
+
+
+def _kit_of(registry: str, name: str) -> str:
+    """Raises UsageError where there is no kit for the class, PluginError where it is broken."""
+    from fluxvla_core.contracts.check import is_train_runner
+    from fluxvla_core.plugins.registry import BY_NAME
+
+    if registry not in KITS:
+        raise UsageError(
+            f"{name} is in fluxvla.{registry}, for which there is no kit; there are kits for "
+            f"{', '.join(KITS)}",
+            next="fluxvla plugins doctor checks its class",
+        )
+    cls = BY_NAME[registry].get(name)
+    if registry == "runners" and not is_train_runner(cls):
+        raise UsageError(
+            f"{name} is a runner that does not train, for which there is no kit",
+            next="fluxvla plugins doctor checks its class",
+        )
+    if registry == "runners" and BY_NAME[registry].registered(name) is not None:
+        raise UsageError(
+            f"{name} is registered by a file, and train runners are tested in processes of their "
+            "own, which know what is installed",
+            next="pip install -e its distribution; fluxvla new-plugin begins one",
+        )
+    return KITS[registry]
+
+
+def _arguments(words: list[str]) -> dict[str, Any]:
+    """``KEY=VALUE`` words as constructor arguments.
+
+    Raises:
+        UsageError: one has no '='.
+    """
+    from fluxvla_core.config.overrides import parse_value
+
+    arguments: dict[str, Any] = {}
+    for word in words:
+        key, sign, text = word.partition("=")
+        if not sign or not key.isidentifier():
+            raise UsageError(f"--set {word}: expected KEY=VALUE, with the name of an argument")
+        arguments[key] = parse_value(text)
+    return arguments
+
+
+def _run(args: argparse.Namespace, kit: str) -> Iterator[Outcome]:
+    """The outcomes of the kit, or of those in ``args.kit`` for this class."""
+    import pytest
+
+    short = args.name.rpartition(":")[2]
+    collected = _Collected(short if args.kit is not None else None)
+    arguments = _arguments(args.arguments)
+    said = io.StringIO()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / _MODULE
+        if args.kit is None:
+            text = _SOURCE.format(kit=kit, name=args.name, arguments=arguments)
+            path.write_text(text, encoding="utf-8")
+        elif not Path(args.kit).is_file():
+            raise UsageError(f"--kit {args.kit}: there is no such file")
+        else:
+            path = Path(args.kit).resolve()
+        settings = Path(folder) / "pytest.ini"  # so that none of the present folder's applies
+        settings.write_text("[pytest]\n", encoding="utf-8")
+        # From the root, so that two files of one name are two modules.
+        words = ["-q", "-c", str(settings), "--rootdir", path.anchor, "--tb=no"]
+        words += ["-p", "no:cacheprovider", "--import-mode=importlib", str(path)]
+        with (
+            mock.patch.dict(os.environ, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1", PYTEST_ADDOPTS=""),
+            contextlib.redirect_stdout(said),
+        ):
+            code = pytest.main(words, plugins=[collected])
+    if code == pytest.ExitCode.INTERRUPTED and not collected.problem:
+        raise KeyboardInterrupt
+    if collected.problem or code == pytest.ExitCode.INTERNAL_ERROR:
+        raise UsageError(collected.problem or said.getvalue().strip())
+    yield from collected.outcomes
+
+
+class _Collected:
+    """A plugin of pytest that keeps what each check said.
+
+    Args:
+        name: only kits with this ``entry_point`` are run; None runs all.
+    """
+
+    def __init__(self, name: str | None) -> None:
+        self.outcomes: list[Outcome] = []
+        self.problem = ""
+        self._name = name
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        if self._name is not None:
+            items[:] = [item for item in items if self._is_for(item)]
+
+    def _is_for(self, item: Any) -> bool:
+        entry_point = getattr(item.cls, "entry_point", None) if item.cls is not None else None
+        return isinstance(entry_point, str) and entry_point.rpartition(":")[2] == self._name
+
+    def pytest_collectreport(self, report: Any) -> None:
+        if report.failed:
+            self.problem = f"the kit cannot be loaded: {_words(report)}"
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        check = report.nodeid.rpartition("::")[2].removeprefix("test_").replace("_", " ")
+        if report.skipped:
+            self.outcomes.append(Outcome(check, "skipped", _words(report)))
+        elif report.failed:
+            self.outcomes.append(Outcome(check, "FAILED", _words(report)))
+        elif report.when == "call":
+            self.outcomes.append(Outcome(check, "ok", ""))
+
+
+def _words(report: Any) -> str:
+    """What a check said, without the values that pytest adds."""
+    if isinstance(report.longrepr, tuple):  # path, line, reason of a skip
+        return str(report.longrepr[2]).removeprefix("Skipped: ")
+    crash = getattr(report.longrepr, "reprcrash", None)
+    text = str(report.longrepr) if crash is None else str(crash.message)
+    return text.partition("\nassert ")[0].removeprefix("AssertionError: ").strip()
+
+
+def _lines(outcome: Outcome) -> list[str]:
+    import textwrap
+
+    indent = " " * 11
+    words = textwrap.wrap(outcome.words, 100, initial_indent=indent, subsequent_indent=indent)
+    return [f"  {outcome.state:8} {outcome.check}", *words]

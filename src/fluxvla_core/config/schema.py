@@ -1,0 +1,244 @@
+"""JSON Schema (draft 2020-12) of the configs that what is installed can run.
+
+For editors: names of sections and keys, ``type`` from the registries, and each class's parameters
+with types, defaults and descriptions. Signatures and docstrings are read as ``config check`` reads
+them, without importing a plugin; the latter finds more, such as what a ``_base_`` leaves undone.
+
+A file that inherits (``_base_``) writes parts of tables, and so does a variable that is composed
+into others: there, nothing is required. Every definition therefore exists twice, ``whole:…`` and
+``part:…``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote
+
+from fluxvla_core.config.annotations import Schema, default_value, value_schema
+from fluxvla_core.config.check import REQUIRES
+from fluxvla_core.config.load import BASE
+from fluxvla_core.config.resolve import INJECTED, LOADERS, SEARCHED, SLOTS, Found, installed
+from fluxvla_core.config.runtime_signature import inspect_signature
+from fluxvla_core.config.signature import Parameter, Signature
+from fluxvla_core.config.tree import DELETE
+from fluxvla_core.errors import PluginError
+from fluxvla_core.plugins._metadata import CORE, Plugin, version
+from fluxvla_core.plugins.load import is_core
+from fluxvla_core.plugins.registry import BY_NAME
+from fluxvla_core.registries import BY_NAME as ROWS
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_WHOLE, _PART = "whole", "part"
+# A table under these may hold others by name instead of being of a class itself.
+_MAY_GROUP = frozenset({"datasets", "hooks", "action_filters"})
+_ALWAYS_TABLES = frozenset({"transforms"})
+_QUALIFIED = "^[A-Za-z0-9._-]+:.+$"
+
+
+@dataclass(frozen=True)
+class _Class:
+    """One class under the names that a config may call it by, the first of them preferred."""
+
+    names: tuple[str, ...]
+    found: Found
+
+
+def config_schema() -> Schema:
+    """The schema of every config file; plain JSON values."""
+    classes = {registry: list(_classes(registry)) for registry in SEARCHED}
+    definitions: Schema = {}
+    for kind in (_WHOLE, _PART):
+        definitions |= {f"{kind}:file": _file(kind)}
+        definitions |= {f"{kind}:{name}": _loader(kind) for name in LOADERS}
+        for registry, found in classes.items():
+            definitions[f"{kind}:{registry}"] = _slot(kind, registry, found)
+            for one in found:
+                definitions[f"{kind}:{registry}:{one.names[0]}"] = _table(kind, one.found)
+    definitions["section"] = _section(classes["runners"])
+    definitions["untyped"] = _untyped()
+    return {
+        "$schema": DIALECT,
+        "title": "FluxVLA config",
+        "description": f"What fluxvla-core {version(CORE)} and the plugins installed with it take.",
+        "type": "object",
+        "if": {"required": [BASE]},
+        "then": {"$ref": _ref(_PART, "file")},
+        "else": {"$ref": _ref(_WHOLE, "file")},
+        "$defs": definitions,
+    }
+
+
+def _ref(*parts: str) -> str:
+    """A reference (RFC 6901, as a URI fragment): a plugin's name may have any letters."""
+    return "#/$defs/" + quote(":".join(parts).replace("~", "~0").replace("/", "~1"), safe="~:")
+
+
+def _classes(registry: str) -> Iterable[_Class]:
+    """Every class of a registry that a config can name; what cannot work is left out."""
+    here = BY_NAME[registry]
+    registered = [name for name in here if here.registered(name) is not None]
+    for name in registered:
+        signature = inspect_signature(here.registered(name))
+        found = Found(registry, name, "registered in this process", None, signature)
+        yield _Class((name,), found)
+    for name, plugins in sorted(here.installed().items()):
+        preferred = [p for p in plugins if is_core(p)] or (plugins if len(plugins) == 1 else [])
+        for plugin in plugins:
+            qualified = f"{plugin.dist}:{name}"
+            plain = plugin in preferred and name not in registered
+            found_class = _installed(plugin)
+            if found_class is not None:
+                yield _Class((name, qualified) if plain else (qualified,), found_class)
+
+
+def _installed(plugin: Plugin) -> Found | None:
+    try:
+        return installed(plugin)
+    except PluginError:  # doctor, and the check of a config that names it, say why
+        return None
+
+
+def _file(kind: str) -> Schema:
+    properties: Schema = {
+        BASE: {
+            "description": "A file, or several, whose values this config inherits.",
+            "type": ["string", "array"],
+            "items": {"type": "string"},
+        },
+        REQUIRES: {
+            "description": "Distributions that this config needs (PEP 508): 'fluxvla-ur>=0.3'.",
+            "type": "array",
+            "items": {"type": "string"},
+        },
+    }
+    properties |= {name: {"$ref": _ref(kind, registry)} for name, registry in SLOTS.items()}
+    properties |= {name: {"$ref": _ref(kind, name)} for name in LOADERS}
+    return {
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": {"$ref": _ref("section")},
+    }
+
+
+def _section(runners: list[_Class]) -> Schema:
+    """Another top-level name: a section where its type is a runner's, else a variable."""
+    names = [name for one in runners for name in one.names]
+    return {
+        "if": {
+            "type": "object",
+            "properties": {"type": {"enum": names}},
+            "required": ["type"],
+        },
+        "then": {"$ref": _ref(_PART, "runners")},
+        "else": {"$ref": _ref("untyped")},
+    }
+
+
+def _untyped() -> Schema:
+    """A table whose class is not known here: what its keys hold is known by their names."""
+    tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
+    return {"properties": tables}
+
+
+def _loader(kind: str) -> Schema:
+    """``train_dataloader``; another runner may read keys of its own there."""
+    return {
+        "type": ["object", "null"],
+        "properties": {
+            "per_device_batch_size": {
+                "type": "integer",
+                "description": "samples in a batch of each process.",
+            },
+            "per_device_num_workers": {
+                "type": "integer",
+                "description": "processes that load data for each process that trains.",
+            },
+            "shuffle_episodes": {"type": ["boolean", "null"]},
+            "dataset": {"$ref": _ref(kind, "datasets")},
+        },
+    }
+
+
+def _slot(kind: str, registry: str, classes: list[_Class]) -> Schema:
+    """A value under a key that takes classes of ``registry``: a table, or a list of such.
+
+    A policy may be a word and a metric an object's name: what is neither is left to the class.
+    """
+    names = [one.names[0] for one in classes]
+    named: Schema = {
+        "description": f"a class of fluxvla.{registry}",
+        "anyOf": [{"enum": names}, {"type": "string", "pattern": _QUALIFIED}],
+    }
+    if not names:
+        named = {"type": "string", "pattern": _QUALIFIED}
+    slot: Schema = {
+        "description": ROWS[registry].about,
+        "items": {"$ref": _ref(kind, registry)},
+        "properties": {"type": named},
+    }
+    cases: list[Schema] = [
+        {
+            "if": {"properties": {"type": {"enum": list(one.names)}}, "required": ["type"]},
+            "then": {"$ref": _ref(kind, registry, one.names[0])},
+        }
+        for one in classes
+    ]
+    if kind == _PART:
+        cases.append({"if": {"not": {"required": ["type"]}}, "then": {"$ref": _ref("untyped")}})
+    if cases:
+        slot["allOf"] = cases
+    if registry in _ALWAYS_TABLES:
+        slot["type"] = ["object", "array", "null"]
+    if registry == "hooks":
+        slot["if"] = {"type": "string"}
+        slot["then"] = named
+    if kind == _WHOLE and registry not in _MAY_GROUP:
+        # An empty table is what a config writes to be filled in.
+        slot["if"] = {"type": "object", "minProperties": 1}
+        slot["then"] = {"required": ["type"]}
+    return slot
+
+
+def _table(kind: str, found: Found) -> Schema:
+    """The keys of a table of one class."""
+    signature = found.signature
+    about = {"title": found.title, "description": f"from {found.origin}"}
+    if signature is None:
+        return about
+    if signature.doc:
+        about["description"] = f"{signature.doc} ({found.origin})"
+    table = {**about, **_keys(kind, signature)}
+    required = [p.name for p in signature.parameters if p.required and p.name not in INJECTED]
+    if kind == _WHOLE and required:
+        table["required"] = ["type", *required]
+    return table
+
+
+def _keys(kind: str, signature: Signature) -> Schema:
+    meanings = signature.meanings
+    properties: Schema = {"type": True, DELETE: {"type": "boolean"}}
+    for parameter in signature.parameters:
+        if parameter.name not in INJECTED:
+            properties[parameter.name] = _parameter(kind, parameter, meanings.get(parameter.name))
+    if signature.open:
+        properties |= dict.fromkeys(INJECTED, False)
+    return {"properties": properties, "additionalProperties": signature.open}
+
+
+def _parameter(kind: str, parameter: Parameter, meaning: str | None) -> Schema:
+    registry = SLOTS.get(parameter.name)
+    if registry is not None:
+        schema: Schema = {"$ref": _ref(kind, registry)}
+    else:
+        schema = value_schema(parameter, lambda table: _keys(kind, table))
+    default: Any = default_value(parameter)
+    said = [meaning] if meaning else []
+    if default is not None:
+        schema["default"] = default[0]
+    elif parameter.default is not None:
+        said.append(f"Default: {parameter.default}")
+    if said:
+        schema["description"] = " ".join(said)
+    return schema

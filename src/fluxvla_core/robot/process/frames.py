@@ -1,0 +1,259 @@
+"""``FrameChannel``: an operator's frames on their way from the control process to the main process.
+
+There is one frame at a time, and only where the main process asked for one: what is asked for is
+written while nobody reads, and read while nobody writes. A question, and its answer, is a number in
+shared memory and then a signal of an ``eventfd``; that system call also orders the memory's
+contents, whatever the order is in which a processor sees the stores. Nothing is pickled: a frame is
+JSON values and arrays of numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import select
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.robot.control.safety import BadFrame
+from fluxvla_core.robot.robot import is_number
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+AnyArray = npt.NDArray[Any]
+_ASKED, _ANSWERED, _LENGTH = 0, 1, 2
+_NUMBERS = 64
+_ALIGNED = 64
+# Room for the JSON values: names, stamps, or an error's message.
+_TEXT = 64 * 1024
+_PICTURE, _MORE, _MEASURED = "picture ", "more ", "measured"
+
+
+class FrameMemory(NamedTuple):
+    """File descriptors: of the shared memory, and of the events 'asked' and 'answered'."""
+
+    memory: int
+    asked: int
+    answered: int
+
+    def close(self) -> None:
+        """Close them; what maps the memory keeps it."""
+        for descriptor in self:
+            os.close(descriptor)
+
+
+def frame_bytes(embodiment: EmbodimentSpec, cameras: Iterable[str]) -> int:
+    """Bytes that a frame of a robot takes at most: its state, and a picture of each camera."""
+    sizes = {camera.name: camera.height * camera.width * 3 for camera in embodiment.cameras}
+    pictures = sum(_aligned(sizes[name]) for name in cameras)
+    return _NUMBERS + _TEXT + 2 * _aligned(8 * embodiment.state_dim) + pictures
+
+
+def make_frame_memory(size: int) -> FrameMemory:
+    """Memory for frames of ``size`` bytes; it is gone with the processes that have it.
+
+    Raises:
+        OSError: there is not so much memory. Pages that are missing later would crash a process.
+    """
+    memory = os.memfd_create("fluxvla-frames")
+    try:
+        os.posix_fallocate(memory, 0, size)
+    except OSError:
+        os.close(memory)
+        raise
+    return FrameMemory(memory, os.eventfd(0, os.EFD_CLOEXEC), os.eventfd(0, os.EFD_CLOEXEC))
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one look at a robot gave.
+
+    Args:
+        fields: JSON values.
+        arrays: arrays of numbers, by name.
+    """
+
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, AnyArray] = field(default_factory=dict)
+
+
+class FrameChannel:
+    """One end; one thread of each process uses it.
+
+    Args:
+        descriptors: of ``make_frame_memory``; they belong to the channel from now on.
+    """
+
+    def __init__(self, descriptors: FrameMemory) -> None:
+        self._descriptors = descriptors
+        size = os.fstat(descriptors.memory).st_size
+        memory = memoryview(mmap.mmap(descriptors.memory, size))
+        # Of the machine's own word size: each is read and written in one piece.
+        self._numbers = memory[:_NUMBERS].cast("Q")
+        self._data = np.frombuffer(memory, np.uint8)[_NUMBERS:]
+        self._poll = select.poll()
+        self._poll.register(descriptors.answered, select.POLLIN)
+
+    def close(self) -> None:
+        """Close the descriptors; no other thread uses the channel any more."""
+        self._descriptors.close()
+
+    # The main process's end.
+
+    def ask(self) -> None:
+        """Ask for a frame; the one before was taken, or nobody waits for it any more."""
+        self._numbers[_ASKED] += 1
+        os.eventfd_write(self._descriptors.asked, 1)
+
+    def answered(self, seconds: float) -> bool:
+        """Wait for the answer; whether it came within so many seconds."""
+        if self._poll.poll(seconds * 1e3):
+            os.eventfd_read(self._descriptors.answered)
+        return self._numbers[_ANSWERED] == self._numbers[_ASKED]
+
+    def take(self) -> Look:
+        """The answer, in fresh arrays."""
+        length = self._numbers[_LENGTH]
+        fields, layout = json.loads(self._data[:length].tobytes())
+        arrays, at = {}, _aligned(length)
+        for name, kind, shape in layout:
+            dtype = np.dtype(kind)
+            size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+            arrays[name] = self._data[at : at + size].view(dtype).reshape(shape).copy()
+            at += _aligned(size)
+        return Look(fields, arrays)
+
+    # The control process's end.
+
+    def wait_for_question(self) -> None:
+        """Wait until a frame is asked for."""
+        os.eventfd_read(self._descriptors.asked)
+
+    def fits(self, look: Look) -> bool:
+        """Whether there is room for it."""
+        return len(self._data) >= sum(
+            [_aligned(len(_text(look))), *(_aligned(a.nbytes) for a in look.arrays.values())]
+        )
+
+    def answer(self, look: Look) -> None:
+        """Answer the question; ``look`` fits."""
+        text = _text(look)
+        self._numbers[_LENGTH] = len(text)
+        self._data[: len(text)] = np.frombuffer(text, np.uint8)
+        at = _aligned(len(text))
+        for array in look.arrays.values():
+            room = self._data[at : at + array.nbytes]
+            # numpy lets other threads have the interpreter while it copies a picture.
+            np.copyto(room.view(array.dtype).reshape(array.shape), array)
+            at += _aligned(array.nbytes)
+        self._numbers[_ANSWERED] = self._numbers[_ASKED]
+        os.eventfd_write(self._descriptors.answered, 1)
+
+
+def look_of(frame: Frame, cameras: Iterable[str], source: str) -> Look:
+    """State, stamps and the pictures of ``cameras`` of a frame; what it has besides is left out.
+
+    Args:
+        frame: of the operator; a picture that is None has not come yet.
+        cameras: the ones that are asked for.
+        source: what gave it, for messages.
+
+    Raises:
+        BadFrame: the state or a picture is no array of numbers.
+    """
+    stamps = {str(k): float(v) if is_number(v) else None for k, v in frame.stamps.items()}
+    pictures = {n: frame.images[n] for n in cameras if frame.images.get(n) is not None}
+    arrays = {STATE: _numbers(frame.state, f"the state of {source}")} | {
+        _PICTURE + name: _numbers(picture, f"camera {name} of {source}")
+        for name, picture in pictures.items()
+    }
+    return Look({"stamps": stamps}, arrays)
+
+
+def frame_of(look: Look) -> Frame:
+    """The frame of ``look_of``."""
+    pictures = {
+        name.removeprefix(_PICTURE): array
+        for name, array in look.arrays.items()
+        if name.startswith(_PICTURE)
+    }
+    return Frame(look.arrays[STATE], pictures, look.fields["stamps"])
+
+
+def look_of_window(
+    window: Mapping[str, Any], frame: Frame | None, cameras: Iterable[str], source: str
+) -> Look:
+    """What a runner's ``update_observation_window`` made of one look at the robot.
+
+    Args:
+        window: ``qpos`` and ``images``; None for what has not come yet. What else it has is arrays
+            of numbers or JSON values.
+        frame: that it was made of, where the operator has frames: state and stamps are sent.
+        cameras: the ones that are asked for.
+        source: what gave it, for messages.
+
+    Raises:
+        BadFrame: it has something that is neither an array of numbers nor a JSON value.
+    """
+    images = window.get("images")
+    if not isinstance(images, Mapping):
+        return Look({"window": None if images is None else repr(images)[:200]})
+    shown = Frame(window.get("qpos"), images, {} if frame is None else frame.stamps)  # type: ignore[arg-type]
+    more = {key: value for key, value in window.items() if key not in ("qpos", "images")}
+    arrays = {_MORE + k: _numbers(v, f"{k} of {source}") for k, v in more.items() if _is_array(v)}
+    values = {key: value for key, value in more.items() if _MORE + key not in arrays}
+    try:
+        json.dumps(values)
+    except (TypeError, ValueError) as error:
+        raise BadFrame(
+            f"{source} has something that no other process can be given: {error}",
+            next="--set <section>.control_process=false keeps it in one process",
+        ) from error
+    waits = [name for name in cameras if name in images and images[name] is None]
+    if window.get("qpos") is None:
+        shown = replace(shown, state=np.empty(0))
+        waits.append(STATE)
+    look = look_of(shown, cameras, source)
+    if frame is not None:
+        arrays[_MEASURED] = _numbers(frame.state, f"the state of {source}")
+    fields = {"window": values, "waits": waits, "frame": frame is not None}
+    return Look({**look.fields, **fields}, {**look.arrays, **arrays})
+
+
+def window_of(look: Look) -> tuple[dict[str, Any], Frame | None]:
+    """The window of ``look_of_window``, and the frame with the window's pictures."""
+    values = look.fields["window"]
+    if not isinstance(values, dict):
+        return {"images": values}, None
+    shown = frame_of(look)
+    more = {k.removeprefix(_MORE): a for k, a in look.arrays.items() if k.startswith(_MORE)}
+    waits = look.fields["waits"]
+    images = {**shown.images, **{name: None for name in waits if name != STATE}}
+    window = {"qpos": None if STATE in waits else shown.state, "images": images, **values, **more}
+    frame = replace(shown, state=look.arrays[_MEASURED]) if look.fields["frame"] else None
+    return window, frame
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, (np.ndarray, np.generic))
+
+
+def _numbers(value: Any, source: str) -> AnyArray:
+    found = np.asarray(value) if isinstance(value, (np.ndarray, np.generic, list, tuple)) else None
+    if found is None or found.dtype.kind not in "biuf":
+        raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
+    return found
+
+
+def _text(look: Look) -> bytes:
+    layout = [(name, array.dtype.str, array.shape) for name, array in look.arrays.items()]
+    return json.dumps([look.fields, layout], separators=(",", ":")).encode()
+
+
+def _aligned(size: int) -> int:
+    return -(-size // _ALIGNED) * _ALIGNED

@@ -1,0 +1,104 @@
+"""What the conformance kits share: how a component is made, and the checks of its class."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from fluxvla_core.config.runtime_signature import inspect_signature
+from fluxvla_core.contracts.check import check_class
+from fluxvla_core.errors import FluxError
+from fluxvla_core.plugins.registry import BY_NAME
+
+
+class Conformance:
+    """Inherit one of the kits, set ``entry_point`` and ``arguments``, and run pytest."""
+
+    registry: ClassVar[str]
+    entry_point: ClassVar[str]
+    """The ``type`` in a config."""
+    arguments: ClassVar[Mapping[str, Any]] = {}
+    """Constructor arguments."""
+
+    def component(self) -> type:
+        """The class that is tested."""
+        cls: type = BY_NAME[self.registry].get(self.entry_point)
+        return cls
+
+    def make(self) -> Any:
+        """A new one, as it is; override it for one that takes more than ``arguments``."""
+        return self.component()(**self.arguments)
+
+    def test_is_complete(self) -> None:
+        cls, problem = self.component(), ""
+        try:
+            check_class(self.registry, cls, f"{cls.__module__}:{cls.__qualname__}")
+        except FluxError as error:
+            problem = str(error)
+        assert not problem, problem
+        core = cls.__module__.startswith("fluxvla_core.")  # its version is the contracts' own
+        api = getattr(cls, "api", "1.0" if core else None)
+        assert api, (
+            f"{cls.__name__}.api is {api!r}, expected '1.0': the version of the contract "
+            "that it is written for, by which a later core refuses it in words instead of "
+            "failing in the run"
+        )
+
+    def test_constructor_names_every_parameter(self) -> None:
+        cls = self.component()
+        assert not inspect_signature(cls).open, (
+            f"{cls.__name__}() takes *args or **kwargs that go nowhere, expected every parameter "
+            "by name: config check finds misspelt keys by them"
+        )
+
+
+def capability(has: bool, what: str) -> None:
+    """Skip a check of an optional ability that the component does not have.
+
+    Args:
+        what: how to provide it.
+    """
+    if not has:
+        pytest.skip(what)
+
+
+def is_json(value: Any) -> bool:
+    """Whether ``value`` is made of JSON values alone, and comes back as it is."""
+    try:
+        return bool(json.loads(json.dumps(value, allow_nan=False)) == value)
+    except (TypeError, ValueError):
+        return False
+
+
+def as_array(value: Any) -> Any:
+    """``value`` as an array where it is a tensor or an array; else as it is."""
+    if type(value).__module__.startswith("torch"):
+        return value.detach().cpu().float().numpy()
+    return value
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Whether two values, arrays, tensors, or nested tables and lists of these are equal."""
+    if isinstance(a, Mapping):
+        same_keys = isinstance(b, Mapping) and set(a) == set(b)
+        return same_keys and all(equal(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        same_length = isinstance(b, (list, tuple)) and len(a) == len(b)
+        return same_length and all(equal(x, y) for x, y in zip(a, b, strict=True))
+    a, b = as_array(a), as_array(b)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.shape(a) == np.shape(b) and np.array_equal(a, b, equal_nan=_floats(a, b))
+    return bool(a == b)
+
+
+def _floats(*arrays: Any) -> bool:
+    return all(np.asarray(a).dtype.kind == "f" for a in arrays)
+
+
+def unequal_keys(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """Keys that one of two tables lacks, or whose values differ."""
+    return sorted(k for k in {*a, *b} if k not in a or k not in b or not equal(a[k], b[k]))

@@ -34,6 +34,9 @@ from fluxvla_core.data import LeRobotWriter, ParquetDataset, Pipeline
 from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import FluxError
+from fluxvla_core.evaluation.compare import Evaluated, compare, describe
+from fluxvla_core.evaluation.compare import read as read_evaluated
+from fluxvla_core.evaluation.episodes import EvalLog
 from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.optimizer_state import SavedOptimizer
@@ -104,7 +107,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     try:
         value = json.loads(content)
     except ValueError:
-        if content.startswith(b'{"event"'):  # JSON lines
+        if content.startswith((b'{"event"', b'{"format"')):  # JSON lines
             lines = content.splitlines()
             at = rng.randrange(len(lines))
             lines[at] = forged(json.loads(lines[at]), rng)
@@ -235,6 +238,21 @@ def read_recording(root: Path) -> None:
     assert found.success in (None, True, False)
 
 
+def evaluation(root: Path) -> Path:
+    log = EvalLog(root / "eval" / "episodes.jsonl", {"policy": "p", "settings": {"a": {"b": 1}}})
+    for seed in range(3):
+        record = {"group": "policy", "task": "lift", "seed": seed, "status": "done"}
+        log.add({**record, "success": seed > 0, "steps": 3})
+    return root
+
+
+def read_evaluation(root: Path) -> None:
+    record = {"group": "policy", "task": "lift", "status": "done", "success": True}
+    records = [{**record, "seed": seed} for seed in range(3)]
+    about = {"policy": "q", "settings": {"a": {"b": 1}}}
+    describe(compare(read_evaluated(root), Evaluated(root, "policy", about, records)))
+
+
 def work_dir(root: Path) -> Path:
     (root / "eval").mkdir(parents=True)
     (root / "metrics.jsonl").write_text('{"event": 0, "step": 1, "loss": 2.0}\n' * 3)
@@ -248,6 +266,7 @@ FORMATS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "checkpoint": (checkpoint, read_checkpoint),
     "config": (config, read_configs),
     "recording": (recording, read_recording),
+    "evaluation": (evaluation, read_evaluation),
     "report": (work_dir, read_facts),
 }
 

@@ -60,6 +60,7 @@ def checkpoint(tmp_path, monkeypatch):
         {"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},
     ]
     dataset = {"type": "ParquetDataset", "img_keys": ["eye"], "transforms": transforms}
+    dataset["data_root_path"] = str(tmp_path / "demonstrations")  # which are not there
     config = {"model": {"type": "Strides"}, "train_dataloader": {"dataset": dataset}}
     files = {
         "config.resolved.json": {"format": "fluxvla-config-1", "config": config, "origins": {}},

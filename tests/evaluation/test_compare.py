@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 
@@ -121,6 +122,38 @@ def test_places_without_an_evaluation_are_refused(tmp_path):
     with pytest.raises(UsageError, match="there is no evaluation") as caught:
         read(tmp_path)
     assert "--section eval" in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_a_log_without_an_end_is_refused_at_once(tmp_path, make):
+    (tmp_path / "eval").mkdir()
+    make(tmp_path / "eval" / "episodes.jsonl")
+    with pytest.raises(UsageError, match=r"episodes\.jsonl: is not a regular file"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("line", "change"),
+    [(1, {"task": None}), (1, {"seed": [1]}), (1, {"success": "yes"}), (1, {"group": 3})],
+)
+def test_a_line_that_is_no_episode_counts_as_none(tmp_path, line, change):
+    a, b = sides(tmp_path, A, B)
+    path = b / "eval" / "episodes.jsonl"
+    lines = path.read_text().splitlines()
+    lines[line] = json.dumps({**json.loads(lines[line]), **change})
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(UsageError, match="only one has lift/0"):
+        compare(read(a), read(b))
+
+
+@pytest.mark.parametrize("stated", [None, 3, [], "x"])
+def test_a_log_that_does_not_say_of_what_it_is_is_no_evaluation(tmp_path, stated):
+    path = evaluated(tmp_path, A) / "eval" / "episodes.jsonl"
+    header, *rest = path.read_text().splitlines()
+    header = json.dumps({**json.loads(header), "evaluation": stated})
+    path.write_text("\n".join([header, *rest]) + "\n")
+    with pytest.raises(UsageError, match="there is no evaluation"):
+        read(tmp_path)
 
 
 def test_a_checkpoint_stands_for_its_work_dir_if_it_was_the_one(tmp_path):

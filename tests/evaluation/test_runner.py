@@ -11,6 +11,7 @@ import pytest
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.config.load import load_config
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch, UsageError
+from fluxvla_core.evaluation.collect import Collection, collect
 from fluxvla_core.evaluation.compare import read
 from fluxvla_core.evaluation.runner import EvalRunner
 from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files
@@ -314,6 +315,17 @@ def test_each_evaluation_keeps_its_own_config(tmp_path, walking):
     for name, live in (("eval", False), ("eval_live", True)):
         kept = load_config(tmp_path / name / "config.resolved.json")
         assert kept.tree["eval"]["live"] is live
+
+
+@pytest.mark.parametrize(("first", "unseen"), [(50, True), (41, False)])
+def test_results_say_whether_training_saw_their_seeds(tmp_path, checkpoint, first, unseen):
+    options = {"policy": "checkpoint", "ckpt_path": str(checkpoint), "tasks": ["right"]}
+    options |= {"episodes": 2, "workers": 1, "seed": first, "max_steps": 4}
+    evaluate(tmp_path / "unknown", **options)
+    assert results(tmp_path / "unknown")["provenance"]["unseen_seeds"] is None
+    collect(tmp_path / "demonstrations", Collection(WALK, 2, seed=40), workers=1)
+    evaluate(tmp_path, **options)
+    assert results(tmp_path)["provenance"]["unseen_seeds"] is unseen
 
 
 def test_how_pictures_were_drawn_is_in_the_results(tmp_path, walking):

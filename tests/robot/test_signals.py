@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 
 import pytest
 
@@ -64,6 +65,26 @@ def test_a_policy_that_ends_the_program_is_held_and_told(tmp_path):
     notes = arm.notes()
     assert notes[-3:] == ["stop", "stop", "close"]
     assert_stopped_within_limits(notes)
+
+
+@pytest.mark.parametrize(
+    ("fault", "code"),
+    [
+        ("", 0),
+        ("raise SystemExit(0)", 1),
+        ("raise ValueError('lost')", 1),
+        ("self.way = float('nan')", 1),
+    ],
+)
+def test_no_line_is_said_twice(tmp_path, fault, code):
+    """By the run, which reports what it does, and by the command line, which reports errors."""
+    returned, output = Swinging(tmp_path, steps=250, fault=fault).end()
+    assert returned == code, output
+    assert (code == 0) == ("max_steps" in output)
+    said = [re.sub(r"^\[ *[\d.]+s\] ", "", line) for line in output.splitlines()]
+    said = [line for line in said if not re.match(r"(task 1: |… )?(commands \d|working)", line)]
+    assert len(said) > 1
+    assert [line for line, count in Counter(said).items() if count > 1] == []
 
 
 def test_a_second_ctrl_c_does_not_cut_the_stop_short(tmp_path):

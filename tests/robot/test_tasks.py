@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from fluxvla_core.errors import UsageError
@@ -87,7 +89,8 @@ def test_a_line_that_is_no_task_is_named_and_none_of_the_file_counts(tmp_path):
     [
         (b"# nothing\n\n", "the file has no task in it; nothing was moved"),
         (b"\xff\xfe", "the tasks cannot be read: 'utf-8' codec"),
-        (None, "the tasks cannot be read: .*No such file"),
+        (None, r"tasks\.txt: cannot be read: No such file"),
+        (b"1\n" * 600_000, r"tasks\.txt: holds more than 1 MiB"),
     ],
 )
 def test_a_file_that_is_none(tmp_path, content, message):
@@ -97,6 +100,13 @@ def test_a_file_that_is_none(tmp_path, content, message):
 
     with pytest.raises(UsageError, match=message):
         read_tasks(file, KNOWN)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_a_file_of_tasks_without_an_end_is_refused_at_once(tmp_path, make):
+    make(tmp_path / "tasks.txt")
+    with pytest.raises(UsageError, match=r"tasks\.txt: is not a regular file"):
+        read_tasks(tmp_path / "tasks.txt", KNOWN)
 
 
 def test_the_word_that_allows_motion_again_is_no_task():

@@ -60,6 +60,27 @@ def test_what_cannot_be_installed_is_said(
     needs.ensure(print, (missing,))
 
 
+def test_what_comparisons_with_lerobot_and_compiling_need_is_missed(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests of both were skipped without a word where it is not there."""
+    assert [need.name for need in needs.NEEDS] == ["compiler", "libpython"]
+    monkeypatch.setenv("PATH", str(programs))
+    assert not needs.has_compiler()
+    monkeypatch.setattr(needs, "LIBPYTHON", "libpython-that-is-not-there")
+    assert not needs.has_libpython()
+    fake_apt(programs, "exit 100")
+    with pytest.raises(needs.Lacking) as told:
+        needs.ensure(print)
+    for need in needs.NEEDS:
+        assert f"{need.name}: {need.why}" in str(told.value)
+
+
+def test_the_session_of_the_tests_asks_for_it_before_it_runs_any() -> None:
+    body = (ROOT / "noxfile.py").read_text().partition("\ndef tests(")[2].partition("\n\n\n")[0]
+    assert body.index("ensure_needs(session)") < body.index("STAGES")
+
+
 def test_skips_of_several_runs_are_one_list(tmp_path: Path) -> None:
     place = tmp_path / "skipped.jsonl"
     assert skipped.summary(place) == ["nothing was skipped"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html.parser
 import json
 import math
+import os
 import re
 import shutil
 from pathlib import Path
@@ -369,6 +370,97 @@ def test_a_narrow_page_stacks_its_tables_and_scrolls_no_chart(
         head, cells = table.count("<th class="), re.findall(r'<td class="number"[^>]*>', table)
         assert cells
         assert head == 0 or all("data-label=" in cell for cell in cells)
+
+
+NARROW = 420.0
+INSIDE = NARROW - 2 * (12 + 14) - 2
+"""Pixels of a section of a narrow page: without the paddings of both, and the section's borders."""
+LEGIBLE = 9.0
+
+
+def declarations(css: str) -> dict[str, dict[str, str]]:
+    """What a page of less than 640 pixels is drawn by: selector -> property -> value."""
+    wide, _, narrow = css.partition("@media (max-width: 640px) {")
+    narrow = narrow.partition("\n}\n")[0]
+    found: dict[str, dict[str, str]] = {}
+    for selectors, body in re.findall(r"([^{}]+)\{([^{}]*)\}", wide + narrow):
+        for selector in selectors.split(","):
+            rule = found.setdefault(" ".join(selector.split()), {})
+            rule |= {
+                name.strip(): value.strip()
+                for name, _, value in (line.partition(":") for line in body.split(";"))
+            }
+    return found
+
+
+def test_nothing_is_wider_than_a_page_of_420_pixels(complete: Path, tmp_path: Path) -> None:
+    html = build_report(complete, tmp_path / "page.html").read_text(encoding="utf-8")
+    rules = declarations(html.partition("<style>")[2].partition("</style>")[0])
+    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in html
+    assert rules["main"]["padding"] == "20px 12px 48px"
+    assert rules["section"]["padding"] == "16px 14px"
+    for selector, rule in rules.items():
+        for name in ("width", "min-width", "flex-basis", "grid-template-columns"):
+            # min(100%, …) is never wider than what it stands in.
+            value = re.sub(r"min\(100%, \d+px\)", "", rule.get(name, ""))
+            widths = [float(number) for number in re.findall(r"([\d.]+)px", value)]
+            assert sum(widths) <= INSIDE, f"{selector}: {name}: {rule[name]}"
+    assert re.findall(r"<(?:svg|table|video|div|figure)[^>]*\bwidth\s*[=:]", html) == []
+
+
+def test_charts_are_legible_on_a_page_of_420_pixels(complete: Path, tmp_path: Path) -> None:
+    html = build_report(complete, tmp_path / "page.html").read_text(encoding="utf-8")
+    rules = declarations(html.partition("<style>")[2].partition("</style>")[0])
+    assert rules["svg"]["width"] == "100%"
+    seen = 0
+    for place in ("grid", "joints"):
+        size = rules.get(f".{place} svg text", rules["svg text"])["font-size"]
+        _, _, drawn = html.partition(f'<div class="{place}">')
+        for width in re.findall(r'viewBox="0 0 (\d+) ', drawn.partition("</div>")[0]):
+            seen += 1
+            assert float(size.removesuffix("px")) * INSIDE / float(width) >= LEGIBLE, place
+    assert seen > 5
+
+
+def test_the_policy_stands_beside_the_wrong_instruction_and_the_untrained_one(
+    complete: Path, tmp_path: Path
+) -> None:
+    html = build_report(complete, tmp_path / "page.html").read_text(encoding="utf-8")
+    rules = declarations(html.partition("<style>")[2].partition("</style>")[0])
+    _, _, after = html.partition("The same task, side by side")
+    row, _, more = after.partition('<div class="videos wide">')[2].partition("</div>")
+    said = re.findall(r"<figcaption>(.*?)</figcaption>", row, re.DOTALL)
+    assert [words.split("·")[0].split(">")[-1].strip() for words in said] == [
+        "trained policy", "wrong instruction", "untrained policy",
+    ]  # fmt: skip
+    assert "chip good" in said[0], "a success, where there is one"
+    assert row.count("<video") == 3
+    # Three fit a page of 1120 pixels, and each of the others has 440.
+    assert "min(100%, 300px)" in rules[".videos.wide"]["grid-template-columns"]
+    assert "min(100%, 440px)" in rules[".videos"]["grid-template-columns"]
+    assert '<div class="videos ">' in more
+
+
+def test_an_episode_that_nobody_judges_is_no_failure(complete: Path, tmp_path: Path) -> None:
+    root = tmp_path / "recordings"
+    for number, success in enumerate((None, True)):
+        folder = shutil.copytree(complete / "inference" / "001-lift", root / f"00{number}-wave")
+        summary = json.loads((folder / "episode.json").read_text())
+        (folder / "episode.json").write_text(json.dumps({**summary, "success": success}))
+    html = build_report(root, tmp_path / "page.html").read_text(encoding="utf-8")
+    page = Page(html)
+    assert page.shows("1 of 1 judged ones succeeded")
+    assert 'class="chip bad"' not in html
+    assert not page.shows("failure")
+    (wave,) = re.findall(r'<section id="000-wave">.*?</section>', html, re.DOTALL)
+    assert "chip" not in wave
+
+
+def test_a_pipe_among_the_videos_keeps_nobody_waiting(complete: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(complete / "inference" / "001-lift", tmp_path / "001-lift")
+    (folder / "top.mp4").unlink()
+    os.mkfifo(folder / "top.mp4")
+    assert "<video" not in build_report(folder, tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_a_title_stands_with_its_plot(complete: Path, tmp_path: Path) -> None:

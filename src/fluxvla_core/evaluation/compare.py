@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, flat, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, flat, read_log, whole_lines
 from fluxvla_core.evaluation.success_rates import all_of, mcnemar_test, rate, verdict
 
 NAMED = 5
@@ -46,12 +46,13 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
     found: list[dict[str, Any]] = []
     about: dict[str, Any] | None = None
     for path in _logs(folder):
-        records = whole_lines(path.read_bytes())
+        records = whole_lines(read_log(path))
         if not records or records[0].get("format") not in (FORMAT, FORMER):
             continue
-        if about is not None and records[0]["evaluation"] != about:
+        stated = records[0].get("evaluation")
+        if not isinstance(stated, dict) or (about is not None and stated != about):
             continue  # parts of an evaluation before
-        about = records[0]["evaluation"]
+        about = stated
         found += [record for record in records if "format" not in record]
     if about is None:
         raise UsageError(

@@ -34,11 +34,14 @@ from fluxvla_core.atomic import json_text
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.evaluation.pool import Outcome, WorkerPool
+from fluxvla_core.untrusted import read_bytes
 
 T = TypeVar("T")
 FORMAT = "fluxvla-episodes-2"
 FORMER = "fluxvla-episodes-1"
 """Without the code."""
+LARGEST_LOG = 1 << 30
+"""Bytes of an evaluation log, of some 500 an episode."""
 DONE, ERROR = "done", "error"
 """Status of a record."""
 POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
@@ -162,8 +165,9 @@ class EvalLog:
         changed: what differs in that code, in words.
 
     Raises:
-        UsageError: there are episodes of the same evaluation that other code ran.
-        RunFailed: the file cannot be read or written.
+        UsageError: there are episodes of the same evaluation that other code ran, or the file
+            cannot be read.
+        RunFailed: it cannot be written.
     """
 
     def __init__(
@@ -234,18 +238,17 @@ class EvalLog:
         """Read what other processes have written by now.
 
         Raises:
-            OSError: a file cannot be read.
-            UsageError: other code ran their episodes of this evaluation.
+            UsageError: a file cannot be read, or other code ran their episodes of this evaluation.
         """
         for path in sorted(self.path.parent.glob(self._other_logs)) if self._other_logs else []:
             if path == self.path:
                 continue
-            records = whole_lines(path.read_bytes())
+            records = whole_lines(read_log(path))
             if records and self._is_mine(records[0]):
                 self._take(records, path)
 
     def _read(self) -> None:
-        data = self.path.read_bytes()
+        data = read_log(self.path)
         # A crash can leave the last line cut short; it was never reported as finished.
         whole = data[: data.rfind(b"\n") + 1]
         records = whole_lines(whole)
@@ -334,9 +337,18 @@ def open_eval_log(
     return log
 
 
+def read_log(path: Path) -> bytes:
+    """The content of an evaluation log.
+
+    Raises:
+        UsageError: it cannot be read, or is no regular file.
+    """
+    return read_bytes(path, UsageError, at_most=LARGEST_LOG)
+
+
 def whole_lines(data: bytes) -> list[dict[str, Any]]:
-    """The objects in JSON lines; the header, or an empty one, comes first, and a last line that was
-    cut short is left out."""
+    """Headers and episodes of a log; a header, or an empty one, comes first. What is neither is
+    left out, as is a last line that was cut short: those episodes were not finished."""
     whole = data[: data.rfind(b"\n") + 1].decode("utf-8", "replace")
     lines = [_parsed(line) for line in whole.splitlines()]
     return [line for line in [(lines[0] or {}) if lines else None, *lines[1:]] if line is not None]
@@ -347,14 +359,20 @@ def _parsed(line: str) -> dict[str, Any] | None:
         value = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return value if isinstance(value, dict) else None
+    return value if isinstance(value, dict) and ("format" in value or _is_episode(value)) else None
+
+
+def _is_episode(record: Mapping[str, Any]) -> bool:
+    names = all(isinstance(record.get(name), str) for name in ("group", "task", "status"))
+    outcome = record.get("status") != DONE or isinstance(record.get("success"), bool)
+    return names and outcome and type(record.get("seed")) is int
 
 
 def code_differences(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> list[str]:
     """Differences of ``now``, in words; both as ``provenance.Code.to_dict`` gives them."""
-    if before is None:
+    if not isinstance(before, Mapping) or not isinstance(before.get("versions"), Mapping):
         return ["the code is not known: a former version of FluxVLA kept these episodes"]
-    old, new = before.get("versions", {}), now["versions"]
+    old, new = before["versions"], now["versions"]
     lines = [
         f"{name} {old.get(name, 'not there')} -> {new.get(name, 'not there')}"
         for name in sorted({*old, *new})

@@ -20,7 +20,10 @@ from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import UsageError
+from fluxvla_core.untrusted import read_bytes
 
+_LARGEST_FILE = 1 << 20
+"""Bytes of a file of tasks."""
 REARM = "rearm"
 """What a person says after a stop, so that the robot may move again."""
 
@@ -102,8 +105,9 @@ def read_tasks(path: str | Path, known: Mapping[str, str], free: bool = False) -
             counts then.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        content = read_bytes(Path(path), UsageError, at_most=_LARGEST_FILE)
+        lines = content.decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
         raise UsageError(f"the tasks cannot be read: {error}", where=str(path)) from error
     found = []
     for number, line in enumerate(lines, 1):

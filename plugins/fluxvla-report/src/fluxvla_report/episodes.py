@@ -56,6 +56,7 @@ def _episode(reader: Reader, folder: Path) -> Episode:
         videos=[
             Video(path, f"{instruction} · camera {path.stem}", success)
             for path in sorted(folder.glob("*.mp4"))
+            if path.is_file()
         ],
         problem=str(summary.get("problem") or ""),
         phases=phases(events, first),

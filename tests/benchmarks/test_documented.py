@@ -1,0 +1,97 @@
+"""The figures in docs are those of ``benchmarks/results``, as far as they are in tables."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.step_loop import MOST_MS, ONE_LAYER, SMALL
+from fluxvla_core.robot.control.joiners import METHODS
+
+ROOT = Path(__file__).parents[2]
+
+
+def results(name: str) -> Any:
+    return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())
+
+
+def page(name: str) -> str:
+    return " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
+
+
+def rows(name: str, head: str) -> list[list[str]]:
+    """The cells of the table whose first line begins with ``head``."""
+    text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    table = text[text.index(head) :].partition("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+
+
+SIDES = {
+    "the engine, stock pictures": "engine, stock pictures",
+    "`gymnasium.vector` (asynchronous) around the same scene, stock pictures": (
+        "gymnasium.vector, stock pictures"
+    ),
+    "`lerobot-eval`'s rollout, stock pictures": "lerobot",
+    "the engine, cheap pictures (the default)": "engine",
+    "the same scene in a bare loop, cheap pictures": "bare",
+}
+
+
+def test_evaluations_are_compared_with_what_drew_as_many_pictures() -> None:
+    found = results("evaluation")
+    table = rows("evaluation", "| | cameras drawn |")
+    assert [SIDES[row[0]] for row in table] == list(SIDES.values())
+    for name, cameras, milliseconds in table:
+        assert int(cameras) == found["cameras_drawn"][SIDES[name]], name
+        assert int(milliseconds) == round(found["cpu_ms_per_step"][SIDES[name]]), name
+    text = page("evaluation")
+    equal, lerobot = (found[f"times_{name}_by_cpu"] for name in ("gymnasium_vector", "lerobot"))
+    assert f"as fast as Gymnasium's vector environment ({equal:.2f} times)" in text
+    assert "LeRobot's environment always renders three cameras" in text
+    assert f"nearly all of the factor of {lerobot:.1f}" in text
+
+
+def joined(parts: list[dict[str, Any]], key: str, digits: int) -> str:
+    return " / ".join(f"{row[key]:.{digits}f}" for row in parts)
+
+
+def of_method(part: str, method: str) -> list[dict[str, Any]]:
+    found = [
+        row for row in results("chunk_joining")[part]["rows"] if row["chunk_joining"] == method
+    ]
+    assert [row["latency_s"] for row in found] == [0.0, 0.2, 0.4]
+    return found
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_how_smooth_each_joiner_is(method: str) -> None:
+    ((_, *said),) = (r for r in rows("control", "| | done after") if r[0] == f"`{method}`")
+    trained = of_method("trained", method)
+    assert said == [
+        joined(trained, "seconds", 1),
+        joined(trained, "largest_step_rad", 2),
+        joined(trained, "acceleration_rms", 1),
+    ]
+    table = rows("control", "| latency 0 / 0.2 / 0.4 s |")
+    ((_, *said),) = (r for r in table if r[0] == f"`{method}`")
+    free, limited = (of_method(p, method) for p in ("wavering", "wavering_with_jerk_limit"))
+    assert said == [
+        text
+        for part in (free, limited)
+        for text in (joined(part, "acceleration_rms", 1), joined(part, "jerk_rms", 0))
+    ]
+
+
+def test_for_which_steps_the_loop_costs_nothing_to_speak_of() -> None:
+    cases = results("step_loop")["cases"]
+    assert all(row["goal_met"] for name, row in cases.items() if name not in (SMALL, ONE_LAYER))
+    assert {"own_ms", "own_cpu_ms", "ratio"} <= set(cases[SMALL])
+    text = page("training")
+    assert "`step_loop` has to stay within 3 %, which holds for steps of 40 ms and more" in text
+    assert f"(the goal there is {MOST_MS})" in text
+    (low, high) = map(float, re.findall(r"and ([\d.]+) to ([\d.]+) on a slower machine", text)[0])
+    assert low <= cases[ONE_LAYER]["own_cpu_ms"] <= high

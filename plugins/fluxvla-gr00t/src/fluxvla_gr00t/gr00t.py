@@ -104,12 +104,7 @@ class GR00T(VLA, nn.Module):
         """
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
-        if prev_actions is None:
-            return self.vla_head.sample(context, states, ids, noise)
-        assert prefix_weights is not None
-        assert prefix_len is not None
-        assert max_guidance_weight is not None
-        guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
         return self.vla_head.sample(context, states, ids, noise, guide)
 
     @property

@@ -99,12 +99,7 @@ class CompactVLA(VLA, nn.Module):
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
         context = self._context(images, lang_tokens, lang_masks, states)
-        if prev_actions is None:
-            return self.vla_head.sample(context, noise)
-        assert prefix_weights is not None
-        assert prefix_len is not None
-        assert max_guidance_weight is not None
-        guide = Guide(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
         return self.vla_head.sample(context, noise, guide)
 
     @property

@@ -36,6 +36,29 @@ class Guide:
     frozen: Tensor
     most: Tensor
 
+    @classmethod
+    def of(
+        cls,
+        prev_actions: Tensor | None,
+        prefix_weights: Tensor | None,
+        prefix_len: Tensor | None,
+        max_guidance_weight: Tensor | None,
+        width: int | None = None,
+    ) -> Guide | None:
+        """The guide that a model's ``predict_action`` is given; None if there is no chunk to go on
+        from.
+
+        Args:
+            width: so many dimensions of ``prev_actions`` count, all by default: a loss that leaves
+                padding out says nothing of it.
+        """
+        if prev_actions is None:
+            return None
+        assert prefix_weights is not None
+        assert prefix_len is not None
+        assert max_guidance_weight is not None
+        return cls(prev_actions[..., :width], prefix_weights, prefix_len, max_guidance_weight)
+
     def pull(
         self, estimate: Callable[[Tensor], Tensor], x: Tensor, time: float
     ) -> tuple[Tensor, Tensor]:

@@ -266,14 +266,8 @@ class PiFlowMatching(VLA, nn.Module):
         self._check(noise, "noise")
         prefix = self.embed_prefix(images, img_masks, lang_tokens, lang_masks)
         known = self._keys_and_values(prefix)
-        guide = None
-        if prev_actions is not None:
-            assert prefix_weights is not None
-            assert prefix_len is not None
-            assert max_guidance_weight is not None
-            own = None if self.prefix_conditioning else self.ori_action_dim
-            actions = prev_actions[..., :own]
-            guide = Guide(actions, prefix_weights, prefix_len, max_guidance_weight)
+        own = None if self.prefix_conditioning else self.ori_action_dim
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         held = guide if self.prefix_conditioning else None
 
         def velocity(x: Tensor, tau: Tensor) -> Tensor:

@@ -220,13 +220,8 @@ class SmolVLA(VLA, nn.Module):
         """
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
         memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
-        guide = None
-        if prev_actions is not None:
-            assert prefix_weights is not None
-            assert prefix_len is not None
-            assert max_guidance_weight is not None
-            own = prev_actions[..., : self.ori_action_dim]
-            guide = Guide(own, prefix_weights, prefix_len, max_guidance_weight)
+        own = self.ori_action_dim
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
             return self._velocity(x, t, memory).to(x.dtype)

@@ -88,10 +88,10 @@ def test_how_smooth_each_joiner_is(method: str) -> None:
 
 def test_for_which_steps_the_loop_costs_nothing_to_speak_of() -> None:
     cases = results("step_loop")["cases"]
-    assert all(row["goal_met"] for name, row in cases.items() if name not in (SMALL, ONE_LAYER))
+    assert all(row["goal_met"] for name, row in cases.items() if name != SMALL)
     assert {"own_ms", "own_cpu_ms", "ratio"} <= set(cases[SMALL])
     text = page("training")
     assert "`step_loop` has to stay within 3 %, which holds for steps of 40 ms and more" in text
     assert f"(the goal there is {MOST_MS})" in text
-    (low, high) = map(float, re.findall(r"and ([\d.]+) to ([\d.]+) on a slower machine", text)[0])
+    (low, high) = map(float, re.findall(r"on the machine: ([\d.]+) to ([\d.]+), where", text)[0])
     assert low <= cases[ONE_LAYER]["own_cpu_ms"] <= high

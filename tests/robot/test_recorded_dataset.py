@@ -192,7 +192,7 @@ from fluxvla_core import VLAS
 import fluxvla_core.testing.training  # registers OneProcessRunner
 
 @VLAS.register_module()
-class SmallVLA(torch.nn.Module):
+class RecordedVLA(torch.nn.Module):
     action_shape = (5, 3)
 
     def __init__(self):
@@ -208,7 +208,7 @@ class SmallVLA(torch.nn.Module):
         return []
 """
 CONFIG = """
-model = dict(type="SmallVLA")
+model = dict(type="RecordedVLA")
 train_dataloader = dict(per_device_batch_size=8, per_device_num_workers=0, dataset=dict(
     type="ParquetDataset", data_root_path={data!r}, img_keys=["front"], action_window_size=5,
     transforms=[dict(type="SimpleNormalizeImages"),

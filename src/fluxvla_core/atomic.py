@@ -37,6 +37,18 @@ def prepare_folder(path: Path, what: str, next: str) -> None:
         ) from error
 
 
+def refuse_content(target: Path) -> None:
+    """See that a folder that is to be made is not there yet, or is empty.
+
+    Raises:
+        UsageError: there is something at ``target``.
+    """
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise UsageError(
+            f"there is something at {target} already", next="name a folder that does not exist yet"
+        )
+
+
 _LINE = json.JSONEncoder(allow_nan=False)
 """Kept: creating one takes a fifth of the time that a short line does."""
 

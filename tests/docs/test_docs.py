@@ -56,7 +56,6 @@ NO_INDEX = (
 )
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
-PUBLISHED = "fetches published weights of several GB; the plugin's tests run it on tiny ones"
 FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
@@ -131,6 +130,16 @@ NOT_RUN: dict[tuple[str, str], str] = {
         ],
         WEIGHTS: [
             (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla import-checkpoint hf:OWNER/my_gr00t policy --tokenizer tokenizer "
+                "--embodiment dataset --rate 20",
+            ),
+            (
+                "plugins/fluxvla-gr00t/README.md",
+                "fluxvla run --config configs/gr00t_n15_aloha.py --section runner --nproc 8 "
+                "--set model.pretrained_name_or_path=hf:nvidia/GR00T-N1.5-3B",
+            ),
+            (
                 "plugins/fluxvla-openvla/README.md",
                 "fluxvla import-checkpoint models/openvla-7b-oft-finetuned-libero-spatial policy "
                 "--embodiment libero.json",
@@ -147,18 +156,6 @@ NOT_RUN: dict[tuple[str, str], str] = {
             (
                 "plugins/fluxvla-pi/README.md",
                 "fluxvla export work_dirs/pi05 exported --format lerobot",
-            ),
-        ],
-        PUBLISHED: [
-            (
-                "plugins/fluxvla-gr00t/README.md",
-                "fluxvla import-checkpoint hf:OWNER/my_gr00t policy --tokenizer tokenizer "
-                "--embodiment dataset --rate 20",
-            ),
-            (
-                "plugins/fluxvla-gr00t/README.md",
-                "fluxvla run --config configs/gr00t_n15_aloha.py --section runner --nproc 8 "
-                "--set model.pretrained_name_or_path=hf:nvidia/GR00T-N1.5-3B",
             ),
         ],
         EXAMPLE: [

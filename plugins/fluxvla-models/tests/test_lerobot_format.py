@@ -217,6 +217,25 @@ def test_processors_that_nobody_wrote(folder: Path) -> None:
             LeRobotACT().read(folder)
 
 
+@pytest.mark.parametrize("stem", ["policy_preprocessor", "policy_postprocessor"])
+def test_a_step_that_is_not_done_here_is_refused(folder: Path, stem: str) -> None:
+    """It would change what the robot is told, and be lost without a word."""
+    file = folder / f"{stem}.json"
+    steps = json.loads(file.read_text())["steps"]
+    more = {"registry_name": "absolute_actions_processor", "config": {"enabled": True}}
+    change(file, steps=[*steps, more])
+    with pytest.raises(CheckpointError, match=r"'absolute_actions_processor' .* not known here"):
+        LeRobotACT().read(folder)
+
+
+def test_what_makes_physical_actions_has_the_last_word(folder: Path) -> None:
+    (file,) = folder.glob("policy_postprocessor*_processor.safetensors")
+    stats = load_file(file)
+    save_file({**stats, "action.mean": stats["action.mean"] + 1.0}, file)
+    read = LeRobotACT().read(folder).statistics["private"]["action"]["mean"]
+    assert read == pytest.approx((stats["action.mean"] + 1.0).tolist())
+
+
 def test_a_missing_statistic_and_a_missing_file(folder: Path) -> None:
     stats = load_file(folder / NORMALIZER)
     for path in folder.glob("policy_*_processor.safetensors"):

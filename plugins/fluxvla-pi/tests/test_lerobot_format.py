@@ -207,7 +207,12 @@ def step(content, name):
         (
             "policy_preprocessor.json",
             lambda c: c["steps"].append({"class": "their.Step", "config": {}}),
-            "the step 'their.Step' is not one of",
+            "the step 'their.Step' of the processors is not known",
+        ),
+        (
+            "policy_postprocessor.json",
+            lambda c: c["steps"].append({"registry_name": "their_clip", "config": {}}),
+            "the step 'their_clip' of the processors is not known",
         ),
         (
             "policy_preprocessor.json",

@@ -11,13 +11,13 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from fluxvla_core.atomic import prepare_folder
+from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
-from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
 from fluxvla_core.untrusted import read_bytes
 
@@ -40,10 +40,7 @@ def export(source: str | Path, target: str | Path) -> Path:
         UsageError: there is something at ``target``, or nothing can be written there.
     """
     target = Path(target)
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
-        raise UsageError(
-            f"there is something at {target} already", next="name a folder that does not exist yet"
-        )
+    refuse_content(target)
     checkpoint = Checkpoint.open(source)
     prepare_folder(target.parent, "folder to export to", "name another place for the export")
     checkpoint.verify()

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fluxvla_core.atomic import prepare_folder
+from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
@@ -64,7 +64,7 @@ def import_checkpoint(
         UsageError: there is something at ``target``, or an option does not fit.
     """
     target = Path(target)
-    _refuse_content(target)
+    refuse_content(target)
     found = read_foreign(source, format, tokenizer)
     found = replace(
         found,
@@ -108,7 +108,7 @@ def export_foreign(source: str | Path, target: str | Path, format: str) -> Path:
         UsageError: no installed format of that name writes its model, or ``target`` is there.
     """
     target = Path(target)
-    _refuse_content(target)
+    refuse_content(target)
     checkpoint = Checkpoint.open(source)
     checkpoint.verify()
     found = _as_foreign(checkpoint)
@@ -236,13 +236,6 @@ def _check_robot(found: ForeignCheckpoint, where: str) -> None:
 def _width(statistics: Mapping[str, Any]) -> int | None:
     rows = [values for values in statistics.values() if isinstance(values, list | tuple)]
     return len(rows[0]) if rows else None
-
-
-def _refuse_content(target: Path) -> None:
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
-        raise UsageError(
-            f"there is something at {target} already", next="name a folder that does not exist yet"
-        )
 
 
 def embodiment_in(place: str | Path) -> EmbodimentSpec:

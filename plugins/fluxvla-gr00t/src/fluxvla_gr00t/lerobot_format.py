@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from fluxvla_models.lerobot_files import POSTPROCESSOR, PREPROCESSOR, Step, read_steps, whole
+
 from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
@@ -39,7 +41,7 @@ HEADS: dict[str, dict[str, Any]] = {
 }
 _PREFIX = "_groot_model."
 _IMAGES = "observation.images."
-_PRE, _POST = "policy_preprocessor.json", "policy_postprocessor.json"
+_PRE = f"{PREPROCESSOR}.json"
 
 
 class LeRobotGR00TFormat(CheckpointFormat):
@@ -67,7 +69,7 @@ class LeRobotGR00TFormat(CheckpointFormat):
         """
         config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
         steps, packing, version = _preprocessor(folder)
-        pack = _config_of(packing)
+        pack = packing.config
         robot = _robot(folder, packing, config)
         head = {
             **HEADS[version],
@@ -80,7 +82,8 @@ class LeRobotGR00TFormat(CheckpointFormat):
         if version == "n1.5":
             transforms = n15_transforms(model, robot, tokenizer)
         else:
-            encode = _config_of(steps.get("groot_n1_7_vlm_encode_v1", {}))
+            encoding = steps.get("groot_n1_7_vlm_encode_v1")
+            encode = {} if encoding is None else encoding.config
             transforms = n17_transforms(
                 model,
                 robot,
@@ -93,13 +96,9 @@ class LeRobotGR00TFormat(CheckpointFormat):
         return checkpoint(version, stored, model, transforms, robot, str(folder))
 
 
-def _preprocessor(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
+def _preprocessor(folder: Path) -> tuple[dict[str, Step], Step, str]:
     """All steps by their names, the one that packs inputs, and the version that it is of."""
-    content = read_json(folder / _PRE, dict[str, Any], CheckpointError)
-    listed = content.get("steps")
-    if not isinstance(listed, list) or not all(isinstance(step, dict) for step in listed):
-        raise CheckpointError("steps: no list of tables", where=str(folder / _PRE))
-    steps = {str(step.get("registry_name")): step for step in listed}
+    steps = {step.name: step for step in read_steps(folder, PREPROCESSOR)}
     found = [name for name in PACKS if name in steps]
     if len(found) != 1:
         raise CheckpointError(
@@ -111,17 +110,16 @@ def _preprocessor(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
     return steps, steps[found[0]], PACKS[found[0]]
 
 
-def _robot(folder: Path, packing: Mapping[str, Any], config: Mapping[str, Any]) -> Robot:
+def _robot(folder: Path, packing: Step, config: Mapping[str, Any]) -> Robot:
     """The robot, without statistics where something is done to its actions that is not here."""
     where = str(folder / _PRE)
-    pack = _config_of(packing)
+    pack = packing.config
     tag, numbers = pack.get("embodiment_tag"), pack.get("embodiment_mapping")
     # LeRobot takes 0 for a tag that is not listed.
     number = numbers.get(tag, 0) if isinstance(numbers, dict) else None
     if not isinstance(tag, str) or not isinstance(number, int):
         raise CheckpointError("embodiment_mapping: no number for embodiment_tag", where=where)
-    content = read_json(folder / _POST, dict[str, Any], CheckpointError)
-    post = {str(s.get("registry_name")): _config_of(s) for s in content.get("steps") or []}
+    post = {step.name: step.config for step in read_steps(folder, POSTPROCESSOR)}
     grouped = "groot_n1_7_action_decode_v1"
     if grouped in post and pack.get("raw_stats") and pack.get("modality_config"):
         settings = {
@@ -131,7 +129,8 @@ def _robot(folder: Path, packing: Mapping[str, Any], config: Mapping[str, Any]) 
         tables = pack["modality_config"], pack["raw_stats"]
         robot = grouped_robot(tag, number, *tables, settings, where)
     else:
-        robot = flat_robot(tag, number, _state_of(folder, packing), where)
+        found = {name: whole(stored).tolist() for name, stored in packing.tensors.items()}
+        robot = flat_robot(tag, number, found, where)
     trained = pack.get("valid_action_horizon")
     horizon = trained if isinstance(trained, int) else robot.horizon
     robot = replace(robot, img_keys=_cameras(config, pack), horizon=horizon)
@@ -159,22 +158,6 @@ def _cameras(config: Mapping[str, Any], pack: Mapping[str, Any]) -> tuple[str, .
     ordered = [n if n in names else alias.get(n) for n in wanted]
     listed = tuple(name for name in ordered if name in names)
     return listed or tuple(names)
-
-
-def _state_of(folder: Path, packing: Mapping[str, Any]) -> dict[str, Any]:
-    """The statistics of a step: ``feature.statistic`` -> list; nothing if it has none."""
-    file = packing.get("state_file")
-    if not isinstance(file, str):
-        return {}
-    if Path(file).name != file:
-        raise CheckpointError(f"{file!r} is not a file next to it", where=str(folder / _PRE))
-    stored = safetensors_in(folder, file.removesuffix(".safetensors"))
-    return {name: t[tuple(slice(None) for _ in t.shape)].tolist() for name, t in stored.items()}
-
-
-def _config_of(step: Mapping[str, Any]) -> dict[str, Any]:
-    config = step.get("config")
-    return config if isinstance(config, dict) else {}
 
 
 def _count(config: Mapping[str, Any], name: str, file: Path) -> int:

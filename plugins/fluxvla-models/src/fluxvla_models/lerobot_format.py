@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
+from fluxvla_core.results import read_json
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
 from fluxvla_models.lerobot_names import act_name, diffusion_name
-from fluxvla_models.lerobot_statistics import (
-    ACTION,
-    CONFIG,
-    STATE,
-    read_normalization,
-    read_table,
-    tables,
-)
+from fluxvla_models.lerobot_statistics import read_normalization, tables
 
 
 class _LeRobotFormat(CheckpointFormat):
@@ -26,9 +22,9 @@ class _LeRobotFormat(CheckpointFormat):
     kind: ClassVar[str]
     our_name: ClassVar[Callable[[str], str | None]]
 
+    @abstractmethod
     def model(self, config: Mapping[str, Any], where: str) -> dict[str, Any]:
         """The table of the model that LeRobot's ``config`` describes."""
-        raise NotImplementedError
 
     def notes(self, config: Mapping[str, Any]) -> Sequence[str]:
         """What somebody who imports the checkpoint ought to know."""
@@ -37,22 +33,20 @@ class _LeRobotFormat(CheckpointFormat):
             return ()
         return (f"LeRobot executes {used} of {horizon} actions: execute_horizon={used}",)
 
+    @abstractmethod
     def horizon(self, config: Mapping[str, Any]) -> int:
         """Actions in a chunk."""
-        raise NotImplementedError
 
     def recognizes(self, folder: Path) -> bool:
-        if not (folder / CONFIG).is_file():
-            return False
         try:
-            config = read_table(folder / CONFIG)
+            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
         except CheckpointError:
             return False
         return config.get("type") == self.kind and "input_features" in config
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
-        config = read_table(folder / CONFIG)
+        config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
         cameras, size = pictures(config, where)
         joints, dim = width(config, "input_features", STATE, where), action_dim(config, where)
         model = self.model(config, where)
@@ -130,7 +124,7 @@ class LeRobotDiffusion(_LeRobotFormat):
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
-        steps = read_table(folder / CONFIG).get("n_obs_steps")
+        steps = read_json(folder / CONFIG, dict[str, Any], CheckpointError).get("n_obs_steps")
         if steps != 1:
             raise CheckpointError(
                 f"the policy acts on {steps} observations, the present and earlier ones "

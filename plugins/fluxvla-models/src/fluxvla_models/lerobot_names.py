@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 
+from fluxvla_models.lerobot_files import BUFFERS
+
 _NETWORK = {
     "0": "conv1",
     "1": "bn1",
@@ -18,13 +20,11 @@ _NETWORK = {
 }
 """Places in LeRobot's sequence of a residual network's parts (2 and 3 have no weights)."""
 _BACKBONE = re.compile(r"^(rgb_encoders\.\d+\.backbone\.)(\d+)\.")
-STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
-"""How names of statistics begin, in checkpoints from before processors were saved."""
 
 
 def act_name(name: str) -> str | None:
     """``model.encoder.…`` -> ``encoder.…``."""
-    if name.startswith(STATISTICS) or name == "model.vae_encoder_pos_enc":
+    if name.startswith(BUFFERS) or name == "model.vae_encoder_pos_enc":
         return None
     return name.removeprefix("model.")
 
@@ -32,7 +32,7 @@ def act_name(name: str) -> str | None:
 def diffusion_name(name: str) -> str | None:
     """``diffusion.rgb_encoder.0.backbone.4.0.conv1.weight`` ->
     ``rgb_encoders.0.backbone.layer1.0.conv1.weight``; a shared encoder is number 0."""
-    if name.startswith(STATISTICS) or name.endswith(".pool.pos_grid"):
+    if name.startswith(BUFFERS) or name.endswith(".pool.pos_grid"):
         return None
     ours = name.removeprefix("diffusion.")
     if ours.startswith("rgb_encoder."):

@@ -7,7 +7,6 @@ among the weights (``normalize_inputs.buffer_<feature>.<statistic>``, with ``_``
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,27 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import Stored, safetensors_in
-from fluxvla_models.lerobot_names import STATISTICS
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    BUFFERS,
+    CONFIG,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    STATE,
+    read_steps,
+    whole,
+)
 
 Floats = npt.NDArray[np.float64]
-STATE, ACTION = "observation.state", "action"
-CONFIG, BEFORE, AFTER = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"
 _ADDED = 1e-6
 """What ``NormalizeStatesAndActions`` adds to a standard deviation."""
+_KNOWN = {
+    "rename_observations_processor",
+    "to_batch_processor",
+    "device_processor",
+    "normalizer_processor",
+    "unnormalizer_processor",
+}
 _RANGES = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 
 
@@ -89,7 +102,7 @@ def read_normalization(folder: Path, config: Mapping[str, Any]) -> Normalization
     Raises:
         CheckpointError: there is none, or a file is damaged.
     """
-    if (folder / BEFORE).is_file():
+    if (folder / f"{PREPROCESSOR}.json").is_file():
         return _of_processors(folder, config)
     features = [*config.get("input_features", {}), *config.get("output_features", {})]
     names = {f"buffer_{feature.replace('.', '_')}": feature for feature in features}
@@ -97,11 +110,11 @@ def read_normalization(folder: Path, config: Mapping[str, Any]) -> Normalization
     for name, stored in safetensors_in(folder).items():
         _, _, rest = name.partition(".")
         feature, _, statistic = rest.rpartition(".")
-        if name.startswith(STATISTICS) and feature in names:
+        if name.startswith(BUFFERS) and feature in names:
             statistics.setdefault(names[feature], {})[statistic] = _array(stored)
     if not statistics:
         raise CheckpointError(
-            f"there is neither {BEFORE} nor statistics among the weights",
+            f"there is neither {PREPROCESSOR}.json nor statistics among the weights",
             where=str(folder),
             cause="the folder was copied without the processors' files",
         )
@@ -159,27 +172,20 @@ def _entry(
 def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
     statistics: dict[str, dict[str, Floats]] = {}
     modes, eps, names = _modes(config), 1e-8, {}
-    for file, kind in ((AFTER, "unnormalizer_processor"), (BEFORE, "normalizer_processor")):
-        if not (folder / file).is_file():
-            continue
-        for step in _steps(folder / file):
-            settings = _table(step, "config", folder / file)
-            if step.get("registry_name") == "rename_observations_processor":
-                names = dict(_table(settings, "rename_map", folder / file))
-            if step.get("registry_name") != kind:
+    # What makes physical actions of the model's comes after it: its statistics go last.
+    stems = [stem for stem in (PREPROCESSOR, POSTPROCESSOR) if (folder / f"{stem}.json").is_file()]
+    for stem in stems:
+        file = folder / f"{stem}.json"
+        for step in read_steps(folder, stem, _KNOWN):
+            if step.name == "rename_observations_processor":
+                names = dict(_table(step.config, "rename_map", file))
+            if not step.name.endswith("normalizer_processor"):
                 continue
-            modes = {**modes, **_table(settings, "norm_map", folder / file)}
-            eps = settings.get("eps", eps)
+            modes = {**modes, **_table(step.config, "norm_map", file)}
+            eps = step.config.get("eps", eps)
             if not isinstance(eps, float):
-                raise CheckpointError(f"eps is {eps!r}, no number", where=str(folder / file))
-            state = step.get("state_file")
-            if state is None:
-                continue
-            if Path(str(state)).name != state:
-                raise CheckpointError(f"{state!r} is not a file next to it", where=file)
-            for name, stored in safetensors_in(
-                folder, str(state).removesuffix(".safetensors")
-            ).items():
+                raise CheckpointError(f"eps is {eps!r}, no number", where=str(file))
+            for name, stored in step.tensors.items():
                 feature, _, statistic = name.rpartition(".")
                 statistics.setdefault(feature, {})[statistic] = _array(stored)
     return Normalization(modes, statistics, eps, names)
@@ -197,29 +203,5 @@ def _table(values: Mapping[str, Any], name: str, where: Path) -> Mapping[str, An
     return found
 
 
-def _steps(path: Path) -> list[Mapping[str, Any]]:
-    content = read_table(path)
-    steps = content.get("steps")
-    if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
-        raise CheckpointError("steps: no list of tables", where=str(path))
-    return steps
-
-
-def read_table(path: Path) -> dict[str, Any]:
-    """A JSON table.
-
-    Raises:
-        CheckpointError: it is missing, or not one.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"cannot be read as JSON: {error}", where=str(path)) from error
-    if not isinstance(content, dict):
-        raise CheckpointError("it is no table", where=str(path))
-    return content
-
-
 def _array(stored: Stored) -> Floats:
-    numbers = stored[tuple(slice(0, length) for length in stored.shape)]
-    return np.asarray(numbers.double().numpy())
+    return np.asarray(whole(stored).double().numpy())

@@ -15,13 +15,13 @@ several statistics are meant: its code takes them from words of the command line
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.results import read_json
 
 SIDECAR = "fluxvla_openvla.json"
 STATISTICS = "dataset_statistics.json"
@@ -76,10 +76,9 @@ def platform_of(dataset: str | None) -> Platform | None:
 def read_config(folder: Path) -> dict[str, Any] | None:
     """``config.json`` if it is a table; None if there is none."""
     try:
-        found = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(folder / "config.json", dict[str, Any], CheckpointError)
+    except CheckpointError:
         return None
-    return found if isinstance(found, dict) else None
 
 
 def is_native(folder: Path, config: Mapping[str, Any]) -> bool:
@@ -97,7 +96,7 @@ def read_sidecar(folder: Path) -> dict[str, Any]:
     file = folder / SIDECAR
     if not file.is_file():
         return {}
-    found = _table(file)
+    found = read_json(file, dict[str, Any], CheckpointError)
     unknown = sorted(set(found) - set(_KEYS))
     if unknown:
         raise CheckpointError(
@@ -113,7 +112,8 @@ def read_statistics(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
         CheckpointError: there are none.
     """
     file = folder / STATISTICS
-    found = _table(file) if file.is_file() else config.get("norm_stats")
+    there = file.is_file()
+    found = read_json(file, dict[str, Any], CheckpointError) if there else config.get("norm_stats")
     if (
         not isinstance(found, dict)
         or not found
@@ -197,13 +197,3 @@ def check_config(config: Mapping[str, Any], folder: Path) -> None:
 
 def _entry(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: entry[key] for key in ("proprio", "action") if key in entry}
-
-
-def _table(file: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"it cannot be read as JSON: {error}", where=str(file)) from error
-    if not isinstance(found, dict):
-        raise CheckpointError("it is not a table", where=str(file))
-    return found

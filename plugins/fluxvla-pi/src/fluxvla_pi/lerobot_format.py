@@ -10,18 +10,15 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
 from fluxvla_pi.lerobot_processors import (
-    ACTION,
-    BUFFERS,
     KEYS,
     MODES,
-    PREPROCESSOR,
-    STATE,
     STATISTICS,
     TOKENIZER,
     Preparation,
@@ -33,7 +30,6 @@ from fluxvla_pi.names import LEROBOT
 from fluxvla_pi.published import FAMILIES, weights_in
 from fluxvla_pi.writing import action_names, only, table_of, weights_to_write
 
-CONFIG = "config.json"
 IMAGES = "observation.images."
 _EMPTY = f"{IMAGES}empty_camera_"
 _FIXED = {"n_obs_steps": 1, "min_period": 4e-3, "max_period": 4.0, "use_peft": False}

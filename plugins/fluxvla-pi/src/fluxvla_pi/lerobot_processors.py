@@ -7,20 +7,24 @@ were buffers among the weights, ``normalize_inputs.buffer_<feature with _>.<stat
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import torch
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    STATE,
+    read_steps,
+    whole,
+)
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import Stored, safetensors_in
-from fluxvla_core.results import read_json
 
-PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
-STATE, ACTION = "observation.state", "action"
 KEYS = {STATE: "proprio", ACTION: "action"}
 """Their features -> entries of our statistics."""
 MODES = {
@@ -37,7 +41,6 @@ NEEDS = {
 }
 STATISTICS = ("mean", "std", "min", "max", "q01", "q10", "q50", "q90", "q99")
 TOKENIZER = "google/paligemma-3b-pt-224"
-BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 _KNOWN = {
     "rename_observations_processor",
     "to_batch_processor",
@@ -48,7 +51,7 @@ _KNOWN = {
     "relative_actions_processor",
     "normalizer_processor",
 }
-SUFFIX = ".safetensors"
+_KNOWN_AFTER = {"unnormalizer_processor", "absolute_actions_processor", "device_processor"}
 _NORMALIZER = "normalizer_processor"
 
 
@@ -86,36 +89,25 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
     Raises:
         CheckpointError: steps or settings that are not known here, or statistics that are missing.
     """
-    file = folder / f"{PREPROCESSOR}.json"
-    where = str(file)
-    content = read_json(file, dict[str, Any], CheckpointError)
-    listed = content.get("steps")
-    if not isinstance(listed, list) or not all(isinstance(step, dict) for step in listed):
-        raise CheckpointError("steps: no list of steps", where=where)
-    steps: dict[str, dict[str, Any]] = {}
-    for step in listed:
-        name = step.get("registry_name")
-        if name not in _KNOWN or not isinstance(step.setdefault("config", {}), dict):
-            raise CheckpointError(
-                f"the step {name or step.get('class')!r} is not one of PI0's or PI0.5's",
-                where=where,
-                cause="the policy was prepared for by code of its own, or a newer LeRobot",
-            )
-        steps[name] = step
+    where = str(folder / f"{PREPROCESSOR}.json")
+    steps = {step.name: step for step in read_steps(folder, PREPROCESSOR, _KNOWN)}
+    if (folder / f"{POSTPROCESSOR}.json").is_file():
+        read_steps(folder, POSTPROCESSOR, _KNOWN_AFTER)
     missing = sorted({_NORMALIZER, "tokenizer_processor"} - set(steps))
     if missing:
         raise CheckpointError(f"there is no step {', '.join(missing)}", where=where)
-    normalizer, words = steps[_NORMALIZER]["config"], steps["tokenizer_processor"]["config"]
+    normalizer, words = steps[_NORMALIZER].config, steps["tokenizer_processor"].config
     modes = _modes(normalizer.get("norm_map", {}), where)
     found: dict[str, dict[str, Sequence[float]]] = {}
-    if steps[_NORMALIZER].get("state_file") is not None:
-        tensors = _state_file(folder, steps[_NORMALIZER]["state_file"], where)
+    tensors = steps[_NORMALIZER].tensors
+    if tensors:
         found = {key: _rows(tensors, f"{key}.", widths[key], where) for key in KEYS}
     _check(found, modes, where)
-    relative = steps.get("relative_actions_processor", {}).get("config", {})
+    settings = {name: step.config for name, step in steps.items()}
+    relative = settings.get("relative_actions_processor", {})
     for key in ("exclude_joints", "action_names"):
         _setting(relative, key, [], (list, type(None)), where)
-    names = steps.get("rename_observations_processor", {}).get("config", {})
+    names = settings.get("rename_observations_processor", {})
     return Preparation(
         modes={key: modes[key] if found.get(key) else "none" for key in KEYS},
         statistics=found,
@@ -273,18 +265,6 @@ def _modes(given: Any, where: str) -> dict[str, str]:
     }
 
 
-def _state_file(folder: Path, name: Any, where: str) -> Mapping[str, Stored]:
-    if (
-        not isinstance(name, str)
-        or PurePath(name).name != name
-        or not name.endswith(".safetensors")
-    ):
-        raise CheckpointError(f"state_file {name!r} is not a file next to it", where=where)
-    if not os.path.lexists(folder / name):
-        raise CheckpointError(f"state_file {name} is missing", where=where)
-    return safetensors_in(folder, name.removesuffix(SUFFIX))
-
-
 def _rows(
     tensors: Mapping[str, Stored], prefix: str, width: int, where: str
 ) -> dict[str, Sequence[float]]:
@@ -294,7 +274,7 @@ def _rows(
         stored = tensors.get(prefix + name)
         if stored is None:
             continue
-        row = stored[tuple(slice(0, n) for n in stored.shape)].float()
+        row = whole(stored).float()
         if row.shape != (width,):
             raise CheckpointError(
                 f"{prefix}{name} has shape {tuple(row.shape)}, {width} numbers are expected",

@@ -8,11 +8,19 @@ from math import isqrt
 from pathlib import Path
 from typing import Any, ClassVar
 
+from fluxvla_models.lerobot_files import ACTION, BUFFERS, STATE
+
 from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, Stored, renamed, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_smolvla import lerobot_files as files
 from fluxvla_smolvla.keys import published, published_names
+from fluxvla_smolvla.lerobot_processors import (
+    Processors,
+    Statistics,
+    buffered_statistics,
+    norms_of,
+    read_processors,
+)
 from fluxvla_smolvla.lerobot_write import write
 from fluxvla_smolvla.model import SMOLVLM2, SmolVLA
 
@@ -64,16 +72,16 @@ class LeRobotSmolVLA(CheckpointFormat):
         weights = {
             name.replace(COMPILED, "model.", 1): tensor
             for name, tensor in stored.items()
-            if not name.startswith(files.BUFFERS)
+            if not name.startswith(BUFFERS)
         }
         vision, text = vision_table(weights, where), text_table(weights, where)
         config.check_size(vision["image_size"], text["layers"])
-        processors = files.read_processors(folder)
+        processors = read_processors(folder)
         notes = []
         if processors is None:
-            statistics = files.buffered_statistics(stored)
-            norms = files.norms_of(config.table("normalization_mapping"), where)
-            processors = files.Processors(norms, statistics)
+            statistics = buffered_statistics(stored)
+            norms = norms_of(config.table("normalization_mapping"), where)
+            processors = Processors(norms, statistics)
         if not processors.statistics:
             notes.append("it has no statistics: it can be trained on, and drives no robot")
         steps, executed = config.count("chunk_size", 50), config.count("n_action_steps", 50)
@@ -205,7 +213,7 @@ class Settings:
 
     def transforms(
         self,
-        processors: files.Processors,
+        processors: Processors,
         image_size: int,
         cameras: int,
         empty: int,
@@ -234,7 +242,7 @@ class Settings:
         )
 
     def _action_dim(self) -> int | None:
-        feature = self.table("output_features").get(files.ACTION, {})
+        feature = self.table("output_features").get(ACTION, {})
         shape = feature.get("shape") if isinstance(feature, dict) else feature
         if shape is None:
             return None
@@ -302,8 +310,8 @@ def _names(model: Mapping[str, Any]) -> list[str]:
         return list(SmolVLA(**{k: v for k, v in model.items() if k != "type"}).state_dict())
 
 
-def _ours(statistics: files.Statistics) -> dict[str, Any]:
-    names = {files.STATE: "proprio", files.ACTION: "action"}
+def _ours(statistics: Statistics) -> dict[str, Any]:
+    names = {STATE: "proprio", ACTION: "action"}
     return {names[feature]: dict(values) for feature, values in statistics.items()}
 
 

@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from fluxvla_models.lerobot_files import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, whole
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint
-from fluxvla_smolvla import lerobot_files as files
 from fluxvla_smolvla.keys import published_names
+from fluxvla_smolvla.lerobot_processors import EPS, NORMS, Statistics
 from fluxvla_smolvla.model import SMOLVLM2
 from fluxvla_smolvla.sizes import TextSize, VisionSize, size_of
 
-_FEATURES = {"proprio": files.STATE, "action": files.ACTION}
+_FEATURES = {"proprio": STATE, "action": ACTION}
 _SETTINGS = (
     "max_state_dim",
     "max_action_dim",
@@ -54,13 +55,13 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
     config = _config(checkpoint, transforms, statistics)
     _dump(config, folder / "config.json")
     names = published_names(checkpoint.tensors)
-    tensors = {theirs: files.whole(checkpoint.tensors[ours]) for ours, theirs in names.items()}
+    tensors = {theirs: whole(checkpoint.tensors[ours]) for ours, theirs in names.items()}
     save_file(
         {name: tensor.contiguous() for name, tensor in tensors.items()},
         folder / "model.safetensors",
         metadata={"format": "pt"},
     )
-    norms = {"eps": files.EPS, "norm_map": config["normalization_mapping"]}
+    norms = {"eps": EPS, "norm_map": config["normalization_mapping"]}
     inputs, outputs = config["input_features"], config["output_features"]
     tokenized = {
         "max_length": config["tokenizer_max_length"],
@@ -87,7 +88,7 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
         for feature, entry in statistics.items()
         for name, values in entry.items()
     }
-    for stem, steps in ((files.BEFORE, before), (files.AFTER, after)):
+    for stem, steps in ((PREPROCESSOR, before), (POSTPROCESSOR, after)):
         listed = []
         for number, (name, settings) in enumerate(steps):
             step: dict[str, Any] = {"registry_name": name, "config": settings}
@@ -101,7 +102,7 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
 def _config(
     checkpoint: ForeignCheckpoint,
     transforms: Mapping[Any, Mapping[str, Any]],
-    statistics: files.Statistics,
+    statistics: Statistics,
 ) -> dict[str, Any]:
     model = checkpoint.model
     vision, text = size_of(VisionSize, model.get("vision")), size_of(TextSize, model.get("text"))
@@ -111,8 +112,8 @@ def _config(
     cameras = {name: sizes.get(name, [3, side, side]) for name in checkpoint.img_keys}
     cameras |= {f"empty_camera_{i}": [3, 480, 640] for i in range(empty)}
     scaled = transforms["SmolVLANormalize"]
-    names = {ours: theirs for theirs, ours in files.NORMS.items()}
-    inputs = {files.STATE: {"type": "STATE", "shape": _shape(statistics, files.STATE)}}
+    names = {ours: theirs for theirs, ours in NORMS.items()}
+    inputs = {STATE: {"type": "STATE", "shape": _shape(statistics, STATE)}}
     inputs |= {
         f"observation.images.{name}": {"type": "VISUAL", "shape": shape}
         for name, shape in cameras.items()
@@ -122,7 +123,10 @@ def _config(
         "n_obs_steps": 1,
         "input_features": inputs,
         "output_features": {
-            files.ACTION: {"type": "ACTION", "shape": _shape(statistics, files.ACTION)}
+            ACTION: {
+                "type": "ACTION",
+                "shape": _shape(statistics, ACTION),
+            }
         },
         "normalization_mapping": {
             "VISUAL": "IDENTITY",
@@ -142,7 +146,7 @@ def _config(
     }
 
 
-def _statistics(checkpoint: ForeignCheckpoint) -> files.Statistics:
+def _statistics(checkpoint: ForeignCheckpoint) -> Statistics:
     entries = checkpoint.statistics.get("private", {})
     lacking = [name for name in _FEATURES if not entries.get(name)]
     if lacking:
@@ -159,7 +163,7 @@ def _statistics(checkpoint: ForeignCheckpoint) -> files.Statistics:
     }
 
 
-def _shape(statistics: files.Statistics, feature: str) -> list[int]:
+def _shape(statistics: Statistics, feature: str) -> list[int]:
     return [len(next(iter(statistics[feature].values())))]
 
 

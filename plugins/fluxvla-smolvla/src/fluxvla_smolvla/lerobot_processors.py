@@ -11,17 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    STATE,
+    read_steps,
+    whole,
+)
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import Stored, safetensors_in
-from fluxvla_core.results import read_json
+from fluxvla_core.models import Stored
 
-STATE, ACTION = "observation.state", "action"
-BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
 EPS = 1e-8
 NORMS = {
     "MEAN_STD": "mean_std",
@@ -31,7 +35,11 @@ NORMS = {
     "IDENTITY": "none",
 }
 """LeRobot's normalisations -> those of ``SmolVLANormalize``."""
-_IGNORED = {
+_KNOWN = {
+    "normalizer_processor",
+    "unnormalizer_processor",
+    "rename_observations_processor",
+    "tokenizer_processor",
     "to_batch_processor",
     "device_processor",
     "smolvla_new_line_processor",  # as SmolVLAPrompt
@@ -41,7 +49,6 @@ _BUFFERS = {
     "normalize_targets.buffer_action.": ACTION,
     "unnormalize_outputs.buffer_action.": ACTION,
 }
-BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 Statistics = dict[str, dict[str, list[float]]]
 """Feature -> statistic -> numbers, one for each dimension."""
 
@@ -71,16 +78,16 @@ def read_processors(folder: Path) -> Processors | None:
     Raises:
         CheckpointError: they are damaged, or do something that is not known here.
     """
-    if not (folder / f"{BEFORE}.json").is_file():
+    if not (folder / f"{PREPROCESSOR}.json").is_file():
         return None
     norms: dict[str, str] = {}
     statistics: Statistics = {}
     renamed: dict[str, str] = {}
     tokens: Mapping[str, Any] = {}
-    for stem in (BEFORE, AFTER):
+    for stem in (PREPROCESSOR, POSTPROCESSOR):
         where = str(folder / f"{stem}.json")
-        for step in _steps(folder / f"{stem}.json"):
-            name, settings = step.get("registry_name"), step.get("config", {})
+        for step in read_steps(folder, stem, _KNOWN):
+            name, settings = step.name, step.config
             if name in ("normalizer_processor", "unnormalizer_processor"):
                 norms |= norms_of(settings.get("norm_map", {}), where)
                 if settings.get("eps", EPS) != EPS:
@@ -88,17 +95,11 @@ def read_processors(folder: Path) -> Processors | None:
                         f"{name} divides by a std plus {settings['eps']}; {EPS} is known",
                         where=where,
                     )
-                statistics |= _stored_statistics(folder, step.get("state_file"), where)
+                statistics |= _statistics(step.tensors)
             elif name == "rename_observations_processor":
                 renamed |= _texts(settings.get("rename_map", {}), "rename_map", where)
             elif name == "tokenizer_processor":
                 tokens = settings
-            elif not isinstance(name, str) or name not in _IGNORED:
-                raise CheckpointError(
-                    f"the step {name!r} of the processors is not known here",
-                    where=where,
-                    cause="it was added to LeRobot's own steps, or by a later version",
-                )
     length, tokenizer = tokens.get("max_length"), tokens.get("tokenizer_name")
     for name, value, kind in (("max_length", length, int), ("tokenizer_name", tokenizer, str)):
         if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
@@ -117,13 +118,6 @@ def buffered_statistics(tensors: Mapping[str, Stored]) -> Statistics:
                 if values.isfinite().all():
                     found.setdefault(feature, {})[name.removeprefix(prefix)] = values.tolist()
     return found
-
-
-def whole(stored: Stored | Tensor) -> Tensor:
-    """The tensor that ``stored`` stands for."""
-    if isinstance(stored, Tensor):
-        return stored
-    return stored[tuple(slice(0, length) for length in stored.shape)]
 
 
 def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
@@ -148,31 +142,17 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
     return {kind: NORMS[norm] for kind, norm in mapping.items() if kind in ("STATE", "ACTION")}
 
 
-def _steps(path: Path) -> list[dict[str, Any]]:
-    content = read_json(path, dict[str, Any], CheckpointError)
-    steps = content.get("steps")
-    if not isinstance(steps, list) or not all(
-        isinstance(step, dict) and isinstance(step.get("config", {}), dict) for step in steps
-    ):
-        raise CheckpointError("steps is no list of steps with a config", where=str(path))
-    return steps
-
-
 def _texts(table: Any, what: str, where: str) -> dict[str, str]:
     if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
         raise CheckpointError(f"{what} is no table of names: {table!r}", where=where)
     return table
 
 
-def _stored_statistics(folder: Path, file: Any, where: str) -> Statistics:
-    if file is None:
-        return {}
-    if not isinstance(file, str) or PurePath(file).name != file:
-        raise CheckpointError(f"state_file {file!r} is not a file next to it", where=where)
+def _statistics(tensors: Mapping[str, Stored]) -> Statistics:
+    """Those of a step, flat as ``<feature>.<statistic>``."""
     found: Statistics = {}
-    tensors = safetensors_in(folder, file.removesuffix(".safetensors"))
-    for name in tensors:
+    for name, stored in tensors.items():
         feature, _, statistic = name.rpartition(".")
         if feature in (STATE, ACTION) and statistic != "count":
-            found.setdefault(feature, {})[statistic] = whole(tensors[name]).float().tolist()
+            found.setdefault(feature, {})[statistic] = whole(stored).float().tolist()
     return found

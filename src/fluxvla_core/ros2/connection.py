@@ -118,21 +118,21 @@ class Connection:
     Args:
         name: begins the node's name; process id and a random part make it unique.
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID`` (0 without it).
-        shared_memory: whether Fast DDS may exchange messages with other processes of this machine
-            through shared memory. Its locks are shared too: a process that is stopped while it has
-            one stops whoever sends to it. Without it, messages go through the loopback interface.
+        commands: whether a robot is commanded through it. Then messages go through the loopback
+            interface: Fast DDS's shared memory has locks, and a process that is stopped while it
+            has one stops whoever sends to it. And callbacks come from rclpy's ``EventsExecutor``
+            where it has one (from Kilted on), at a third of the CPU time.
 
     Raises:
         LoadFailed: there is no rclpy here.
         ConfigError: the domain is no number from 0 to 232.
     """
 
-    def __init__(self, name: str, domain_id: int | None = None, shared_memory: bool = True) -> None:
+    def __init__(self, name: str, domain_id: int | None = None, commands: bool = False) -> None:
         rclpy = require_rclpy()
         _check_domain(domain_id)
         keep_large_blocks()
         from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
         clean = re.sub(r"\W+", "_", name).strip("_") or "node"
@@ -144,7 +144,7 @@ class Connection:
         self._lock = threading.Lock()
         self._context = Context()
         transports = ExitStack()
-        if not shared_memory:
+        if commands:
             transports.enter_context(_udp_alone())
         with transports:
             rclpy.init(
@@ -165,9 +165,8 @@ class Connection:
                 raise
         try:
             self.domain: int = self._context.get_domain_id()
-            self._wake = self.node.create_guard_condition(lambda: None)
             self.every(WATCH_S, self._watch)
-            self._executor = SingleThreadedExecutor(context=self._context)
+            self._executor = _executor(self._context, commands)
             self._executor.add_node(self.node)
         except BaseException:
             self._context.try_shutdown()
@@ -225,7 +224,7 @@ class Connection:
             if self._closing.is_set():
                 return
             self._closing.set()
-        self._wake.trigger()
+        self._executor.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_S)
 
@@ -243,7 +242,7 @@ class Connection:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without
             # close() is noticed, and the process does not hang on a thread that it must join.
             while not self._closing.is_set() and main.is_alive() and self._context.ok():
-                self._executor.spin_once()
+                self._executor.spin_once(timeout_sec=WATCH_S)
         except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error
         finally:
@@ -251,6 +250,19 @@ class Connection:
             self._executor.shutdown()
             self.node.destroy_node()
             self._context.try_shutdown()
+
+
+def _executor(context: Any, events: bool) -> Any:
+    from rclpy.executors import SingleThreadedExecutor
+
+    if events:
+        try:
+            from rclpy.experimental import EventsExecutor
+        except ImportError:
+            pass  # Jazzy has none.
+        else:
+            return EventsExecutor(context=context)
+    return SingleThreadedExecutor(context=context)
 
 
 def _check_domain(domain_id: int | None) -> None:

@@ -6,7 +6,7 @@ identifies it.
 
 from __future__ import annotations
 
-import math
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,17 +27,26 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
         BadMessage: a joint is missing, named twice, without position, or not finite; or the message
             has no names at all. Names ``source`` and what the message does have.
     """
-    given = list(message.name)
+    columns = _columns(tuple(message.name), len(message.position), tuple(names), source)
+    values = np.asarray(message.position, np.float64)[columns]
+    if not np.isfinite(values).all():
+        bad = [name for name, value in zip(names, values, strict=True) if not np.isfinite(value)]
+        raise BadMessage(f"{source}: the position of {', '.join(bad)} is not a finite number")
+    return values
+
+
+# A driver sends the same names with every message; a few streams with a few orders each.
+@functools.lru_cache(maxsize=64)
+def _columns(given: tuple[str, ...], count: int, names: tuple[str, ...], source: str) -> list[int]:
+    """Where in a message that has the names ``given`` and ``count`` positions each joint is."""
     if not given:
         raise BadMessage(
-            f"{source}: {len(message.position)} positions without joint names; "
+            f"{source}: {count} positions without joint names; "
             "joints are only ever told apart by name",
             next="let the driver fill JointState.name",
         )
-    if len(message.position) != len(given):
-        raise BadMessage(
-            f"{source}: {len(given)} joint names, but {len(message.position)} positions"
-        )
+    if count != len(given):
+        raise BadMessage(f"{source}: {len(given)} joint names, but {count} positions")
     at = {name: index for index, name in enumerate(given)}
     if len(at) != len(given):
         twice = sorted({name for name in given if given.count(name) > 1})
@@ -49,11 +58,7 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
             cause="another robot, or a driver that names its joints in another way",
             next="give the operator the names that its driver uses (joint_names)",
         )
-    values = np.array([message.position[at[name]] for name in names], np.float64)
-    bad = [name for name, value in zip(names, values, strict=True) if not math.isfinite(value)]
-    if bad:
-        raise BadMessage(f"{source}: the position of {', '.join(bad)} is not a finite number")
-    return values
+    return [at[name] for name in names]
 
 
 def fill(message: Any, names: Sequence[str], values: npt.ArrayLike) -> Any:

@@ -99,7 +99,9 @@ class LinkObserver(EpisodeObserver):
     def __init__(self, link: Link, inbox: Inbox) -> None:
         self._link, self._inbox = link, inbox
         self._commands = 0
-        self._newest: deque[dict[str, Any]] = deque(maxlen=_EVENTS_KEPT)
+        self._newest: deque[CommandSent | FilterLeftOut | Stopped | EpisodeEnded] = deque(
+            maxlen=_EVENTS_KEPT
+        )
 
     def on_event(self, event: Event) -> None:
         if isinstance(event, CommandSent):
@@ -108,7 +110,7 @@ class LinkObserver(EpisodeObserver):
             if self._commands % _COMMANDS_PER_COLLECTION == 0:
                 gc.collect(1)
         if isinstance(event, (CommandSent, FilterLeftOut, Stopped, EpisodeEnded)):
-            self._newest.append(logged(event))
+            self._newest.append(event)
         message = event_message(event)
         if message is not None:
             # Of commands there are many: those that find no room are counted.
@@ -125,7 +127,7 @@ class LinkObserver(EpisodeObserver):
 
         file = JsonLines(folder, REST_FILE)
         for event in self._newest:
-            file.add(event)
+            file.add(logged(event))
         file.close()
 
 

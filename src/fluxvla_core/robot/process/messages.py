@@ -22,6 +22,7 @@ Array = npt.NDArray[np.float64]
 _HEADER = struct.Struct("<I")
 _FIELDS = ("what", "where", "cause", "next")
 _ALIGNED = 8
+_JSON = json.JSONEncoder(separators=(",", ":"))
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def encode(message: Message) -> bytes:
     """``message`` as bytes."""
     arrays = [np.asarray(array, dtype=np.float64) for array in message.arrays]
     shapes = [array.shape for array in arrays]
-    header = json.dumps([message.kind, message.fields, shapes], separators=(",", ":")).encode()
+    header = _JSON.encode([message.kind, message.fields, shapes]).encode()
     # Spaces, so that the numbers after it are aligned in memory.
     header += b" " * (-(_HEADER.size + len(header)) % _ALIGNED)
     return b"".join([_HEADER.pack(len(header)), header, *(array.tobytes() for array in arrays)])

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from fluxvla_core.training.layout import Layout, nbytes
-from fluxvla_core.training.model import autocast, loss_of, units_of
+from fluxvla_core.training.model import autocast, blocks_of, loss_of
 from fluxvla_core.training.parameters import trainable
 
 LEFT_OUT = (
@@ -41,15 +42,22 @@ class Kept:
 
     Args:
         activations: storages that autograd keeps, without weights, buffers and the batch.
+        recomputed: what is left of them where the model's units are computed again: what goes into
+            them, and what is outside of them.
+        largest_unit: what the largest of these has inside, which is there again at its turn.
         weight_copies: trained weights in the dtype that is computed in, which autocast makes.
-        largest_unit: of ``activations``, those of one of the model's units.
         batch: the inputs.
     """
 
     activations: int
-    weight_copies: int
+    recomputed: int
     largest_unit: int
+    weight_copies: int
     batch: int
+
+
+NOTHING = Kept(0, 0, 0, 0, 0)
+"""Where the batch is not known."""
 
 
 @dataclass(frozen=True)
@@ -89,27 +97,25 @@ class Footprint:
 
 
 def footprint(
-    layout: Layout, kept: Kept, optimizer: int, averaged: bool, recomputed: Kept | None = None
+    layout: Layout, kept: Kept, optimizer: int, averaged: bool, recompute: bool
 ) -> Footprint:
     """Put together what was counted.
 
     Args:
-        kept: of the model as it is.
         optimizer: bytes, of :func:`optimizer_bytes`.
         averaged: whether averaged weights are kept.
-        recomputed: of the model that recomputes its units, if it does.
+        recompute: whether the model's units are computed again in the backward pass.
     """
-    left = kept if recomputed is None else recomputed
     return Footprint(
         parameters=layout.parameters,
         gradients=layout.gradients,
         optimizer=optimizer,
         averages=nbytes(t for group in layout.optimized for t in group) if averaged else 0,
         gathered=layout.gathered,
-        weight_copies=left.weight_copies,
-        activations=left.activations,
-        recomputed=0 if recomputed is None else kept.largest_unit,
-        batch=left.batch,
+        weight_copies=kept.weight_copies,
+        activations=kept.recomputed if recompute else kept.activations,
+        recomputed=kept.largest_unit if recompute else 0,
+        batch=kept.batch,
     )
 
 
@@ -185,30 +191,40 @@ def kept(model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | No
     counter = _Counter(model, given)
     device = next(model.parameters()).device
     model.train()
-    with counter.attributed(model), counter, counter.hooks(), autocast(device, dtype):
-        loss = loss_of(model(**arguments), type(model).__name__)
-    assert loss.requires_grad or not trainable(model)
+    with counter.in_units(model), counter, counter.hooks(), autocast(device, dtype):
+        loss_of(model(**arguments), type(model).__name__)
+    inside = {key: size for unit in counter.inside.values() for key, size in unit.items()}
+    left = counter.outside | counter.entering
+    units = (
+        sum(size for key, size in unit.items() if key not in left)
+        for unit in counter.inside.values()
+    )
     return Kept(
-        activations=sum(counter.found.values()),
+        activations=sum((counter.outside | inside).values()),
+        recomputed=sum(left.values()),
+        largest_unit=max(units, default=0),
         weight_copies=sum(counter.copies.values()),
-        largest_unit=max(counter.by_unit.values(), default=0),
         batch=nbytes(given),
     )
 
 
 class _Counter(TorchDispatchMode):
-    """Counts storages that autograd keeps; answers checks of values that fake tensors lack."""
+    """Counts storages that autograd keeps; answers checks of values that fake tensors lack.
+
+    Each of its tables is from a storage to its bytes: ``outside`` of the model's units, ``inside``
+    of each of them, ``entering`` them, and ``copies`` of weights.
+    """
 
     def __init__(self, model: nn.Module, given: Sequence[Tensor]) -> None:
         super().__init__()
-        own = [*model.parameters(), *model.buffers(), *given]
-        self._own = {_key(tensor) for tensor in own}
+        self._own = {_key(t) for t in (*model.parameters(), *model.buffers(), *given)}
         self._trained = {id(p) for p in trainable(model).values()}
         self._held: list[Any] = []  # so that no other storage gets the place of one counted
         self._unit: int | None = None
-        self.found: dict[int, int] = {}
+        self.outside: dict[int, int] = {}
+        self.inside: dict[int, dict[int, int]] = {}
+        self.entering: dict[int, int] = {}
         self.copies: dict[int, int] = {}
-        self.by_unit: dict[int, int] = {}
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is _VALUE and isinstance(args[0], FakeTensor) and args[0].dtype is torch.bool:
@@ -224,38 +240,45 @@ class _Counter(TorchDispatchMode):
             yield
 
     @contextmanager
-    def attributed(self, model: nn.Module) -> Iterator[None]:
-        """What is kept inside of one of the model's units is counted by unit, too."""
-        handles = []
-        for number, unit in enumerate(units_of(model)):
-            for module in unit:
-                handles.append(module.register_forward_pre_hook(self._enters(number)))
-                handles.append(module.register_forward_hook(self._enters(None)))
+    def in_units(self, model: nn.Module) -> Iterator[None]:
+        """Inside, it is known what each of the model's units keeps, and what goes into it."""
+        blocks = blocks_of(model)
+        before = [block.__dict__.get("forward") for block in blocks]
+        for number, block in enumerate(blocks):
+            block.__dict__["forward"] = self._watched(number, block.forward)
         try:
             yield
         finally:
-            for handle in handles:
-                handle.remove()
+            for block, forward in zip(blocks, before, strict=True):
+                block.__dict__.pop("forward")
+                if forward is not None:
+                    block.__dict__["forward"] = forward
 
-    def _enters(self, number: int | None) -> Callable[..., None]:
-        def hook(*_: Any) -> None:
-            self._unit = number
+    def _watched(self, number: int, forward: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            if torch.is_grad_enabled():
+                for value in tree_leaves((args, kwargs)):
+                    if isinstance(value, Tensor) and _key(value) not in self._own:
+                        self._hold(value, self.entering)
+            around, self._unit = self._unit, number
+            try:
+                return forward(*args, **kwargs)
+            finally:
+                self._unit = around
 
-        return hook
+        return run
 
     def _pack(self, tensor: Tensor) -> Tensor:
         key = _key(tensor)
-        if key not in self._own and key not in self.found and key not in self.copies:
-            size = self._hold(tensor, self.found)
-            if self._unit is not None:
-                self.by_unit[self._unit] = self.by_unit.get(self._unit, 0) + size
+        if key not in self._own and key not in self.copies:
+            found = self.outside if self._unit is None else self.inside.setdefault(self._unit, {})
+            self._hold(tensor, found)
         return tensor
 
-    def _hold(self, tensor: Tensor, found: dict[int, int]) -> int:
+    def _hold(self, tensor: Tensor, found: dict[int, int]) -> None:
         storage = tensor.untyped_storage()
         self._held.append(storage)
         found[_key(tensor)] = storage.nbytes()
-        return storage.nbytes()
 
 
 def _key(tensor: Tensor) -> int:

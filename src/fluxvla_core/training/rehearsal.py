@@ -27,6 +27,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.footprint import (
+    NOTHING,
     Footprint,
     Kept,
     fake,
@@ -35,7 +36,7 @@ from fluxvla_core.training.footprint import (
     optimizer_bytes,
 )
 from fluxvla_core.training.layout import Layout
-from fluxvla_core.training.model import ForwardArguments, checkpoint_activations
+from fluxvla_core.training.model import ForwardArguments
 from fluxvla_core.training.parameters import trainable
 from fluxvla_core.training.strategy import Strategy
 
@@ -57,6 +58,8 @@ class Rehearsal:
         memory: number of processes -> what each of them needs.
         precision: dtype that is computed in.
         notes: what is not known, or does not fit.
+        skeleton: the model without memory, with its adapters.
+        inputs: the batch itself.
     """
 
     robot: EmbodimentSpec | None = None
@@ -70,6 +73,8 @@ class Rehearsal:
     precision: str = "float32"
     activations_known: bool = False
     notes: list[str] = field(default_factory=list)
+    skeleton: nn.Module | None = None
+    inputs: Mapping[str, Any] | None = None
 
 
 def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
@@ -92,8 +97,9 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     if model is not None:
         found.trained = sum(p.numel() for p in trainable(model).values())
     batch = _batch(context, found, runner)
+    found.skeleton, found.inputs = model, batch
     _compare(found)
-    if model is None or runner is None:
+    if model is None or runner is None or not processes:
         return found
     if not found.trained:
         found.notes.append("the model has no trainable parameter: all of its parts are frozen")
@@ -131,33 +137,27 @@ def memory_of(
         Exception: what a model raises that decides by the values of its inputs.
     """
     options = runner.options
-    kept: dict[tuple[tuple[str, torch.dtype], ...], tuple[Kept, Kept | None]] = {}
+    kept: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
     found = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
         lowered = tuple(layout.gathered_as.items())
         if lowered not in kept:
-            kept[lowered] = _kept(model, layout, runner, batch)
-        state = optimizer_bytes(runner.optimizer_settings.build, layout.optimized)
-        now, recomputed = kept[lowered]
-        averaged = options.ema_decay is not None
-        found[count] = footprint(layout, now, state, averaged, recomputed)
+            kept[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+        found[count] = footprint(
+            layout,
+            kept[lowered],
+            optimizer_bytes(runner.optimizer_settings.build, layout.optimized),
+            averaged=options.ema_decay is not None,
+            recompute=options.enable_gradient_checkpointing,
+        )
     return found
 
 
-def _kept(
-    model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any] | None
-) -> tuple[Kept, Kept | None]:
-    """Activations as they are, and with recomputation if it is asked for."""
-    if batch is None:
-        return Kept(0, 0, 0, 0), None
+def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
+    """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
     arguments = ForwardArguments(model)(batch)
-    whole = kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
-    if not runner.options.enable_gradient_checkpointing:
-        return whole, None
-    again = fake(model, layout.gathered_as)
-    checkpoint_activations(again)
-    return whole, kept_by_fake(again, arguments, runner.compute_dtype)
+    return kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
 
 
 def _count(

@@ -1,4 +1,4 @@
-"""GR00T N1.7 on LIBERO-Object by adapters in the action head's attention; see ``gr00t_n17_libero.py``.
+"""GR00T N1.7 on LIBERO-Object by adapters in its action head; see ``gr00t_n17_libero.py``.
 
 fluxvla run --config configs/gr00t_n17_libero_lora.py --section runner --nproc 8
 

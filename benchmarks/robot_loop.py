@@ -56,7 +56,7 @@ from fluxvla_aloha.presets import COBOT_MAGIC
 from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
-from benchmarks._robot_loop_arm import TIMES, TimedAloha, memory_mb
+from benchmarks._timed_arms import TIMES, TimedAloha, memory_mb
 from fluxvla_core.build import RunContext
 from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.recording.recorded import open_recording

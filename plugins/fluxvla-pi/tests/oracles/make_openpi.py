@@ -1,8 +1,9 @@
 """PI0 and PI0.5 of openpi's PyTorch port with tiny weights: losses, gradients, sampled actions.
 
 By hand: a checkout of github.com/Physical-Intelligence/openpi (15a9616), and an environment with
-torch 2.13.0, ``transformers==4.53.2`` and, copied over the latter as openpi's README says, the files
-of the checkout's ``src/openpi/models_pytorch/transformers_replace``. From the repository's root:
+torch 2.13.0 and ``transformers==4.53.2``, with the files of the checkout's
+``src/openpi/models_pytorch/transformers_replace`` copied over the latter (openpi's README).
+From the repository's root:
 
     OMP_NUM_THREADS=1 PYTHONPATH=.:CHECKOUT/src ENVIRONMENT/bin/python \\
         plugins/fluxvla-pi/tests/oracles/make_openpi.py [FOLDER]

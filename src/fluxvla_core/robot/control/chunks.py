@@ -50,7 +50,7 @@ class Chunk:
     def at(self, elapsed: float) -> Array:
         """``(D,)`` where it is after ``elapsed`` seconds; its first or last point outside it.
 
-        As ``keyframes.sample`` has it. That works on the whole chunk, and numpy gives the
+        The same as :func:`sample` for one moment. That works on the whole chunk, and numpy gives the
         interpreter up for arrays of that size: a thread that sends would have to get it again.
         """
         count = len(self.keyframes)

@@ -10,7 +10,7 @@ fluxvla run --config configs/ur5e_sim_lift.py --section inference --task 1
 _base_ = "aloha_sim_transfer.py"
 
 DATASET = "work_dirs/ur5e_sim/dataset"
-HORIZON = 10  # keyframes of 0.1 s
+HORIZON = 10  # actions of 0.1 s
 
 model = dict(
     vla_head=dict(type="FlowMatchingHead", horizon=HORIZON, action_dim=7),

@@ -298,7 +298,8 @@ def test_a_work_dir_that_is_named_means_its_newest_whole_checkpoint_too(tmp_path
     (damaged / "model.safetensors").write_bytes(b"")
 
     assert find_checkpoint(tmp_path, tmp_path / "elsewhere") == whole
-    assert "damaged" in caplog.text and damaged.name in caplog.text
+    assert "damaged" in caplog.text
+    assert damaged.name in caplog.text
     assert load_policy(tmp_path).source == str(whole)
     with pytest.raises(CheckpointError, match="damaged"):
         load_policy(damaged)

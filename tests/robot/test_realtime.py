@@ -121,7 +121,7 @@ def test_what_a_command_is_made_of_gives_the_interpreter_to_nobody(counted):
         time.sleep(0.05)  # whoever waits with the old interval is done with it
         before = counted[0]
         for step in range(250):
-            check_beginning(chunk.keyframes, spec, limiter.last, 50.0, settings)
+            check_beginning(chunk.actions, spec, limiter.last, 50.0, settings)
             (command,), _ = limiter.run(chunk.at(step / 50)[None])
             watch.sent(command, step / 50)
             watch.check(command, step / 50)

@@ -62,8 +62,8 @@ class ControlLoop:
         supervisor: the episode's supervisor; is notified of every accepted chunk.
         safety: ``starvation_s``, ``first_chunk_s`` and the limits of a chunk's beginning.
         interrupts: signals; checked while waiting, and by the supervisor at every tick.
-        keyframe_hz: keyframes a second in the policy's chunks.
-        keyframes: how many of a chunk's keyframes are played; None plays all.
+        action_rate_hz: actions a second in the policy's chunks.
+        max_actions: how many of a chunk's actions are executed; None for all.
         latency_s: how long, in lockstep, an answer takes.
         holds: send the last command again at every tick while the first answer is awaited: the arm
             was commanded before, and some drivers stop an arm that they hear nothing for.
@@ -76,8 +76,8 @@ class ControlLoop:
     supervisor: Supervisor
     safety: SafetySettings
     interrupts: Interrupts
-    keyframe_hz: float
-    keyframes: int | None = None
+    action_rate_hz: float
+    max_actions: int | None = None
     latency_s: float = 0.0
     holds: bool = False
 
@@ -144,7 +144,7 @@ class ControlLoop:
             rows.append(row)
         if not rows:
             raise BadChunk(
-                f"a chunk at {self.keyframe_hz:g} Hz holds no command at "
+                f"a chunk at {self.action_rate_hz:g} Hz holds no command at "
                 f"{self.sender.rate.hz:g} Hz: it is too short"
             )
         return np.array(rows)
@@ -210,23 +210,21 @@ class ControlLoop:
 
     def _receive(self, answer: Answer, anchor: Array) -> None:
         accepted = self._accepted(answer)
-        chunk = Chunk(accepted, self.keyframe_hz, answer.observed, anchor)
+        chunk = Chunk(accepted, self.action_rate_hz, answer.observed, anchor)
         self.joiner.add(chunk, self.robot.clock.now())
 
     def _accepted(self, answer: Answer) -> Array:
-        """The ``(T, D)`` keyframes of an answer that are played, as it arrives."""
-        keyframes, last = answer.keyframes, self.sender.limiter.last
+        """The ``(T, D)`` actions of an answer that are played, as it arrives."""
+        embodiment, last = self.robot.embodiment, self.sender.limiter.last
         try:
-            if isinstance(keyframes, BadChunk):
-                raise keyframes
-            embodiment = self.robot.embodiment
-            check_beginning(keyframes, embodiment, last, self.keyframe_hz, self.safety)
+            actions = answer.checked()
+            check_beginning(actions, embodiment, last, self.action_rate_hz, self.safety)
         except BadChunk:
             self.source.refused(answer)
             raise
         self.supervisor.chunk_accepted()
         self.source.accepted(answer)
-        return keyframes[: self.keyframes]
+        return actions[: self.max_actions]
 
     def _no_chunk(self, until: float) -> Starved:
         most = self.safety.first_chunk_s

@@ -64,19 +64,19 @@ class EpisodeSettings:
         rate_hz: commands a second.
         safety: thresholds of the safety rules.
         start_pose: ``(D,)``, where the arm goes first; None stays.
-        keyframes: how many of a chunk's keyframes are played; None plays all.
+        max_actions: how many of a chunk's actions are executed; None for all.
         latency_s: how long, in a simulation whose time stands still, an answer takes.
         max_steps: commands after which the episode ends.
-        keyframe_hz: keyframes a second in the policy's chunks.
+        action_rate_hz: actions a second in the policy's chunks.
     """
 
     rate_hz: float
     safety: SafetySettings
     start_pose: Sequence[float] | None
-    keyframes: int | None
+    max_actions: int | None
     latency_s: float
     max_steps: int
-    keyframe_hz: float
+    action_rate_hz: float
 
 
 @dataclass(frozen=True)
@@ -266,8 +266,8 @@ class Episode:
             supervisor=self._supervisor,
             safety=settings.safety,
             interrupts=self._interrupts,
-            keyframe_hz=settings.keyframe_hz,
-            keyframes=settings.keyframes,
+            action_rate_hz=settings.action_rate_hz,
+            max_actions=settings.max_actions,
             latency_s=settings.latency_s,
             holds=holds,
         )

@@ -61,9 +61,8 @@ class LocalSource(ChunkSource):
 
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
-        assert isinstance(answer.keyframes, np.ndarray)
         now = self._robot.clock.now()
-        self._emit(ChunkAccepted(now, answer.reading, answer.keyframes, answer.stages))
+        self._emit(ChunkAccepted(now, answer.reading, answer.checked(), answer.stages))
 
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)

@@ -108,22 +108,21 @@ class PolicyCaller:
         stages = {"policy": time.perf_counter() - began, **policy.stages}
         # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread
         # that sends would have to get it again.
-        keyframes: Array | BadChunk
         try:
-            keyframes = self._keyframes(chunk)
-        except BadChunk as problem:
-            keyframes = problem
-        return PolicyAnswer(reading.at, keyframes, reading, chunk, stages)
+            actions = self._actions(chunk)
+        except BadChunk as error:
+            return PolicyAnswer(reading.at, None, error, reading, chunk, stages)
+        return PolicyAnswer(reading.at, actions, None, reading, chunk, stages)
 
-    def _keyframes(self, chunk: Any) -> Array:
+    def _actions(self, chunk: Any) -> Array:
         policy = self.policy
-        keyframes = check_chunk(chunk, self._embodiment, policy.action_rate_hz, self._safety).copy()
-        if len(keyframes) != policy.horizon:
+        actions = check_chunk(chunk, self._embodiment, policy.action_rate_hz, self._safety).copy()
+        if len(actions) != policy.horizon:
             raise BadChunk(
-                f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+                f"the policy's chunk has {len(actions)} actions; it said {policy.horizon}"
             )
-        keyframes.flags.writeable = False
-        return keyframes
+        actions.flags.writeable = False
+        return actions
 
 
 class PolicyThread:

@@ -375,10 +375,10 @@ class BaseInferenceRunner(Runner):
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
-            keyframes=min((n for n in used if n is not None), default=None),
+            max_actions=min((n for n in used if n is not None), default=None),
             latency_s=self.simulated_latency,
             max_steps=self.max_publish_step,
-            keyframe_hz=policy.action_rate_hz,
+            action_rate_hz=policy.action_rate_hz,
         )
         parts = RunParts(
             robot=self.robot,

@@ -66,14 +66,14 @@ def test_whatever_goes_in_comes_out(kind, fields, given_):
 @pytest.mark.parametrize("name", ["", "a", "ab", "abc", "Ünïcødé 手 🦾", "\ud800", "\0\n"])
 def test_arrays_can_be_read_as_any_other(name):
     # The header before them has any length; torch and C code take aligned numbers only.
-    keyframes = np.arange(6.0).reshape(2, 3)
+    actions = np.arange(6.0).reshape(2, 3)
 
-    (got,) = decode(encode(Message("answer", {"name": name}, (keyframes,)))).arrays
+    (got,) = decode(encode(Message("answer", {"name": name}, (actions,)))).arrays
 
     assert got.flags.aligned
     assert not got.flags.writeable
     assert got.dtype == np.float64
-    np.testing.assert_array_equal(got, keyframes)
+    np.testing.assert_array_equal(got, actions)
 
 
 def test_arrays_of_other_layouts_and_types_arrive_as_float64():

@@ -37,11 +37,24 @@ class Answer:
 
     Args:
         observed: when the observation that it answers was made, on the robot's clock.
-        keyframes: ``(T, D)`` targets, read-only, or why they are refused.
+        actions: ``(T, D)`` targets, read-only; None if the chunk is refused.
+        error: why the chunk is refused; None if it is not.
     """
 
     observed: float
-    keyframes: Array | BadChunk
+    actions: Array | None
+    error: BadChunk | None
+
+    def checked(self) -> Array:
+        """``(T, D)`` the actions.
+
+        Raises:
+            BadChunk: the chunk is refused.
+        """
+        if self.error is not None:
+            raise self.error
+        assert self.actions is not None, "an answer has actions or an error"
+        return self.actions
 
 
 class ChunkSource(ABC):

@@ -15,7 +15,7 @@ from fluxvla_core.robot.control.safety import BadChunk, Rule, RuleStop, SafetySe
 from fluxvla_core.robot.control.source import Answer
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Array, Message, error_of
+from fluxvla_core.robot.process.messages import Message, error_of
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,10 @@ def _resolve(future: Future[Answer], message: Message) -> None:
     if "error" in fields:
         future.set_exception(error_of(fields))
         return
-    keyframes: Array | BadChunk
+    observed, number = fields["observed"], fields["number"]
     if message.arrays:
-        keyframes = message.arrays[0]
-    else:
-        refused = error_of(fields["refused"])
-        keyframes = refused if isinstance(refused, BadChunk) else BadChunk(refused.what)
-    future.set_result(RemoteAnswer(fields["observed"], keyframes, fields["number"]))
+        future.set_result(RemoteAnswer(observed, message.arrays[0], None, number))
+        return
+    refused = error_of(fields["refused"])
+    error = refused if isinstance(refused, BadChunk) else BadChunk(refused.what)
+    future.set_result(RemoteAnswer(observed, None, error, number))

@@ -105,17 +105,17 @@ def _continued(ahead: Ahead | None) -> tuple[dict[str, Any], tuple[Array, ...]]:
         "schedule": ahead.schedule,
         "max_guidance_weight": ahead.max_guidance_weight,
     }
-    return fields, (ahead.chunk.keyframes, ahead.chunk.anchor)
+    return fields, (ahead.chunk.actions, ahead.chunk.anchor)
 
 
 def ahead_of(message: Message) -> Ahead | None:
     """What the policy has to continue, of the message ``ask``; in the main process."""
     if not message.arrays:
         return None
-    keyframes, anchor = message.arrays
+    actions, anchor = message.arrays
     fields = message.fields
     return RestOfChunk(
-        Chunk(keyframes, fields["rate_hz"], fields["observed"], anchor),
+        Chunk(actions, fields["rate_hz"], fields["observed"], anchor),
         fields["latency_s"],
         fields["schedule"],
         fields["max_guidance_weight"],

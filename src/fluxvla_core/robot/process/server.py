@@ -120,11 +120,11 @@ class LinkServer:
                 return
             answer = future.result()
             self.answers[number] = answer
-            if isinstance(answer.keyframes, FluxError):
-                refused = error_fields(answer.keyframes)
+            if answer.error is not None:
+                refused = error_fields(answer.error)
                 self._link.post("answer", number=number, observed=answer.observed, refused=refused)
             else:
-                arrays = (answer.keyframes,)
+                arrays = (answer.checked(),)
                 self._link.post("answer", arrays, number=number, observed=answer.observed)
 
         source.ask(ahead_of(message)).add_done_callback(answered)

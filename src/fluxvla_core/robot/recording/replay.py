@@ -280,13 +280,13 @@ class ReplayPolicy(Policy):
 
     @property
     def action_rate_hz(self) -> float:
-        """Keyframes a second."""
+        """Actions a second."""
         key = "action_rate_hz" if self.actions == CHUNKS else "rate_hz"
         return float(self.recorded.start[key])
 
     @property
     def horizon(self) -> int:
-        """Keyframes of a chunk."""
+        """Actions of a chunk."""
         return len(self._chunks[0])
 
     @property

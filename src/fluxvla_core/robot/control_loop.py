@@ -24,9 +24,9 @@ import numpy.typing as npt
 from fluxvla_core.robot.control.chunks import Chunk, check_beginning
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyEnded
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
 from fluxvla_core.robot.control.sender import CommandSender
-from fluxvla_core.robot.control.source import Answer, ChunkSource, PolicyEnded
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.supervisor import EpisodeOver, Supervisor
 
@@ -56,7 +56,7 @@ class ControlLoop:
 
     Args:
         robot: the connected robot; its clock counts.
-        source: observes the robot and asks the policy.
+        client: observes the robot and asks the policy.
         joiner: joins the chunks to one motion.
         sender: sends every command; started at the arm's pose.
         supervisor: the episode's supervisor; is notified of every accepted chunk.
@@ -70,7 +70,7 @@ class ControlLoop:
     """
 
     robot: Robot
-    source: ChunkSource
+    client: PolicyClient
     joiner: ChunkJoiner
     sender: CommandSender
     supervisor: Supervisor
@@ -153,7 +153,7 @@ class ControlLoop:
         last = self.sender.limiter.last
         due = self.robot.clock.now() + self.latency_s
         until = time.monotonic() + self.safety.first_chunk_s
-        future = self.source.ask(self.joiner.ahead())
+        future = self.client.ask(self.joiner.ahead())
         if self.robot.lockstep and time.monotonic() > until:
             raise self._no_chunk(until)
         return PendingQuery(future, last, due)
@@ -169,7 +169,7 @@ class ControlLoop:
         query = self._ask()
         answer = self._wait_for(query, until)
         for _ in range(0 if self.robot.lockstep else 2):
-            self.source.reset()
+            self.client.reset()
             began = time.monotonic()
             query = self._ask()
             answer = self._wait_for(query, until)
@@ -220,15 +220,15 @@ class ControlLoop:
             actions = answer.checked()
             check_beginning(actions, embodiment, last, self.action_rate_hz, self.safety)
         except BadChunk:
-            self.source.refused(answer)
+            self.client.refused(answer)
             raise
         self.supervisor.chunk_accepted()
-        self.source.accepted(answer)
+        self.client.accepted(answer)
         return actions[: self.max_actions]
 
     def _no_chunk(self, until: float) -> Starved:
         most = self.safety.first_chunk_s
-        late, seconds = self.source.late(until - most)
+        late, seconds = self.client.late(until - most)
         return Starved(
             f"there was no chunk within {most:g} s: {late.name} took {seconds:.2f} s of that",
             cause=late.cause,
@@ -237,7 +237,7 @@ class ControlLoop:
 
     def _check_starved(self, seconds: float) -> None:
         if seconds > self.safety.starvation_s:
-            late, share = self.source.late(time.monotonic() - seconds)
+            late, share = self.client.late(time.monotonic() - seconds)
             raise Starved(
                 f"the robot waits for a chunk for {seconds:.2f} s, "
                 f"safety.starvation_s is {self.safety.starvation_s:g}: "

@@ -18,8 +18,8 @@ from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import check_chunk
 from fluxvla_core.robot.control.delays import POLICY, DelayMonitor
+from fluxvla_core.robot.control.policy_client import Answer, PolicyFailed
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
-from fluxvla_core.robot.control.source import Answer, PolicyFailed
 from fluxvla_core.robot.events import Reading
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -106,8 +106,8 @@ class PolicyCaller:
                 traceback.clear_frames(error.__traceback__)
             raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
         stages = {"policy": time.perf_counter() - began, **policy.stages}
-        # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread
-        # that sends would have to get it again.
+        # Checked in this thread: for arrays of a chunk's size numpy releases the GIL, and the
+        # thread that sends would have to get it again.
         try:
             actions = self._actions(chunk)
         except BadChunk as error:

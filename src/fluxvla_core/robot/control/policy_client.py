@@ -1,4 +1,4 @@
-"""``ChunkSource``: where the control loop gets its chunks from, in this process or in another."""
+"""``PolicyClient``: how the control loop asks a policy, in this process or in another."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Answer:
         return self.actions
 
 
-class ChunkSource(ABC):
+class PolicyClient(ABC):
     """Observes the robot and asks the policy, for one episode.
 
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
@@ -109,4 +109,4 @@ class ChunkSource(ABC):
 
     @abstractmethod
     def late(self, since: float) -> tuple[DelaySource, float]:
-        """What took most of the time since then (monotonic, in seconds), and how many seconds."""
+        """What took longest since ``since`` (monotonic, in seconds), and how many seconds of it."""

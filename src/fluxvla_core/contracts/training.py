@@ -51,7 +51,7 @@ class VLA(Contract):
 
     @attribute
     def frozen_source(self) -> str | None:
-        """Where the frozen weights come from when the model is built (a package, a file).
+        """The origin of the frozen weights when the model is built (a package, a file).
 
         They are not saved in checkpoints, only their hash. None: they are saved. Any module inside
         the model may have this attribute for its own frozen weights.
@@ -90,7 +90,7 @@ class Dataset(Contract):
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
 
     seed: Any = None
-    """What its samples draw by, a whole number; None if unknown."""
+    """The seed of its random numbers, an integer; None if unknown."""
     datasets: Sequence[Any] = ()
     """The datasets that a mixture is made of."""
 
@@ -213,7 +213,7 @@ class _AnyTransform(Contract):
         raise NotImplementedError(f"{type(self).__name__} normalises no actions")
 
     def defer(self, sample: Sample) -> Sample:
-        """As ``__call__``, with the normalisation of pictures left to be done on the device."""
+        """As ``__call__``, but images are left for normalisation on the device."""
         raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
 
 
@@ -249,7 +249,7 @@ class Tokenizer(Contract):
     padding_side: str = "right"
     pad_token_id: int | None = None
     model_path: str | None = None
-    """Where it was loaded from, as a config says it."""
+    """The path or name that it was loaded from, as in a config."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

@@ -196,7 +196,7 @@ def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What a figure belongs to: device, threads and versions."""
+    """The device, threads and versions that a measurement belongs to."""
     import torch
 
     gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None

@@ -17,6 +17,7 @@ from fluxvla_models.lerobot_files import POSTPROCESSOR, PREPROCESSOR, Step, read
 from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, chosen_robot, safetensors_in
 from fluxvla_core.results import read_json
+from fluxvla_gr00t.lerobot_write import write
 from fluxvla_gr00t.robots import GRIPPER, Robot, fewer_cameras, flat_robot, grouped_robot
 from fluxvla_gr00t.tables import (
     checkpoint,
@@ -127,6 +128,15 @@ class LeRobotGR00TFormat(CheckpointFormat):
             )
         stored = {n.removeprefix(_PREFIX): t for n, t in safetensors_in(folder).items()}
         return checkpoint(version, stored, model, transforms, chosen, str(folder))
+
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write it as LeRobot saves it: N1.7 as by its version 0.6, N1.5 as by 0.4.
+
+        Raises:
+            CheckpointError: its sizes are not the published ones, or LeRobot's processors cannot
+                do what its transforms do.
+        """
+        write(checkpoint, folder, HEADS)
 
 
 def _preprocessor(folder: Path) -> tuple[dict[str, Step], Step, str]:

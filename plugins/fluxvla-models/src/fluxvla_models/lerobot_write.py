@@ -242,8 +242,13 @@ _PICTURES = ("NormalizeImages", "SimpleNormalizeImages")
 
 def _acting(tables: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     """The transforms that a policy acts with, by name; those of training alone do not matter."""
-    acting = (t for t in tables if not build_transform_from_cfg(dict(t)).training_only)
-    return {str(table["type"]).rpartition(":")[2]: table for table in acting}
+    named = ((str(table["type"]).rpartition(":")[2], table) for table in tables)
+    known = ("ResizeImages", *_PICTURES, "NormalizeStatesAndActions")
+    return {
+        name: table
+        for name, table in named
+        if name in known or not build_transform_from_cfg(dict(table)).training_only
+    }
 
 
 def _size(checkpoint: ForeignCheckpoint, resize: Mapping[str, Any] | None) -> tuple[int, int]:

@@ -28,6 +28,8 @@ from fluxvla_core.plugins.load import LIST
 
 REQUIRES = "requires"
 """The key of ``requires = ["fluxvla-ur>=0.3"]``: what a config says it needs (PEP 508)."""
+# ``inference_model`` is in configs of upstream FluxVLA. Nothing is built from it here: a policy is
+# built from the checkpoint's ``model``. Its classes are checked like any others.
 _NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, REQUIRES, "hooks")
 # Keys under which a table without ``type`` can only be a slip.
 _NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filters"}

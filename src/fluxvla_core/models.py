@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fluxvla_core.build import build_projector_from_cfg as build_projector_from_cfg
     from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
     from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
+    from fluxvla_core.checkpoints.foreign import foreign_folder as foreign_folder
     from fluxvla_core.checkpoints.foreign import renamed as renamed
     from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
     from fluxvla_core.checkpoints.parts import Stored as Stored
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
     from fluxvla_core.policies.loading import load_policy as load_policy
+    from fluxvla_core.training.foreign import embodiment_in as embodiment_in
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -35,7 +37,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "build_vision_backbone_from_cfg",
             "build_vlm_backbone_from_cfg",
         ],
-        "fluxvla_core.checkpoints.foreign": ["renamed", "safetensors_in"],
+        "fluxvla_core.checkpoints.foreign": ["foreign_folder", "renamed", "safetensors_in"],
         "fluxvla_core.checkpoints.parts": ["Stored"],
         "fluxvla_core.contracts.checkpoint_format": ["CheckpointFormat", "ForeignCheckpoint"],
         "fluxvla_core.contracts.frame": ["Observation"],
@@ -43,5 +45,6 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.training": ["VLA"],
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
         "fluxvla_core.policies.loading": ["load_policy"],
+        "fluxvla_core.training.foreign": ["embodiment_in"],
     },
 )

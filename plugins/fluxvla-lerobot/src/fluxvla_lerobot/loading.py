@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, LoadFailed
-from fluxvla_core.models import safetensors_in
 from fluxvla_lerobot.files import EMPTY, WEIGHTS, Described
 from fluxvla_lerobot.installed import LeRobot
 
@@ -113,6 +112,8 @@ def check_weights(policy: Any, folder: Path) -> None:
         CheckpointError: lists what is not.
     """
     import torch
+
+    from fluxvla_core.models import safetensors_in
 
     stored = safetensors_in(folder)
     by_shape: dict[tuple[int, ...], list[str]] = {}

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from fluxvla_core import Actor, Camera, EmbodimentSpec, Environment, Observation
 from fluxvla_core.errors import ConfigError, LoadFailed, SpecMismatch
-from fluxvla_core.models import embodiment_in, foreign_folder
 from fluxvla_core.operators import RunContext
 from fluxvla_lerobot.files import STATE, describe
 from fluxvla_lerobot.installed import installed_version, known_version, lerobot
@@ -90,6 +89,10 @@ class LeRobotPolicy(Actor):
         if rate_hz is not None and not 0.0 < rate_hz < float("inf"):
             raise ConfigError(f"LeRobotPolicy: rate_hz must be positive, got {rate_hz}")
         known_version(installed_version())  # before a checkpoint is fetched
+        from fluxvla_core.models import (
+            foreign_folder,
+        )  # with torch, which a check must not wait for
+
         folder = foreign_folder(path)
         self._described = described = describe(folder, trust_remote_code)
         self._features = cameras_for(described, cameras or {}, left_out)
@@ -268,4 +271,6 @@ class LeRobotPolicy(Actor):
 
 
 def _robot(place: str | Mapping[str, Any]) -> EmbodimentSpec:
+    from fluxvla_core.models import embodiment_in
+
     return embodiment_in(place) if isinstance(place, str) else EmbodimentSpec.from_dict(place)

@@ -15,8 +15,8 @@ pytest.importorskip(
 
 import numpy as np
 
+from fluxvla_core import build_operator_from_cfg
 from fluxvla_core.cli.main import main
-from fluxvla_core.operators import build_operator_from_cfg
 
 from .tiny import save
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from fluxvla_core.config.parameters import Parameter
 from fluxvla_core.config.resolve import (
     INJECTED,
     LOADER_KEYS,
@@ -18,7 +19,7 @@ from fluxvla_core.config.resolve import (
     Found,
     resolve,
 )
-from fluxvla_core.config.signature import Parameter, Signature, table_of
+from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.tree import Config, all_keys, join_key
 from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem, nearest
 from fluxvla_core.plugins._metadata import canonical, version

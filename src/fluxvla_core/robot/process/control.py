@@ -207,7 +207,7 @@ def _execute(
     link: Link, inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message
 ) -> None:
     orders: Mapping[str, Callable[[], object]] = {
-        "connect": engine.connect,
+        "connect": lambda: _connect(engine),
         "rearm": engine.rearm,
         "release": engine.release,
         "stop": engine.stop,
@@ -225,6 +225,13 @@ def _execute(
         failure, holding = engine.stop_failure, engine.holding
         fields |= {"facts": facts, "stop_failure": failure, "holding": holding}
     link.post("done", order=order.kind, **fields)
+
+
+def _connect(engine: Engine) -> None:
+    engine.connect()
+    # The libraries that it imported are not to be looked through between two commands.
+    gc.collect()
+    gc.freeze()
 
 
 def _play(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:

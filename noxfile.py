@@ -140,7 +140,9 @@ def oracles(session: nox.Session) -> None:
                 words = ["-m", "tools.golden", folder, committed, *some]
                 name = f"compare {committed.relative_to(ROOT).as_posix()}"
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
-        both = joined_env.join(env, dev_env(session))
+        dev = dev_env(session)
+        make_renderable(session, dev)
+        both = joined_env.join(env, dev)
         words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
         variables = {**rendering.VARIABLES, **alone}
         step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))

@@ -124,10 +124,11 @@ def check_weights(policy: Any, folder: Path) -> None:
         theirs = stored[name]
         if tuple(theirs.shape) != tuple(own.shape):
             return False
-        if own.ndim == 0:
-            return bool((theirs[()].to(own.dtype) == own.cpu()).item())
-        rows = (slice(0, 1), *(slice(0, n) for n in own.shape[1:]))
-        return torch.equal(theirs[rows].to(own.dtype), own[:1].cpu())
+        rows = tuple(slice(0, n if axis else 1) for axis, n in enumerate(own.shape))
+        pair = (theirs[rows], own[rows].cpu())
+        # A policy may have gone through bfloat16 and back.
+        coarse = torch.bfloat16 if own.is_floating_point() else own.dtype
+        return torch.equal(*(values.to(own.dtype).to(coarse) for values in pair))
 
     lost = []
     for name, own in policy.state_dict().items():

@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT))
 from tools import (  # noqa: E402
     envs,
     golden,
+    joined_env,
     lerobot_env,
     needs,
     oracle_env,
@@ -106,12 +107,16 @@ def environments(session: nox.Session) -> None:
     """What the tests need besides .nox/dev: LeRobot to compare with, and the demo's environment."""
     with Steps(session) as step:
         step("LeRobot", lambda: lerobot_env.prepare(session.log))
+        step("LeRobot's policies", lambda: oracle_env.prepare_044(session.log))
         step("demo", lambda: demo_env(session))
 
 
 @nox.session
 def oracles(session: nox.Session) -> None:
-    """What other implementations compute, computed again and compared with the golden files."""
+    """What other implementations compute, computed again and compared with the golden files.
+
+    And the tests of fluxvla-lerobot that need LeRobot, with the LeRobot that most are made with.
+    """
     with Steps(session) as step:
         made: dict[Path, Path] = {}
         by_hand = [p for p in golden.programs(ROOT) if p.environment is None]
@@ -135,6 +140,12 @@ def oracles(session: nox.Session) -> None:
                 words = ["-m", "tools.golden", folder, committed, *some]
                 name = f"compare {committed.relative_to(ROOT).as_posix()}"
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
+        dev = dev_env(session)
+        make_renderable(session, dev)
+        both = joined_env.join(env, dev)
+        words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
+        variables = {**rendering.VARIABLES, **alone}
+        step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))
 
 
 @nox.session

@@ -8,6 +8,7 @@ does, so that a number which the function worked out in Python is that of the re
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -93,14 +94,22 @@ class Tape:
 
 
 @contextmanager
-def counted(module: torch.nn.Module) -> Iterator[list[torch.nn.Module]]:
-    """The list that ``module`` is added to whenever it is called."""
-    calls: list[torch.nn.Module] = []
-    handle = module.register_forward_hook(lambda called, *_: calls.append(called))
+def count_calls(model: torch.nn.Module) -> Iterator[Counter[str]]:
+    """How often each of the model's modules is called inside, by name; those that are."""
+    calls: Counter[str] = Counter()
+
+    def note(name: str) -> Callable[..., None]:
+        def add(*_: Any) -> None:
+            calls[name] += 1
+
+        return add
+
+    handles = [m.register_forward_hook(note(name)) for name, m in model.named_modules()]
     try:
         yield calls
     finally:
-        handle.remove()
+        for handle in handles:
+            handle.remove()
 
 
 def check_capturable(function: Callable[[], Any]) -> Any:

@@ -9,6 +9,7 @@ is computed once, however many draws of noise or integration steps follow.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -312,7 +313,8 @@ class SmolVLA(VLA, nn.Module):
     def _out(self, hidden: Tensor) -> Tensor:
         out = self.action_out_proj
         # The velocity is summed over the steps: it is computed in fp32 whatever the weights are in.
-        with torch.autocast(hidden.device.type, enabled=False):
+        kind = hidden.device.type
+        with nullcontext() if kind == "meta" else torch.autocast(kind, enabled=False):
             return nn.functional.linear(hidden.float(), out.weight.float(), out.bias.float())
 
     def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:

@@ -34,6 +34,7 @@ _WAITING = {
     _aten.unique_dim,
     _aten.bincount,
 }
+_INDEXING = {_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_}
 # A tensor of Python numbers: on a GPU a copy from memory that is not pinned.
 _FROM_HOST = {_aten.lift_fresh, _aten.lift, _aten._to_cpu}
 
@@ -55,6 +56,8 @@ class NoWaiting(TorchDispatchMode):
         packet = func.overloadpacket
         if packet in _WAITING:
             raise Refused(f"{func} gives a value to the host: a GPU would be waited for")
+        if packet in _INDEXING and any(t.dtype is torch.bool for t in _indices(args)):
+            raise Refused(f"{func} by a mask: the size of the result depends on values")
         if packet in _FROM_HOST:
             raise Refused(f"{func} makes a tensor of numbers of the host: compute it beforehand")
         found = func(*args, **(kwargs or {}))
@@ -133,6 +136,10 @@ class _Recorder(NoWaiting):
         found = super().__torch_dispatch__(func, types, args, kwargs)
         self.steps.append((func, args, dict(kwargs or {}), found))
         return found
+
+
+def _indices(args: Any) -> list[Tensor]:
+    return [part for part in args[1] if isinstance(part, Tensor)]
 
 
 def _sized(value: Any) -> bool:

@@ -69,16 +69,22 @@ class ExecutionConformance:
             if model.observe_is_capturable:
                 check_capturable(lambda: model.observe(**observation))
 
-    def test_the_steps_run_without_numbers(self) -> None:
-        """On the meta device, where tensors have shapes alone."""
+    def test_the_steps_meet_nothing_of_the_host(self) -> None:
+        """On the meta device, where a tensor of the host's is another device's, as on a GPU."""
         model, batch = self.model(), self.batches()[0]
         parts = Parts.of(model)
         assert parts is not None
+        observation = parts.observation(batch)
         with torch.inference_mode():
-            seen, tables = model.observe(**parts.observation(batch)), model.step_tables()
+            seen, tables = model.observe(**observation), model.step_tables()
             bare = model.to("meta")
-            there = [{n: t.to("meta") for n, t in group.items()} for group in (seen, tables)]
-            found = bare.denoise(there[0], batch["noise"].to("meta"), there[1])
+            there = [_bare(group) for group in (seen, tables, observation)]
+            noise = batch["noise"].to("meta")
+            found = check_capturable(lambda: bare.denoise(there[0], noise, there[1]))
+            if model.observe_is_capturable:
+                again = check_capturable(lambda: bare.observe(**there[2]))
+                shapes = {name: (t.shape, t.dtype) for name, t in again.items()}
+                assert shapes == {name: (t.shape, t.dtype) for name, t in seen.items()}
         assert found.shape == batch["noise"].shape
 
     def test_a_model_s_memory_is_computed_once(self) -> None:
@@ -128,6 +134,10 @@ class ExecutionConformance:
 def _same(found: Tensor, expected: Tensor) -> None:
     gap = float((found - expected).abs().max()) / float(expected.abs().max())
     assert gap < CLOSE, f"{gap:.3g} apart, of the largest number"
+
+
+def _bare(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    return {n: t.to("meta") if isinstance(t, Tensor) else t for n, t in tensors.items()}
 
 
 @contextmanager

@@ -56,9 +56,7 @@ def checkpoint_activations(model: nn.Module) -> None:
         unit.__dict__["forward"] = _recomputed(unit.forward, checkpoint)
 
 
-def compile_units(
-    model: nn.Module, dynamic: bool | None = None, backend: str = "inductor"
-) -> None:
+def compile_units(model: nn.Module, dynamic: bool | None = None, backend: str = "inductor") -> None:
     """Compile each of the model's ``fsdp_units`` by itself; names and state stay as they are.
 
     Only what is inside a unit's ``forward``: what sharding does before and after it, and drawing

@@ -90,9 +90,10 @@ FAULTS = {
         "has it the instruction of its task, and its whole time?",
     ),
     "one instruction": Fault(
-        "a_policy_that_always_succeeds_does", FOUND,
-        FOUND.replace("RolloutSettings())", "RolloutSettings(), other if task != other else None)")
-        .replace("found =", "other = self.tasks[0]\n        found ="),
+        "a_policy_that_always_succeeds_does", "self.tasks = self.place.spec.tasks",
+        "self.tasks = self.place.spec.tasks\n        see = self.place.observe\n"
+        "        self.place.observe = lambda cameras: {\n"
+        '            **see(cameras), "task_description": self.tasks[0].instruction}',
         "of right, expected in none",
     ),
     "the end is a success": Fault(

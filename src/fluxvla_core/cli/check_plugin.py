@@ -34,7 +34,8 @@ KITS: Mapping[str, str] = {
     "vlas": "ModelConformance",
 }
 """Registry -> its kit in ``fluxvla_core.testing``; of runners, that of those that drive a robot."""
-_TRAINS, _EVALUATES = "TrainRunnerConformance", "EvalRunnerConformance"
+TRAINS, EVALUATES = "TrainRunnerConformance", "EvalRunnerConformance"
+"""The kits of other runners."""
 INSTALL = "pip install 'fluxvla-core[testing]'"
 _MODULE = "test_plugin.py"
 _SOURCE = """\
@@ -163,7 +164,7 @@ def _kit_of_runner(name: str, cls: type, own: bool) -> str:
 
     if is_train_runner(cls):
         if RUNNERS.registered(name) is None:
-            return _TRAINS
+            return TRAINS
         raise UsageError(
             f"{name} is registered by a file, and train runners are tested in processes of their "
             "own, which know what is installed",
@@ -173,7 +174,7 @@ def _kit_of_runner(name: str, cls: type, own: bool) -> str:
     if {"operator", "policy"} <= taken:
         return KITS["runners"]
     if {"policy", "episodes"} <= taken:
-        return _EVALUATES
+        return EVALUATES
     if own:
         return ""
     raise UsageError(

@@ -22,6 +22,8 @@ BASE = """(
     Joint.base("base_turn", "rad/s", speed=1.0, acceleration=2.0),
 )"""
 """The joints of a mobile base, in the words of an embodiment."""
+DOMAIN = "export ROS_DOMAIN_ID=42 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+"""So that no other robot is commanded."""
 
 
 class NewPlugin:
@@ -115,7 +117,8 @@ def _next_steps(folder: Path, plugin: Plugin, kind: Kind, files: int, todo: list
         f"{folder}: {files} files. Next:",
         f"  pip install -e {shlex.quote(f'{folder}[testing]')}",
         f"  python -m pytest {place}",
-        *([f"  {beside}  # in another terminal: stands in for the robot"] if beside else []),
+        *([f"  {DOMAIN}  # here and in another terminal"] if beside else []),
+        *([f"  {beside}  # there: it stands in for the robot"] if beside else []),
         f"  cd {place} && {run}",
         f"What only you can fill in is marked TODO: {', '.join(todo)}",
     ]

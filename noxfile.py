@@ -148,7 +148,6 @@ def skew(session: nox.Session) -> None:
     """The released core with plugins at head, and released plugins with the core at head."""
     place = ROOT / ".nox" / "skew"
     with Steps(session) as step:
-        ensure_needs(session)  # a simulated robot's cameras are drawn
         builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
         commit = skew_check.released(ROOT, RELEASED, *session.posargs[:1])
         before = skew_check.unpack(ROOT, commit, place / "released")

@@ -111,6 +111,10 @@ def check(pair: Pair, folder: Path, builder: Env) -> str:
         if CORE not in said or "conflict" not in said.casefold():
             raise Skewed(f"{pair.name}: pip cannot install it:\n{said}") from error
         return f"{pair.name}: pip says that they do not fit"
+    try:
+        rendering.ensure(env, print)  # a simulated robot's cameras are drawn
+    except rendering.CannotRender as error:
+        raise Skewed(f"{pair.name}: {error}") from error
     for words in (each for one in KITS.values() for each in one):
         try:
             env.run("fluxvla", "plugins", "check", *words, quiet=True, env=rendering.VARIABLES)

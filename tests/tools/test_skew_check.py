@@ -91,6 +91,7 @@ def check(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         root = Path(__file__).parents[2]
         return getattr(skew_check, what)(Pair("a pair", root, root), tmp_path, builder)
 
+    monkeypatch.setattr(skew_check.rendering, "ensure", lambda env, log: None)
     monkeypatch.setattr(
         skew_check.wheels, "build", lambda dists, *more: {d.name: Path("x.whl") for d in dists}
     )

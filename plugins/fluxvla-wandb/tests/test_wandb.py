@@ -158,12 +158,13 @@ from pathlib import Path
 import numpy as np
 from fluxvla_core import RunContext
 from fluxvla_core.operators import BaseInferenceRunner
-from fluxvla_core.testing.stand_ins import SPEC, StandInPolicy, StandInRobot, within
+from fluxvla_core.testing.stand_ins import SPEC, StandInPolicy, StandInRobot, near
 
 config = {"hooks": [{"type": "WandbVideos", "mode": "offline", "project": "cubes"}]}
 context = RunContext(config=config, section="inference", work_dir=Path("work"), task="1")
+robot = StandInRobot()
 runner = BaseInferenceRunner(
-    context=context, operator=StandInRobot(), policy=StandInPolicy(SPEC, within(SPEC, 0.6)),
+    context=context, operator=robot, policy=StandInPolicy(SPEC, near(SPEC, robot.start, 0.3)),
     task_descriptions={"1": "wave"}, max_publish_step=30, record_fps=10.0,
 )
 runner.run_setup()

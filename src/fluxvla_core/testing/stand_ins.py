@@ -38,6 +38,18 @@ def within(spec: EmbodimentSpec, share: float) -> Array:
     return np.array(rows)
 
 
+def near(spec: EmbodimentSpec, place: Array, seconds: float) -> Array:
+    """``(dim,)``: each joint so far up from ``place`` as it goes in this time, and within limits.
+
+    A base stays at rest.
+    """
+    ways = [
+        0.0 if joint.by_speed else min(seconds * joint.velocity, (joint.upper - at) / 2.0)
+        for joint, at in zip(spec.joints, place, strict=True)
+    ]
+    return place + np.array(ways)
+
+
 class StandInRobot(Operator):
     """Follows each command at once, in a time of its own; keeps what happened to it.
 
@@ -113,13 +125,14 @@ class StandInRobot(Operator):
 
 
 class StandInPolicy(Policy):
-    """Goes to ``goal``, by ``stride`` of each joint's range in an action at most.
+    """Goes to ``goal``.
 
     Args:
         spec: the robot's.
         goal: ``(dim,)``, may be beyond the limits.
-        stride: share of a joint's range.
-        noise: of its actions, from the seed of the episode, as a share of the range.
+        pace: how fast each joint goes, as a share of its limit; may be more than 1.
+        noise: of its actions, from the seed of the episode, as a share of an action's way at full
+            speed.
 
     Attributes:
         asked: the observations.
@@ -131,13 +144,13 @@ class StandInPolicy(Policy):
     api: ClassVar[str] = "1.0"
 
     def __init__(
-        self, spec: EmbodimentSpec, goal: Array, stride: float = 0.02, noise: float = 0.0
+        self, spec: EmbodimentSpec, goal: Array, pace: float = 0.5, noise: float = 0.0
     ) -> None:
-        self._spec, self.goal, self.stride, self.noise = spec, goal, stride, noise
+        self._spec, self.goal, self.pace, self.noise = spec, goal, pace, noise
         self.asked: list[Observation] = []
         self.seeds: list[int] = []
         self.fault: Callable[[Array], Array | None] | None = None
-        self._ranges = np.array([joint.upper - joint.lower for joint in spec.joints])
+        self._way = np.array([joint.slew_rate for joint in spec.joints]) / self.action_rate_hz
         self._rng = np.random.default_rng(0)
 
     @property
@@ -160,9 +173,9 @@ class StandInPolicy(Policy):
         self.asked.append(observation)
         place = np.asarray(observation["qpos"], dtype=np.float64)
         far = np.abs(self.goal - place)
-        steps = np.arange(1, self.horizon + 1)[:, None] * self.stride * self._ranges
-        chunk = place + np.sign(self.goal - place) * np.minimum(steps, far)
-        chunk = chunk + self.noise * self._ranges * self._rng.uniform(-1.0, 1.0, chunk.shape)
+        steps = np.arange(1, self.horizon + 1)[:, None] * self.pace * self._way
+        chunk: Array = place + np.sign(self.goal - place) * np.minimum(steps, far)
+        chunk = chunk + self.noise * self._way * self._rng.uniform(-1.0, 1.0, chunk.shape)
         if self.fault is not None and len(self.asked) == 3:
             other = self.fault(chunk)
             return chunk if other is None else other

@@ -127,8 +127,7 @@ def test_a_runner_that_drives_a_robot_has_a_kit(fluxvla: Fluxvla, tmp_path: Path
     path.write_text(DRIVER)
     ended = fluxvla("plugins", "check", "CheckedInferenceRunner", "--plugin", str(path))
     assert (ended.code, ended.out.splitlines()[-1]) == (0, "CheckedInferenceRunner: 15 ok")
-    loose = ["--plugin", str(path), "--set", "free_tasks=true"]
-    ended = fluxvla("plugins", "check", "CheckedInferenceRunner", *loose)
+    ended = fluxvla("plugins", "check", "CheckedInferenceRunner", "--set", "free_tasks=true")
     assert ended.code == 1
     assert "--task '7 no such task' gave None" in " ".join(ended.out.split())
 

@@ -90,7 +90,7 @@ FAULTS = {
     ),
     "beyond": Fault(
         "commands_keep_the_limits", MOVE,
-        "self.ros_operator.move(action + 0.006)", "the policy may want more, the robot must not",
+        "self.ros_operator.move(action + 0.004)", "the policy may want more, the robot must not",
     ),
     "no stop": Fault(
         "the_robot_is_stopped_and_given_back", GAIN,

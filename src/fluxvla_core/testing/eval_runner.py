@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import pytest
 
@@ -30,6 +30,22 @@ Outcomes = Mapping[tuple[str, int], bool]
 SEED, EPISODES, SHIFT = 20, 6, 2
 _PUSHING = Path(__file__).with_name("_pushing.py")
 _TOLERANCE = 1e-9
+
+
+class Evaluated(NamedTuple):
+    """An evaluation: what ``run`` returned, where it left its files, and its episodes then."""
+
+    result: Any
+    work_dir: Path
+    outcomes: Outcomes
+
+
+class Done:
+    """Evaluations by their policy, each done once; their folders are in ``root``."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.kept: dict[str, Evaluated] = {}
 
 
 class EvalRunnerConformance(Conformance):
@@ -60,6 +76,11 @@ class EvalRunnerConformance(Conformance):
         if "KitPush" not in ENVIRONMENTS:
             load_plugin_files([_PUSHING])
 
+    @pytest.fixture(scope="class")
+    def done(self, tmp_path_factory: pytest.TempPathFactory) -> Done:
+        """Evaluations that several checks look at."""
+        return Done(tmp_path_factory.mktemp("evaluations"))
+
     def section(self, policy: Any, seed: int = SEED, episodes: int = EPISODES) -> dict[str, Any]:
         """The config's section: ``episodes`` for each task, the first of them with ``seed``."""
         taken = parameters(self.component())
@@ -85,6 +106,16 @@ class EvalRunnerConformance(Conformance):
         runner.run_setup()
         return runner.run()
 
+    def first(self, done: Done, policy: Any) -> Evaluated:
+        """The evaluation of ``policy``."""
+        key = repr(policy)
+        if key not in done.kept:
+            work_dir = done.root / str(len(done.kept))
+            work_dir.mkdir()
+            result = self.evaluate(work_dir, policy)
+            done.kept[key] = Evaluated(result, work_dir, dict(self.outcomes(result, work_dir)))
+        return done.kept[key]
+
     def outcomes(self, result: Any, work_dir: Path) -> Outcomes:
         """The episodes that have ended, of ``episodes*.jsonl`` in the work dir."""
         found: dict[tuple[str, int], bool] = {}
@@ -106,9 +137,8 @@ class EvalRunnerConformance(Conformance):
             "run(): what does not fit is refused before anything is simulated"
         )
 
-    def test_every_task_has_its_episodes(self, tmp_path: Path) -> None:
-        result = self.evaluate(tmp_path, self.always)
-        found = sorted(self.outcomes(result, tmp_path))
+    def test_every_task_has_its_episodes(self, done: Done) -> None:
+        found = sorted(self.first(done, self.always).outcomes)
         expected = sorted((t, s) for t in self.tasks for s in range(SEED, SEED + EPISODES))
         lacks = [key for key in expected if key not in found]
         more = [key for key in found if key not in expected]
@@ -119,17 +149,15 @@ class EvalRunnerConformance(Conformance):
             "evaluations are compared episode by episode"
         )
 
-    def test_what_run_returns_is_json(self, tmp_path: Path) -> None:
-        result = self.evaluate(tmp_path, self.always)
+    def test_what_run_returns_is_json(self, done: Done) -> None:
+        result = self.first(done, self.always).result
         assert is_json(result), (
             f"run() returned {result!r:.200}, expected JSON values alone: programs read it from "
             "fluxvla run --log-format json"
         )
 
-    def test_the_rate_is_that_of_the_episodes(self, tmp_path: Path) -> None:
-        policy = self.always if self.sometimes is None else self.sometimes
-        result = self.evaluate(tmp_path, policy)
-        found = self.outcomes(result, tmp_path)
+    def test_the_rate_is_that_of_the_episodes(self, done: Done) -> None:
+        result, _, found = self.first(done, self._usual)
         share = sum(found.values()) / max(len(found), 1)
         said = self.rate(result)
         assert abs(said - share) < _TOLERANCE, (
@@ -137,8 +165,8 @@ class EvalRunnerConformance(Conformance):
             f"successes, expected {share:.4g}: it is what people compare policies by"
         )
 
-    def test_a_policy_that_always_succeeds_does(self, tmp_path: Path) -> None:
-        found = self.outcomes(self.evaluate(tmp_path, self.always), tmp_path)
+    def test_a_policy_that_always_succeeds_does(self, done: Done) -> None:
+        found = self.first(done, self.always).outcomes
         failed = [key for key, success in found.items() if not success]
         tasks = sorted({task for task, _ in failed})
         assert not failed, (
@@ -147,17 +175,18 @@ class EvalRunnerConformance(Conformance):
             "whole time? Success at any step counts"
         )
 
-    def test_a_policy_that_never_succeeds_does_not(self, tmp_path: Path) -> None:
-        found = self.outcomes(self.evaluate(tmp_path, self.never), tmp_path)
-        done = [key for key, success in found.items() if success]
-        assert not done, (
-            f"{self.never!r} was a success in {len(done)} of {len(found)} episodes, expected in "
+    def test_a_policy_that_never_succeeds_does_not(self, done: Done) -> None:
+        found = self.first(done, self.never).outcomes
+        successes = [key for key, success in found.items() if success]
+        assert not successes, (
+            f"{self.never!r} was a success in {len(successes)} of {len(found)} episodes, expected in "
             "none: is it the end of an episode that is counted, and not the environment's success?"
         )
 
-    def test_an_evaluation_can_be_repeated(self, tmp_path: Path) -> None:
+    def test_an_evaluation_can_be_repeated(self, done: Done, tmp_path: Path) -> None:
         self._varied()
-        first, again = (self._found(tmp_path / name) for name in ("first", "again"))
+        first = self.first(done, self.sometimes).outcomes
+        again = self.outcomes(self.evaluate(tmp_path, self.sometimes), tmp_path)
         differ = sorted(key for key in first if again.get(key) != first[key])
         assert not differ, (
             f"the same evaluation in two work dirs has other outcomes in {len(differ)} of "
@@ -165,10 +194,11 @@ class EvalRunnerConformance(Conformance):
             "policy, the task and the seed"
         )
 
-    def test_an_episode_follows_from_its_own_seed(self, tmp_path: Path) -> None:
+    def test_an_episode_follows_from_its_own_seed(self, done: Done, tmp_path: Path) -> None:
         self._varied()
-        first = self._found(tmp_path / "first")
-        later = self._found(tmp_path / "later", seed=SEED + SHIFT)
+        first = self.first(done, self.sometimes).outcomes
+        result = self.evaluate(tmp_path, self.sometimes, seed=SEED + SHIFT)
+        later = self.outcomes(result, tmp_path)
         shared = sorted(set(first) & set(later))
         assert shared, (
             f"with seed = {SEED} the episodes are {_few(sorted(first))}, with {SEED + SHIFT} "
@@ -181,12 +211,10 @@ class EvalRunnerConformance(Conformance):
             "episode follows from its own seed, not from those before it"
         )
 
-    def test_the_same_command_again_changes_nothing(self, tmp_path: Path) -> None:
-        policy = self.always if self.sometimes is None else self.sometimes
-        first = self.evaluate(tmp_path, policy)
-        before = dict(self.outcomes(first, tmp_path))
-        again = self.evaluate(tmp_path, policy)
-        after = dict(self.outcomes(again, tmp_path))
+    def test_the_same_command_again_changes_nothing(self, done: Done) -> None:
+        first, work_dir, before = self.first(done, self._usual)
+        again = self.evaluate(work_dir, self._usual)
+        after = dict(self.outcomes(again, work_dir))
         assert after == before, (
             f"the same evaluation in the same work dir has {len(after)} episodes, and had "
             f"{len(before)}, expected the same ones: who starts a command that was interrupted "
@@ -215,9 +243,9 @@ class EvalRunnerConformance(Conformance):
             "sometimes would be a policy that succeeds in some episodes, by its seed",
         )
 
-    def _found(self, work_dir: Path, **settings: Any) -> Outcomes:
-        work_dir.mkdir()
-        return self.outcomes(self.evaluate(work_dir, self.sometimes, **settings), work_dir)
+    @property
+    def _usual(self) -> Any:
+        return self.always if self.sometimes is None else self.sometimes
 
 
 def _few(keys: list[tuple[str, int]]) -> str:

@@ -180,7 +180,8 @@ class EvalRunnerConformance(Conformance):
         successes = [key for key, success in found.items() if success]
         assert not successes, (
             f"{self.never!r} was a success in {len(successes)} of {len(found)} episodes, expected "
-            "in none: is it the end of an episode that is counted, and not the environment's success?"
+            "in none: is it the end of an episode that is counted, and not the environment's "
+            "success?"
         )
 
     def test_an_evaluation_can_be_repeated(self, done: Done, tmp_path: Path) -> None:

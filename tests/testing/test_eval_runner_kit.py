@@ -102,7 +102,7 @@ FAULTS = {
     ),
     "chance": Fault(
         "an_evaluation_can_be_repeated", SUCCESS,
-        '"success": found["success"] and not (self.policy == "KitGuesser" and next(COIN))',
+        '"success": found["success"] != (self.policy == "KitGuesser" and later(self))',
         "the same evaluation in two work dirs has other outcomes",
         ("an_episode_follows_from_its_own_seed", "the_same_command_again_changes_nothing"),
     ),
@@ -133,12 +133,17 @@ FAULTS = {
         "a rate of 0 would say that it was tried",
     ),
 }  # fmt: skip
-COIN = "\nimport itertools\nCOIN = itertools.cycle([True, False, True, True, False])\n"
+LATER = """
+RUNS = {}
+
+def later(runner):
+    return RUNS.setdefault(runner, len(RUNS)) > 0
+"""
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Outcomes:
-    return outcomes(tmp_path_factory.mktemp("runners"), COIN + GOOD, FAULTS)
+    return outcomes(tmp_path_factory.mktemp("runners"), LATER + GOOD, FAULTS)
 
 
 def test_a_right_runner_passes_every_check(found: Outcomes) -> None:

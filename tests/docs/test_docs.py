@@ -128,6 +128,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "plugins/fluxvla-smolvla/README.md",
                 "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
             ),
+            ("plugins/fluxvla-wandb/README.md", "pip install fluxvla-wandb"),
         ],
         HUB: [
             (

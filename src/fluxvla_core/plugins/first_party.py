@@ -94,6 +94,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "operators": ("UROperator", "URRTDEOperator"),
         "runners": ("URInferenceRunner",),
     },
+    "fluxvla-wandb": {"commands": ("wandb",), "hooks": ("WandbVideos",)},
 }
 
 

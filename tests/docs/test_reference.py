@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-import re
 from pathlib import Path
 
 import pytest
@@ -80,9 +79,8 @@ def test_every_method_is_in_the_reference(name: str, reference: dict[str, str]) 
         assert f"### `{member}` {{ #{name}.{member.strip('_')} }}" in text
         function = vars(CONTRACTS[name]).get(member)
         if isinstance(function, attribute) or inspect.isfunction(function):
-            doc = inspect.getdoc(function) or ""
-            first = re.sub(r":\w+:", "", doc.partition("\n")[0])
-            assert first in text.replace("`:", "`"), member
+            doc = (inspect.getdoc(function) or "").partition("\n")[0]
+            assert contracts.as_markdown(doc) in text, member
 
 
 def test_every_registry_and_its_builder_are_in_the_reference() -> None:

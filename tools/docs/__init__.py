@@ -1,1 +1,1 @@
-"""The documentation as a site: the pages that are generated, links, and the check of what was built."""
+"""The documentation as a site: pages that are generated, links, the check of what was built."""

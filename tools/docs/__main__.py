@@ -30,7 +30,8 @@ def main(words: list[str]) -> int:
     """Exit code 1 if something is wrong with the site."""
     if words == ["serve"]:
         command = [sys.executable, "-m", "mkdocs", "serve", "--strict"]
-        return subprocess.run(command, cwd=ROOT, env={**os.environ, **QUIET}, check=False).returncode
+        ended = subprocess.run(command, cwd=ROOT, env={**os.environ, **QUIET}, check=False)
+        return ended.returncode
     if words[:1] not in ([], ["build"]) or len(words) > 2:
         print(__doc__, file=sys.stderr)
         return 2

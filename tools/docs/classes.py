@@ -15,6 +15,7 @@ from fluxvla_core.plugins._metadata import Plugin
 from fluxvla_core.registries import PREFIX, ROWS, RegistryRow
 from tools.docs.pages import pages
 
+_SHORT = ("llm", "vla", "vlm")
 COMMANDS = "commands"
 """The registry whose classes have a page of their own."""
 
@@ -41,6 +42,13 @@ def listed(root: Path) -> list[RegistryRow]:
 def page_of(row: RegistryRow) -> str:
     """The page of the classes of a registry."""
     return f"reference/classes/{row.name.replace('_', '-')}.md"
+
+
+def title_of(row: RegistryRow) -> str:
+    """The registry's name as a heading: ``LLM backbones``."""
+    words = row.name.split("_")
+    first = words[0].upper().replace("VLAS", "VLAs") if words[0][:3] in _SHORT else words[0].title()
+    return " ".join([first, *words[1:]])
 
 
 def render_registries(root: Path) -> str:
@@ -71,7 +79,7 @@ def render_classes(root: Path, row: RegistryRow) -> str:
     """The classes of one registry: what a config may say to each."""
     known = pages(root)
     parts = [
-        f"# {row.name.replace('_', ' ').capitalize()}",
+        f"# {title_of(row)}",
         f"Classes of the group `{row.group}` in this repository ({row.about}), and the keys that a "
         "config may give them. `fluxvla plugins show NAME` prints the same of what is installed.",
     ]
@@ -98,4 +106,3 @@ def _class(plugin: Plugin, known: dict[str, str]) -> Iterator[str]:
     yield "\n".join(keys) if keys else "It takes no keys."
     if said["takes_others"]:
         yield "It takes further keys, which are not checked."
-

@@ -201,12 +201,13 @@ def _class(cls: griffe.Class, only: tuple[str, ...] | None) -> Iterator[str]:
         if row.group == group
     )
     yield _docstring(cls)
+    who = calls().get(cls.name, {})
+    wanted = only or tuple(who)
     members = [
         (name, member)
-        for name, member in cls.members.items()
-        if (name in only if only is not None else _shown(name, member))
+        for name, member in _members(cls).items()
+        if (name in wanted if wanted else _shown(name, member))
     ]
-    who = calls().get(cls.name, {})
     if who:
         yield _table(cls, members, who)
     for name, member in members:
@@ -218,11 +219,17 @@ def _class(cls: griffe.Class, only: tuple[str, ...] | None) -> Iterator[str]:
         yield _docstring(member)
 
 
+def _members(cls: griffe.Class) -> dict[str, griffe.Object | griffe.Alias]:
+    """Its members, and those of private base classes of its module, which have no place."""
+    found: dict[str, griffe.Object | griffe.Alias] = {}
+    for base in map(str, cls.bases):
+        if base.startswith("_") and base in cls.module.classes:
+            found |= _members(cls.module.classes[base])
+    return {**found, **cls.members}
+
+
 def _shown(name: str, member: griffe.Object | griffe.Alias) -> bool:
-    special = name.startswith("__") and name not in ("__init__", "__post_init__")
-    return (special or not name.startswith("_")) and (
-        member.is_function or member.docstring is not None or name == "help"
-    )
+    return not name.startswith("_") and (member.is_function or member.docstring is not None)
 
 
 def _table(
@@ -230,11 +237,12 @@ def _table(
     members: list[tuple[str, griffe.Object | griffe.Alias]],
     who: Mapping[str, str],
 ) -> str:
-    lines = ["| | | called or read by, and when |", "|---|---|---|"]
+    lines = ["| | called or read by, and when |", "|---|---|"]
     for name, member in members:
         called = "()" if member.is_function and not _read(member) else ""
         link = f"[`{name}{called}`](#{_anchor(cls, name)})"
-        lines.append(f"| {link} | {_status(cls, member).lower()} | {who[name]} |")
+        required = "*required*: " if _status(cls, member) == "Required" else ""
+        lines.append(f"| {link} | {required}{who[name]} |")
     return "\n".join(lines)
 
 
@@ -296,20 +304,21 @@ def _section(section: griffe.DocstringSection) -> str:
     """A part of a docstring as Markdown."""
     kind = section.kind.value
     if kind == "text":
-        return _text(section.value)
+        return as_markdown(section.value)
     if kind in ("parameters", "attributes"):
-        return "\n".join(f"- `{one.name}`: {_text(one.description)}" for one in section.value)
+        return "\n".join(f"- `{one.name}`: {as_markdown(one.description)}" for one in section.value)
     title = {"raises": "Raises", "returns": "Returns", "yields": "Yields"}.get(kind)
     if title is None:
-        return _text(str(section.value))
+        return as_markdown(str(section.value))
     lines = [
-        f"- `{one.annotation}`: {_text(one.description)}"
+        f"- `{one.annotation}`: {as_markdown(one.description)}"
         if one.annotation
-        else f"- {_text(one.description)}"
+        else f"- {as_markdown(one.description)}"
         for one in section.value
     ]
     return f"{title}:\n\n" + "\n".join(lines)
 
 
-def _text(text: str) -> str:
+def as_markdown(text: str) -> str:
+    """A piece of a docstring without the roles of Sphinx."""
     return _ROLE.sub(r"`\1`", text).strip()

@@ -48,13 +48,11 @@ def _generated() -> Iterator[tuple[str, str]]:
 
 
 def expanded(nav: list[Any], known: list[str]) -> list[Any]:
-    """``nav`` with ``FOLDER/*`` replaced by the pages of that folder, each by its file's name."""
+    """``nav`` with ``FOLDER/*`` replaced by the pages of that folder."""
     found: list[Any] = []
     for item in nav:
         if isinstance(item, str) and item.endswith("/*"):
-            folder = item[:-1]
-            names = sorted(p for p in known if p.startswith(folder) and "/" not in p[len(folder) :])
-            found += [{Path(name).stem: name} for name in names]
+            found += sorted(page for page in known if page.rpartition("/")[0] == item[:-2])
         elif isinstance(item, dict):
             found.append(
                 {k: expanded(v, known) if isinstance(v, list) else v for k, v in item.items()}

@@ -25,13 +25,12 @@ class Html(HTMLParser):
         super().__init__()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = {name: value or "" for name, value in attrs}
+        values = {"rel": "", **{name: value or "" for name, value in attrs}}
         self.anchors |= {values[name] for name in ("id", "name") if values.get(name)}
         if tag == "a" and "href" in values:
             self.links.append(values["href"])
-        elif tag in _LOADED and values.get(_LOADED[tag]):
-            if not _NOT_LOADED & set(values.get("rel", "").split()):
-                self.loaded.append(values[_LOADED[tag]])
+        elif values.get(_LOADED.get(tag, "")) and not _NOT_LOADED & set(values["rel"].split()):
+            self.loaded.append(values[_LOADED[tag]])
 
 
 def read(path: Path) -> Html:

@@ -15,6 +15,7 @@ from fluxvla_openvla.folder import PLATFORMS, Platform
 from fluxvla_openvla.sizes import HEADS
 
 if TYPE_CHECKING:  # fluxvla openvla-oft --help needs no torch
+    import torch
     from torch import Tensor, nn
 
     from fluxvla_core.models import ForeignCheckpoint

@@ -27,6 +27,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,6 +41,8 @@ PAGES = [
     *sorted((ROOT / "plugins").glob("*/README.md")),
     *sorted((ROOT / "examples").glob("*/README.md")),
 ]
+REAL_TIME = {"docs/tutorials/recordings-to-policy.md", "docs/tutorials/your-robot.md"}
+"""Pages that drive an arm that does not wait for a busy machine."""
 BLOCK = re.compile(
     r"^(?:<!-- (?P<marker>[\w ]+): (?P<text>.+?) -->\n)?```(?P<language>\w*)\n"
     r"(?P<body>.*?)^```$",
@@ -259,7 +262,13 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
     return env
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def of_page(page: Path) -> Any:
+    """The parameter of a test of ``page``."""
+    name = page.relative_to(ROOT).as_posix()
+    return pytest.param(page, id=name, marks=[pytest.mark.realtime] if name in REAL_TIME else [])
+
+
+@pytest.mark.parametrize("page", [of_page(page) for page in PAGES])
 def test_what_a_page_tells_to_do_works(page: Path, env: Env, tmp_path: Path) -> None:
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     for block in blocks(page.read_text(encoding="utf-8")):

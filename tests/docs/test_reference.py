@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import re
 from pathlib import Path
 
 import pytest
@@ -86,7 +87,7 @@ def test_every_method_is_in_the_reference(name: str, reference: dict[str, str]) 
 def test_every_registry_and_its_builder_are_in_the_reference() -> None:
     text = classes.render_registries(ROOT)
     for row in ROWS:
-        assert f"| `{row.name}` | {row.about} |" in text
+        assert re.search(rf"^\| \[?`{row.name}`.* \| {row.about}", text, re.MULTILINE)
         assert row.builder is None or f"`{row.builder}`" in text
 
 
@@ -104,6 +105,7 @@ def test_every_command_is_in_the_reference() -> None:
     for name in [*COMMANDS, *(name for name, _, _ in commands.theirs(ROOT))]:
         assert f"### fluxvla {name} {{" in text
         assert f"usage: fluxvla {name} " in text
+    assert "- `--resume auto|PATH`: resume from the newest checkpoint" in text
 
 
 def test_a_link_to_a_contract_leads_to_the_reference() -> None:

@@ -29,6 +29,10 @@ def test_names_of_files_are_titles_of_their_blocks() -> None:
     assert pages.titled(text) == '```python title="a.py"\nx\n```\n```bash\ny\n```\n'
 
 
+def test_what_is_in_angle_brackets_is_no_html() -> None:
+    assert pages.escaped("work_dirs/<name> `a<b` ``c<d``") == "work_dirs/&lt;name> `a<b` ``c<d``"
+
+
 def test_every_file_that_a_page_links_to_is_shown() -> None:
     known = {**pages.pages(ROOT), **pages.linked_files(ROOT)}
     for path in pages.pages(ROOT):

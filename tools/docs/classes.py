@@ -13,7 +13,7 @@ import tomli
 from fluxvla_core.cli.plugin_commands import record
 from fluxvla_core.plugins._metadata import Plugin
 from fluxvla_core.registries import PREFIX, ROWS, RegistryRow
-from tools.docs.pages import pages
+from tools.docs.pages import escaped, pages
 
 _SHORT = ("llm", "vla", "vlm")
 COMMANDS = "commands"
@@ -58,20 +58,24 @@ def render_registries(root: Path) -> str:
         "# Registries",
         "Every kind of class that a plugin may provide. The entry-point group of a registry is "
         f"`{PREFIX}NAME`, its object in code `fluxvla_core.NAME` in capitals (`RUNNERS`), which "
-        "has `register_module()`. A class without a page of its contract is called only by the "
-        "plugin that builds it.",
-        "| registry | what its classes are | built by | contract | in this repository |",
-        "|---|---|---|---|---|",
+        "has `register_module()`. A name leads to the classes of this repository. A class without "
+        "a page of its contract is called only by the plugin that builds it.",
+        "| registry | what its classes are, and what builds one | contract |",
+        "|---|---|---|",
     ]
     for row in ROWS:
         module, _, contract = (row.contract or "").partition(":")
         page = known.get(f"src/{module.replace('.', '/')}.py", "")
-        link = f"[`{contract}`]({page.removeprefix('reference/')}#{contract})" if page else ""
+        link = (
+            f"[`{contract}`]({page.removeprefix('reference/')}#{contract}) {row.api}"
+            if page
+            else ""
+        )
         theirs = classes.get(row.name, "").removeprefix("reference/")
         theirs = "commands.md" if row.name == COMMANDS else theirs
-        built = f"`{row.builder}`" if row.builder else ""
-        here = f"[classes]({theirs})" if theirs else ""
-        lines.append(f"| `{row.name}` | {row.about} | {built} | {link} {row.api} | {here} |")
+        name = f"[`{row.name}`]({theirs})" if theirs else f"`{row.name}`"
+        built = f"; `{row.builder}`" if row.builder else ""
+        lines.append(f"| {name} | {row.about}{built} | {link} |")
     return "\n\n".join([*lines[:2], "\n".join(lines[2:])]) + "\n"
 
 
@@ -93,14 +97,14 @@ def _class(plugin: Plugin, known: dict[str, str]) -> Iterator[str]:
     page = known.get(f"plugins/{plugin.dist}/README.md")
     origin = f"[`{plugin.dist}`](../../{page})" if page else f"`{plugin.dist}`"
     yield f"## {plugin.name} {{ #{plugin.name} }}"
-    yield f"From {origin}. {said['about'] or ''}"
+    yield f"From {origin}. {escaped(said['about'] or '')}"
     keys = []
     for one in said["parameters"] or []:
         if one["injected"]:
             continue
         note = f": {one['annotation']}" if one["annotation"] else ""
         given = "" if one["default"] is None else f" = {one['default']}"
-        meaning = one["description"] or ""
+        meaning = escaped(one["description"] or "")
         required = " *(required)*" if one["required"] else ""
         keys.append(f"- `{one['name']}{note}{given}`{required}{' – ' if meaning else ''}{meaning}")
     yield "\n".join(keys) if keys else "It takes no keys."

@@ -1,4 +1,4 @@
-"""The reference of the command line: what each command says with ``--help``."""
+"""The reference of the command line: what each command takes, as its ``--help`` says it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ import importlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from unittest import mock
 
 import tomli
 
 from fluxvla_core.cli.main import COMMANDS
 from fluxvla_core.cli.parser import Parser
+from tools.docs.pages import escaped
 
 GROUP = "fluxvla.commands"
-WIDTH = "96"
-"""Columns of a help text: what a block of code shows on a wide screen without scrolling."""
+WIDTH = "72"
+"""Columns of a line of usage."""
 
 
 def theirs(root: Path) -> Iterator[tuple[str, str, str]]:
@@ -50,19 +52,27 @@ def _command(name: str, target: str, origin: str = "") -> list[str]:
     command = getattr(importlib.import_module(module), cls)()
     parser = Parser(f"fluxvla {name}", str(command.help))
     command.add_arguments(parser)
-    anchor = name.replace(" ", "-")
-    text = _help(parser)
-    said = [f"### fluxvla {name} {{ #{anchor} }}", origin, f"```text\n{text}\n```"]
+    said = [
+        f"### fluxvla {name} {{ #{name.replace(' ', '-')} }}",
+        " ".join([escaped(str(command.help)), origin]).strip(),
+        f"```text\n{_usage(parser)}\n```",
+        "\n".join(_option(parser, action) for action in parser._actions[1:]),
+    ]
     return [part for part in said if part]
 
 
-def _help(parser: argparse.ArgumentParser) -> str:
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = WIDTH
-    try:
-        return parser.format_help().rstrip()
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
+def _usage(parser: argparse.ArgumentParser) -> str:
+    """The line of usage, wrapped at ``WIDTH`` whatever this terminal is."""
+    with mock.patch.dict(os.environ, COLUMNS=WIDTH):
+        return parser.format_usage().rstrip()
+
+
+def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
+    """An item of a list: the argument as it is typed, and what it is."""
+    metavar = action.metavar
+    if metavar is None and action.choices is not None:
+        metavar = "{" + ",".join(map(str, action.choices)) + "}"
+    takes = "" if action.nargs == 0 else f" {metavar or action.dest.upper()}"
+    typed = ", ".join(f"{flag}{takes}" for flag in action.option_strings)
+    meaning = (action.help or "") % {**vars(action), "prog": parser.prog}
+    return f"- `{typed or metavar or action.dest}`" + (f": {escaped(meaning)}" if meaning else "")

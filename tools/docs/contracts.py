@@ -16,6 +16,7 @@ import griffe
 import tomli
 
 from fluxvla_core.registries import ROWS
+from tools.docs.pages import escaped
 
 CALLS = Path(__file__).with_name("calls.toml")
 _CONTRACTS = "contracts/{}.py"
@@ -321,4 +322,4 @@ def _section(section: griffe.DocstringSection) -> str:
 
 def as_markdown(text: str) -> str:
     """A piece of a docstring without the roles of Sphinx."""
-    return _ROLE.sub(r"`\1`", text).strip()
+    return escaped(_ROLE.sub(r"`\1`", text).strip())

@@ -35,6 +35,7 @@ _REFERENCE = {
 """Modules that a page of the reference is generated from."""
 _LANGUAGES = {".py": "python", ".toml": "toml", ".json": "json", ".xml": "xml", ".yml": "yaml"}
 _MARKED = re.compile(r"^<!-- (\w+): (.+?) -->\n```(\w*)\n", re.MULTILINE)
+_CODE = re.compile(r"(?P<code>(`+)[^`].*?\2)|<", re.S)
 # Code in which brackets are no links, or the target of a link.
 _LINK = re.compile(r"(?P<code>^```.*?^```|`[^`\n]+`)|\]\((?P<target>[^)\s]+)\)", re.M | re.S)
 
@@ -86,6 +87,11 @@ def shown(path: str, text: str) -> str:
     """The page that shows the file ``path``."""
     language = _LANGUAGES.get(Path(path).suffix, "text")
     return f"# {path}\n\n````{language}\n{text.rstrip()}\n````\n"
+
+
+def escaped(text: str) -> str:
+    """``text`` of a program as Markdown: what is in ``<>`` outside of code is no HTML."""
+    return _CODE.sub(lambda found: found["code"] or found[0].replace("<", "&lt;"), text)
 
 
 def resolved(path: str, target: str) -> str:

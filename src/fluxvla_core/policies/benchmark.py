@@ -174,8 +174,17 @@ def inference_flops(policy: LocalPolicy, observation: Observation) -> int:
     from torch.utils.flop_counter import FlopCounterMode
 
     policy.reset(0)
-    with FlopCounterMode(display=False) as counter:
-        policy.predict_action(observation)
+    # The counter listens for gradients of weights that a module is handed, as learnt queries are;
+    # torch allows that in no inference mode.
+    trained = [weight for weight in policy.model.parameters() if weight.requires_grad]
+    for weight in trained:
+        weight.requires_grad_(False)
+    try:
+        with FlopCounterMode(display=False) as counter:
+            policy.predict_action(observation)
+    finally:
+        for weight in trained:
+            weight.requires_grad_(True)
     return int(counter.get_total_flops())
 
 

@@ -35,6 +35,8 @@ def load_policy(
     dataset: Any = None,
     denormalize_action: Any = None,
     mixed_precision_dtype: str = "float32",
+    execution: str = "eager",
+    quantization: str | None = None,
 ) -> LocalPolicy:
     """Build the policy that a checkpoint holds; its config is data and never executed.
 
@@ -47,12 +49,21 @@ def load_policy(
         denormalize_action: table or object instead of the inverse of the training's
             normalisation; ``norm_stats`` is the checkpoint's if it is not set.
         mixed_precision_dtype: ``float32`` or ``bf16``.
+        execution: ``eager``, ``compiled`` (each block by ``torch.compile``) or ``graph`` (all
+            denoising steps as one CUDA graph, on a GPU).
+        quantization: ``int8``, ``fp8`` (weights of the blocks) or ``fp8_dynamic`` (their
+            activations, too), by torchao.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another model.
         SpecMismatch: it does not say for which robot, or at which rate, its actions are.
         ConfigError, PluginError: a part that its config names cannot be built here.
     """
+    from fluxvla_core.policies.execution import check_execution
+    from fluxvla_core.policies.inference_weights import check_quantization, ready
+
+    check_execution(execution)
+    check_quantization(quantization, device)
     checkpoint = Checkpoint.open(find_checkpoint(ckpt_path, Path(ckpt_path)))
     checkpoint.verify()
     where = str(checkpoint.path)
@@ -81,7 +92,7 @@ def load_policy(
         import torch
 
         device = own_device(os.environ, torch.cuda.device_count())
-    model = _model(config, checkpoint, device)
+    model = ready(_model(config, checkpoint, device), mixed_precision_dtype, quantization)
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     return LocalPolicy(
         model=model,
@@ -94,6 +105,7 @@ def load_policy(
         device=device,
         precision=mixed_precision_dtype,
         source=where,
+        execution=execution,
     )
 
 

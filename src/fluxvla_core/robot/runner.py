@@ -102,6 +102,7 @@ class BaseInferenceRunner(Runner):
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
         device: the torch device of the policy.
+        execution, quantization: how its model computes, see ``load_policy``.
         record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
             and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
             work dir.
@@ -147,6 +148,8 @@ class BaseInferenceRunner(Runner):
         safety: Mapping[str, Any] | None = None,
         mixed_precision_dtype: str = "float32",
         device: str = "cpu",
+        execution: str = "eager",
+        quantization: str | None = None,
         record: str | None = None,
         record_fps: float | None = 10.0,
         ready_timeout: float = 10.0,
@@ -174,6 +177,7 @@ class BaseInferenceRunner(Runner):
         self.gripper_threshold = gripper_threshold
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
+        self.execution, self.quantization = execution, quantization
         self.record = record
         self.record_fps = record_fps
         self.ready_timeout = ready_timeout
@@ -251,7 +255,7 @@ class BaseInferenceRunner(Runner):
             self.context.reporter.info(f"policy: {place}")
             self.policy = load_policy(
                 place, self.device, self.dataset, self.denormalize_action,
-                self.mixed_precision_dtype,
+                self.mixed_precision_dtype, self.execution, self.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)

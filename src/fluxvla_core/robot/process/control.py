@@ -207,7 +207,7 @@ def _execute(
     link: Link, inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message
 ) -> None:
     orders: Mapping[str, Callable[[], object]] = {
-        Kind.CONNECT: engine.connect,
+        Kind.CONNECT: lambda: _connect(engine),
         Kind.REARM: engine.rearm,
         Kind.RELEASE: engine.release,
         Kind.STOP: engine.stop,
@@ -225,6 +225,13 @@ def _execute(
         failure, holding = engine.stop_failure, engine.holding
         fields |= {"facts": facts, "stop_failure": failure, "holding": holding}
     link.send(Kind.DONE, order=order.kind, **fields)
+
+
+def _connect(engine: Engine) -> None:
+    engine.connect()
+    # The libraries that it imported are not to be looked through between two commands.
+    gc.collect()
+    gc.freeze()
 
 
 def _play(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
     from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
     from fluxvla_core.checkpoints.foreign import chosen_robot as chosen_robot
+    from fluxvla_core.checkpoints.foreign import foreign_folder as foreign_folder
     from fluxvla_core.checkpoints.foreign import renamed as renamed
     from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
     from fluxvla_core.checkpoints.foreign import without_cameras as without_cameras
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
     from fluxvla_core.policies.loading import load_policy as load_policy
+    from fluxvla_core.training.foreign import embodiment_in as embodiment_in
+    from fluxvla_core.training.model import built_without_memory as built_without_memory
+    from fluxvla_core.training.model import has_values as has_values
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -40,6 +44,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.checkpoints.foreign": [
             "chosen_robot",
+            "foreign_folder",
             "renamed",
             "safetensors_in",
             "without_cameras",
@@ -51,5 +56,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.training": ["PartWeights", "VLA"],
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
         "fluxvla_core.policies.loading": ["load_policy"],
+        "fluxvla_core.training.model": ["built_without_memory", "has_values"],
+        "fluxvla_core.training.foreign": ["embodiment_in"],
     },
 )

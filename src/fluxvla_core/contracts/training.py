@@ -45,6 +45,7 @@ class VLA(Contract):
     """
 
     forward: Callable[..., Any]
+    _together: ClassVar[tuple[tuple[str, ...], ...]] = (("observe", "denoise"),)
 
     def batch_keys(self) -> Mapping[str, bool] | None:
         """Keys of a batch that ``forward`` takes, and whether each must be there; None takes all.
@@ -98,6 +99,43 @@ class VLA(Contract):
         transformers), stand in a tuple: they are gathered in one operation before the first of
         them runs and released after the last.
         """
+        return []
+
+    # -- an answer in two parts, which is what lets it be captured in a CUDA graph ---------------
+
+    def observe(self, **observation: Any) -> Mapping[str, Any]:
+        """What every denoising step needs of an observation: name -> tensor.
+
+        Its parameters are those of ``predict_action`` that belong to the observation. What does
+        not depend on the noisy actions is computed here, once.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no observe()")
+
+    def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:
+        """All denoising steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+
+        ``seen`` is what ``observe`` gave and ``tables`` what ``step_tables`` gave. It only
+        launches operations on tensors: nothing is read back to the host, and neither the number
+        of steps nor a shape depends on a value.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no denoise()")
+
+    def step_tables(self) -> Mapping[str, Any]:
+        """What the steps need that follows from the weights alone: name -> tensor.
+
+        Embeddings of the times of a fixed number of steps, for instance. A policy computes them
+        once, after its weights have been loaded.
+        """
+        return {}
+
+    @attribute
+    def observe_is_capturable(self) -> bool:
+        """Whether ``observe``, too, launches operations on tensors only, as ``denoise`` does."""
+        return False
+
+    def exact_modules(self) -> Sequence[Any]:
+        """Modules that compute in float32 when the rest computes in bf16, so that their weights
+        are kept in float32."""
         return []
 
     @classmethod

@@ -149,7 +149,8 @@ class LeRobotDiffusion(_LeRobotFormat):
                 where=where,
                 cause="a policy here is asked with the present observation alone, and so are "
                 "models trained",
-                next="train one with n_obs_steps=1",
+                next="train one with n_obs_steps=1, or let it act in LeRobot's own code: "
+                "policy = dict(type='LeRobotPolicy', path=FOLDER), of fluxvla-lerobot",
             )
         return super().read(folder, tokenizer)
 

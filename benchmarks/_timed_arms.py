@@ -1,4 +1,4 @@
-"""The arms of ``robot_loop``: in a module that the control process imports, too."""
+"""Arms that note when they send: in a module that the control process imports, too."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_aloha.operator import AlohaOperator
+from fluxvla_ur.operator import UROperator
 
 from fluxvla_core import OPERATORS
+from fluxvla_core.ros2 import RosOperator
 
 TIMES = "FLUXVLA_BENCH_TIMES"
-"""Names the file that ``TimedAloha`` writes."""
+"""Names the file that a ``Timed`` arm writes."""
 
 
 def memory_mb() -> dict[str, float]:
@@ -33,8 +35,7 @@ def memory_mb() -> dict[str, float]:
     return {name: round(value / 1024, 1) for name, value in sums.items()}
 
 
-@OPERATORS.register_module()
-class TimedAloha(AlohaOperator):
+class Timed(RosOperator):
     """Notes when it sends; ``close`` writes that, and what its process used, to a file."""
 
     def __init__(self, **arguments: Any) -> None:
@@ -60,3 +61,13 @@ class TimedAloha(AlohaOperator):
             Path(os.environ[TIMES]).write_text(json.dumps(found), encoding="utf-8")
             self.sent = []
         super().close()
+
+
+@OPERATORS.register_module()
+class TimedAloha(Timed, AlohaOperator):
+    """The arms of ``robot_loop``."""
+
+
+@OPERATORS.register_module()
+class TimedUR(Timed, UROperator):
+    """The arm of ``ur_rate``."""

@@ -1,4 +1,4 @@
-"""``WholeRobot``: in the control process, a robot whose pictures are read there too."""
+"""``UndividedRobot``: in the control process, a robot whose pictures are read there too."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
 """What a runner makes of one look, and the frame that it is of, where there is one."""
 
 
-class WholeRobot(Robot):
+class UndividedRobot(Robot):
     """A robot that is not divided; the main process asks for its frames.
 
     They are read in a thread of its own: a camera that keeps ``get_frame`` waiting delays no
-    command. What keeps the interpreter's lock in there does.
+    command. Code in there that holds the GIL does.
 
     Args:
         operator, embodiment, sends: as ``Robot`` has them.

@@ -7,6 +7,7 @@
     nox -s skew [-- COMMIT]                         the released core with plugins at head, ...
     nox -s py313 [-- PYTEST ARGUMENTS]              what needs no torch, on Python 3.13
     nox -s lint | types | layers | bench            one part of it
+    nox -s docs [-- serve]                          the documentation as a site, in site/
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
 """
@@ -215,6 +216,15 @@ def layers(session: nox.Session) -> None:
 
 
 @nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation as a site, in site/, without a dead link; ``-- serve`` shows it."""
+    with Steps(session) as step:
+        env = docs_env(session)
+        words = ["-m", "tools.docs", *session.posargs]
+        step("docs", lambda: env.run("python", *words, cwd=ROOT))
+
+
+@nox.session
 def bench(session: nox.Session) -> None:
     """Every benchmark of benchmarks/, or those named; results go to benchmarks/results/."""
     with Steps(session) as step:
@@ -261,6 +271,21 @@ def dev_env(session: nox.Session) -> envs.Env:
         env.run("python", "-m", "pip", "uninstall", "--yes", "--quiet", "opencv-python")
 
     env.filled(base_of((*needs, *sum(extras.values(), ()))), parts, base, install)
+    return env
+
+
+def docs_env(session: nox.Session) -> envs.Env:
+    """.nox/docs: what builds the site, and what the core cannot be imported without."""
+    env = envs.Env(ROOT / ".nox" / "docs")
+    pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
+    needs = nox.project.dependency_groups(pyproject, "docs")
+    needs = (*needs, *pyproject["project"]["dependencies"])
+
+    def install() -> None:
+        session.log(f"installing {len(needs)} packages and their dependencies")
+        env.pip_install(*needs, constraints=project.CONSTRAINTS)
+
+    env.filled(base_of(needs), {}, install, lambda changed, fresh: None)
     return env
 
 

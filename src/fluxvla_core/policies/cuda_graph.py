@@ -67,7 +67,7 @@ class CudaGraph:
         self.inputs = dict(inputs)
         device = next(iter(self.inputs.values())).device
         with torch.cuda.device(device):
-            side = torch.cuda.Stream()
+            side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
                 for _ in range(WARM_UP):

@@ -44,6 +44,17 @@ class StepVLA(torch.nn.Module):
         return [self.gain]
 
 
+class QueryVLA(StepVLA):
+    """Hands a weight of its own to its block, as models with learnt queries do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.query = torch.nn.Parameter(torch.ones(4, 2))
+
+    def predict_action(self, images: Any, states: Any, noise: Any) -> Any:
+        return self.gain(self.query)[None] + noise
+
+
 @pytest.fixture(autouse=True)
 def model() -> Any:
     VLAS.register_module()(StepVLA)
@@ -128,6 +139,19 @@ def test_the_fixture_is_what_was_asked_and_answered(tmp_path: Path) -> None:
         assert json.loads((folder / "config.json").read_text())["model"] == {"type": "StepVLA"}
         kept.append((figures["inputs_sha256"], figures["answers_sha256"]))
     assert kept[0] == kept[1]
+
+
+def test_a_weight_that_a_block_is_given_is_counted(tmp_path: Path) -> None:
+    VLAS.register_module()(QueryVLA)
+    try:
+        words = written(tmp_path)
+        config = tmp_path / "c.py"
+        config.write_text(config.read_text().replace("StepVLA", "QueryVLA"))
+        out = tmp_path / "bench.json"
+        assert main([*words, "--calls", "1", "--json", str(out), "--peak-tflops", "1"]) == 0
+    finally:
+        VLAS.unregister("QueryVLA")
+    assert json.loads(out.read_text())["gflops"] == round(2 * 4 * 2 * 2 / 1e9, 3)
 
 
 def test_a_peak_that_nobody_gives_is_measured(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute
@@ -17,6 +18,23 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class PartWeights:
+    """Published weights of a part of a model, under the names that they have there.
+
+    Args:
+        place: a safetensors file, a folder of them, ``hf:<id>``, or a file of ``torch.save``.
+        names: a part of our weights' names -> what stands there instead. Of several the longest
+            counts; weights whose names have none of them are not in the file.
+        unread: parts of names there that nothing here needs. Whatever else is left over is an
+            error, as is whatever is missing.
+    """
+
+    place: str
+    names: Mapping[str, str]
+    unread: Sequence[str] = ()
 
 
 class VLA(Contract):
@@ -65,6 +83,12 @@ class VLA(Contract):
         another project's checkpoint. The trainer reads them, not the constructor; what a checkpoint
         of the training holds comes after it."""
         return None
+
+    @attribute
+    def part_weights(self) -> Sequence[PartWeights]:
+        """Parts that a training starts from published weights of their own, where neither
+        ``runner.init_from`` nor ``pretrained_name_or_path`` names weights of the whole model."""
+        return ()
 
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.

@@ -25,6 +25,7 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import Transform
+from fluxvla_core.data.example import unit_statistics
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
@@ -148,7 +149,9 @@ def untrained_policy(
             "is unknown"
         )
     name = dataset.get("statistic_name", "private")
-    statistics = {name: {"proprio": _unit(robot.state_dim), "action": _unit(robot.dim)}}
+    statistics = {
+        name: {"proprio": unit_statistics(robot.state_dim), "action": unit_statistics(robot.dim)}
+    }
     prepare = PrivateInferenceDataset(
         dataset["img_keys"],
         dataset["transforms"],
@@ -305,11 +308,6 @@ def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
         return operator.embodiment
     finally:
         operator.close()
-
-
-def _unit(width: int) -> dict[str, list[float]]:
-    zeros, ones, below = [0.0] * width, [1.0] * width, [-1.0] * width
-    return {"mean": zeros, "std": ones, "min": below, "max": ones, "q01": below, "q99": ones}
 
 
 def _forget_memory(device: str) -> None:

@@ -36,8 +36,13 @@ WARM_UP = 3
 class Recorded(Protocol):
     """A function that was recorded with fixed memory."""
 
-    inputs: Tensors
-    outputs: Tensors
+    @property
+    def inputs(self) -> Tensors:
+        """The memory that it reads."""
+
+    @property
+    def outputs(self) -> Tensors:
+        """The memory that it writes."""
 
     def __call__(self, inputs: Tensors) -> Tensors:
         """Run it on ``inputs``, of the names, shapes and dtypes of the recording.

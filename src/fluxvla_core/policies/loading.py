@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 from collections.abc import Mapping
@@ -25,6 +26,8 @@ from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
 from fluxvla_core.policies.local import LocalPolicy
 
+log = logging.getLogger("fluxvla.policies")
+
 
 def load_policy(
     ckpt_path: str | Path,
@@ -38,7 +41,7 @@ def load_policy(
     """Build the policy that a checkpoint holds; its config is data and never executed.
 
     Args:
-        ckpt_path: a checkpoint's folder, or a work dir, whose newest one is taken.
+        ckpt_path: a checkpoint's folder, or a work dir, whose newest undamaged one is taken.
         device: a torch device; a plain ``cuda`` is ``own_device``'s.
         dataset: table or object that prepares observations instead of the training dataset's
             transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
@@ -61,7 +64,7 @@ def load_policy(
 
     check_execution(execution)
     check_quantization(quantization, device)
-    checkpoint = Checkpoint.open(ckpt_path)
+    checkpoint = Checkpoint.open(find_checkpoint(ckpt_path, Path(ckpt_path)))
     checkpoint.verify()
     where = str(checkpoint.path)
     config = checkpoint.config()
@@ -119,15 +122,22 @@ def own_device(environment: Mapping[str, str], count: int) -> str:
 
 
 def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
-    """The checkpoint to load: the one that is named, else the newest whole one of the work dir.
+    """The folder of the checkpoint to load, or of the newest undamaged one of a work dir.
+
+    Args:
+        ckpt_path: a checkpoint's folder, which is only opened here, or a work dir; None for
+            ``work_dir``. A damaged checkpoint of a work dir is passed over with a warning.
 
     Raises:
-        CheckpointError: there is none; what was wrong with damaged ones is said.
+        CheckpointError: there is none; the message says what is wrong with damaged ones.
     """
-    if ckpt_path is not None:
+    if ckpt_path is not None and not folders(ckpt_path):
         return Checkpoint.open(ckpt_path).path
+    work_dir = work_dir if ckpt_path is None else Path(ckpt_path)
     found, refused = newest_whole(work_dir)
     if found is not None:
+        for error in refused:
+            log.warning("not loading a damaged checkpoint: %s: %s", error.where, error.what)
         return found.path
     damaged = "; ".join(error.what for error in refused)
     others = [shlex.quote(str(p)) for p in work_dirs_below(Path()) if folders(p)][:3]

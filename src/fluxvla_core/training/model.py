@@ -109,6 +109,23 @@ def autocast(device: torch.device, dtype: torch.dtype | None) -> AbstractContext
     return torch.autocast(device.type, dtype)
 
 
+# -- without memory --------------------------------------------------------------------------
+
+
+def has_values(tensor: Tensor) -> bool:
+    """Whether a tensor has numbers, and not only a shape: for what looks at its inputs."""
+    if type(tensor) is Tensor and not tensor.is_meta:
+        return True
+    from torch._subclasses.fake_tensor import FakeTensor
+
+    return not (tensor.is_meta or isinstance(tensor, FakeTensor))
+
+
+def built_without_memory() -> bool:
+    """Whether models are built on the meta device now: then there are no weights to load."""
+    return torch.get_default_device().type == "meta"
+
+
 # -- from a batch to a loss ------------------------------------------------------------------
 
 

@@ -245,6 +245,11 @@ def test_a_robot_on_ros2_is_described_and_its_tests_skipped_without_it(
     )
     assert done.returncode == 0, done.stdout
     assert "pip install 'fluxvla-core[ros2]'" in done.stdout
+    alone = [sys.executable, "-m", "fluxvla_rolling_rover.driver"]
+    done = subprocess.run(alone, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "pip install 'fluxvla-core[ros2]'" in done.stderr
+    assert "Traceback" not in done.stderr
     check = [sys.executable, "-m", "fluxvla_core", "config", "check", "configs/rolling_rover.toml"]
     done = subprocess.run(
         check, cwd=ros2_rover, env=env, capture_output=True, text=True, timeout=120, check=False

@@ -7,6 +7,7 @@
     nox -s skew [-- COMMIT]                         the released core with plugins at head, ...
     nox -s py313 [-- PYTEST ARGUMENTS]              what needs no torch, on Python 3.13
     nox -s lint | types | layers | bench            one part of it
+    nox -s docs [-- serve]                          the documentation as a site, in site/
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
 """
@@ -27,6 +28,7 @@ sys.path.insert(0, str(ROOT))
 from tools import (  # noqa: E402
     envs,
     golden,
+    joined_env,
     lerobot_env,
     needs,
     oracle_env,
@@ -112,12 +114,16 @@ def environments(session: nox.Session) -> None:
     """What the tests need besides .nox/dev: LeRobot to compare with, and the demo's environment."""
     with Steps(session) as step:
         step("LeRobot", lambda: lerobot_env.prepare(session.log))
+        step("LeRobot's policies", lambda: oracle_env.prepare_044(session.log))
         step("demo", lambda: demo_env(session))
 
 
 @nox.session
 def oracles(session: nox.Session) -> None:
-    """What other implementations compute, computed again and compared with the golden files."""
+    """What other implementations compute, computed again and compared with the golden files.
+
+    And the tests of fluxvla-lerobot that need LeRobot, with the LeRobot that most are made with.
+    """
     with Steps(session) as step:
         made: dict[Path, Path] = {}
         by_hand = [p for p in golden.programs(ROOT) if p.environment is None]
@@ -141,6 +147,12 @@ def oracles(session: nox.Session) -> None:
                 words = ["-m", "tools.golden", folder, committed, *some]
                 name = f"compare {committed.relative_to(ROOT).as_posix()}"
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
+        dev = dev_env(session)
+        make_renderable(session, dev)
+        both = joined_env.join(env, dev)
+        words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
+        variables = {**rendering.VARIABLES, **alone}
+        step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))
 
 
 @nox.session
@@ -204,6 +216,15 @@ def layers(session: nox.Session) -> None:
 
 
 @nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation as a site, in site/, without a dead link; ``-- serve`` shows it."""
+    with Steps(session) as step:
+        env = docs_env(session)
+        words = ["-m", "tools.docs", *session.posargs]
+        step("docs", lambda: env.run("python", *words, cwd=ROOT))
+
+
+@nox.session
 def bench(session: nox.Session) -> None:
     """Every benchmark of benchmarks/, or those named; results go to benchmarks/results/."""
     with Steps(session) as step:
@@ -250,6 +271,21 @@ def dev_env(session: nox.Session) -> envs.Env:
         env.run("python", "-m", "pip", "uninstall", "--yes", "--quiet", "opencv-python")
 
     env.filled(base_of((*needs, *sum(extras.values(), ()))), parts, base, install)
+    return env
+
+
+def docs_env(session: nox.Session) -> envs.Env:
+    """.nox/docs: what builds the site, and what the core cannot be imported without."""
+    env = envs.Env(ROOT / ".nox" / "docs")
+    pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
+    needs = nox.project.dependency_groups(pyproject, "docs")
+    needs = (*needs, *pyproject["project"]["dependencies"])
+
+    def install() -> None:
+        session.log(f"installing {len(needs)} packages and their dependencies")
+        env.pip_install(*needs, constraints=project.CONSTRAINTS)
+
+    env.filled(base_of(needs), {}, install, lambda changed, fresh: None)
     return env
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from fluxvla_core.testing.dataset import DatasetConformance as DatasetConformance
     from fluxvla_core.testing.environment import EnvironmentConformance as EnvironmentConformance
     from fluxvla_core.testing.eval_runner import EvalRunnerConformance as EvalRunnerConformance
+    from fluxvla_core.testing.execution import ExecutionConformance as ExecutionConformance
     from fluxvla_core.testing.hook import HookConformance as HookConformance
     from fluxvla_core.testing.inference_runner import (
         InferenceRunnerConformance as InferenceRunnerConformance,
@@ -31,6 +32,7 @@ _KITS = {
     "fluxvla_core.testing.action_filter": ["ActionFilterConformance"],
     "fluxvla_core.testing.dataset": ["DatasetConformance"],
     "fluxvla_core.testing.environment": ["EnvironmentConformance"],
+    "fluxvla_core.testing.execution": ["ExecutionConformance"],
     "fluxvla_core.testing.eval_runner": ["EvalRunnerConformance"],
     "fluxvla_core.testing.hook": ["HookConformance"],
     "fluxvla_core.testing.inference_runner": ["InferenceRunnerConformance"],

@@ -267,6 +267,17 @@ def test_a_robot_on_ros2_is_formatted_for_any_joints_and_cameras(rendered: Rende
         assert done.returncode == 0, done.stdout
 
 
+def test_a_robot_requires_what_its_episodes_videos_are_written_with(
+    fluxvla: Fluxvla, tmp_path: Path
+) -> None:
+    """Without PyAV a run in an environment of its own ends with an error."""
+    for name, more in (("plain", []), ("nodes", ["--ros2"])):
+        words = ["new-plugin", name, "--kind", "operator", "--dir", str(tmp_path)]
+        assert fluxvla(*words, *more).code == 0
+        text = (tmp_path / f"fluxvla-{name}" / "pyproject.toml").read_text()
+        assert 'dependencies = ["fluxvla-core[data]>=' in text
+
+
 def test_a_robot_on_ros2_says_how_to_stand_in_for_it(fluxvla: Fluxvla, tmp_path: Path) -> None:
     ended = fluxvla("new-plugin", "rover", "--kind", "operator", "--ros2", "--dir", str(tmp_path))
     assert ended.code == 0, ended.err

@@ -62,6 +62,7 @@ EXAMPLE = "as in tests/examples, which install the examples in environments of t
 KIT = "it starts and kills processes for minutes; tests/cli/test_new_plugin.py runs it every night"
 HARDWARE = "moves a robot, with a person's consent"
 FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
+LEROBOT = "needs LeRobot beside FluxVLA; the plugin's tests run it in an environment that has both"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
@@ -108,6 +109,12 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "fluxvla import-checkpoint FOLDER work/imported --embodiment arm.json --rate 50",
             ),
         ],
+        LEROBOT: [
+            (
+                "plugins/fluxvla-lerobot/README.md",
+                "fluxvla run --config acting.py --section eval --work-dir work",
+            ),
+        ],
         NO_INDEX: [
             (
                 "docs/installation.md",
@@ -131,6 +138,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
             ("plugins/fluxvla-latency/README.md", "pip install fluxvla-latency"),
+            ("plugins/fluxvla-lerobot/README.md", "pip install 'fluxvla-lerobot[lerobot]'"),
             ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
             ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
@@ -142,6 +150,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "plugins/fluxvla-smolvla/README.md",
                 "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
             ),
+            ("plugins/fluxvla-wandb/README.md", "pip install fluxvla-wandb"),
         ],
         HUB: [
             (

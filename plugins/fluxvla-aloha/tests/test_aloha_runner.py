@@ -12,9 +12,15 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_core import RUNNERS, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.operators import Frame, RunContext, SimulatedClock
+from fluxvla_core.testing import InferenceRunnerConformance
 
 SPEC = embodiment.aloha_spec(cameras=())
 START_POSE = embodiment.start_pose("viperx300")
+
+
+class TestConformance(InferenceRunnerConformance):
+    entry_point = "AlohaInferenceRunner"
+    spec = SPEC
 
 
 class Still:

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from fluxvla_core.config.signature import Parameter, Signature, table_of
+from fluxvla_core.config.parameters import Parameter
+from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.source import dotted_name
 
 Schema = dict[str, Any]

@@ -31,6 +31,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-latency": {"hooks": ("LatencyLog",)},
+    "fluxvla-lerobot": {"policies": ("LeRobotPolicy",)},
     "fluxvla-libero": {
         "environments": ("LiberoEnvironment",),
         "policies": ("LiberoExpert",),
@@ -93,6 +94,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "operators": ("UROperator", "URRTDEOperator"),
         "runners": ("URInferenceRunner",),
     },
+    "fluxvla-wandb": {"commands": ("wandb",), "hooks": ("WandbVideos",)},
 }
 
 

@@ -35,13 +35,13 @@ from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
 from fluxvla_core.robot.control.sender import Execute, check_pose
-from fluxvla_core.robot.division import RunnersOwn, Tables, divide
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
 from fluxvla_core.robot.make_engine import RunParts, make_engine
 from fluxvla_core.robot.observation import fit_cameras
 from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.process_layout import ControlTables, RunnerOverrides, choose_layout
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
@@ -93,6 +93,7 @@ class BaseInferenceRunner(Runner):
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
         device: the torch device of the policy.
+        execution, quantization: how its model computes, see ``load_policy``.
         record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
             and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
             work dir.
@@ -138,6 +139,8 @@ class BaseInferenceRunner(Runner):
         safety: Mapping[str, Any] | None = None,
         mixed_precision_dtype: str = "float32",
         device: str = "cpu",
+        execution: str = "eager",
+        quantization: str | None = None,
         record: str | None = None,
         record_fps: float | None = 10.0,
         ready_timeout: float = 10.0,
@@ -165,6 +168,7 @@ class BaseInferenceRunner(Runner):
         self.gripper_threshold = gripper_threshold
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
+        self.execution, self.quantization = execution, quantization
         self.record = record
         self.record_fps = record_fps
         self.ready_timeout = ready_timeout
@@ -183,18 +187,20 @@ class BaseInferenceRunner(Runner):
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
         scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
         table = {**scene, **operator} if isinstance(operator, Mapping) else operator
-        tables = Tables(table, list(action_filters), gripper_threshold)
-        self._division = divide(
+        tables = ControlTables(table, list(action_filters), gripper_threshold)
+        self._layout = choose_layout(
             lambda: build_operator_from_cfg(operator, context, **scene),
             tables,
             self.context.config,
             embodiment,
-            RunnersOwn.of(type(self), BaseInferenceRunner, self.context),
+            RunnerOverrides.of(type(self), BaseInferenceRunner, self.context),
             "control_process is False" if control_process is False else None,
         )
-        if control_process and self._division.obstacle is not None:
-            raise self.config_error("control_process", f"is True, and {self._division.obstacle}")
-        self.ros_operator, self.robot = self._division.operator, self._division.robot
+        if control_process and self._layout.why_single_process is not None:
+            raise self.config_error(
+                "control_process", f"is True, and {self._layout.why_single_process}"
+            )
+        self.ros_operator, self.robot = self._layout.operator, self._layout.robot
         self.embodiment = self.robot.embodiment
         self.publish_rate = self._checked_rate(publish_rate)
         if state_dim is not None and state_dim != self.embodiment.state_dim:
@@ -242,7 +248,7 @@ class BaseInferenceRunner(Runner):
             self.context.reporter.info(f"policy: {place}")
             self.policy = load_policy(
                 place, self.device, self.dataset, self.denormalize_action,
-                self.mixed_precision_dtype,
+                self.mixed_precision_dtype, self.execution, self.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
@@ -281,8 +287,8 @@ class BaseInferenceRunner(Runner):
         with Interrupts() as interrupts, watched:
             self._observers = (HookObserver(hooks),)
             engine = self._engine(interrupts, thread)
-            if self._division.remark is not None:
-                self.context.reporter.info(self._division.remark)
+            if self._layout.notice is not None:
+                self.context.reporter.info(self._layout.notice)
             self._session = session = RobotSession(
                 source, self.task_descriptions, self.free_tasks, self.seed, self._history,
                 engine, self.latch, interrupts, thread,
@@ -311,7 +317,7 @@ class BaseInferenceRunner(Runner):
     @property
     def divided(self) -> bool:
         """Whether a process of its own commands the robot."""
-        return self._division.tables is not None
+        return self._layout.tables is not None
 
     def get_ros_observation(self) -> tuple[Any, ...]:
         """The newest reading: one picture for each of ``camera_names``, then the state.
@@ -339,7 +345,7 @@ class BaseInferenceRunner(Runner):
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
         self.robot.play(actions, rate)
 
-    def commanding_side(
+    def control_side(
         self, robot: Robot, cameras: Sequence[str]
     ) -> tuple[Execute, Callable[[], tuple[dict[str, Any], Frame | None]]]:
         """In the control process, where there is no policy: what sends commands, and observes.
@@ -375,10 +381,10 @@ class BaseInferenceRunner(Runner):
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
-            keyframes=min((n for n in used if n is not None), default=None),
+            max_actions=min((n for n in used if n is not None), default=None),
             latency_s=self.simulated_latency,
             max_steps=self.max_publish_step,
-            keyframe_hz=policy.action_rate_hz,
+            action_rate_hz=policy.action_rate_hz,
         )
         parts = RunParts(
             robot=self.robot,
@@ -394,7 +400,7 @@ class BaseInferenceRunner(Runner):
             context=self.context,
             history=self._history,
         )
-        return make_engine(parts, self._division, interrupts, thread)
+        return make_engine(parts, self._layout, interrupts, thread)
 
     def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None

@@ -167,6 +167,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import flops, lora
         from fluxvla_core.training.model import checkpoint_activations, compile_units
+        from fluxvla_core.training.part_weights import put_parts
         from fluxvla_core.training.rng import seed_all
         from fluxvla_core.training.weights import base_to_note, start_training_from
 
@@ -181,6 +182,8 @@ class BaseTrainRunner(Strategy):
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self.resume_checkpoint
         init_from = options.init_from or VLA.adapt(vla).pretrained_name_or_path
+        if init_from is None and before is None:
+            put_parts(vla, VLA.adapt(vla).part_weights)
         start_training_from(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = base_to_note(before, init_from)

@@ -28,7 +28,7 @@ from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.safety import SafetySettings
 from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.episode import EpisodeSettings
-from fluxvla_core.robot.process.whole_robot import WholeRobot
+from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -97,9 +97,9 @@ class ControlSetup:
         Raises:
             ConfigError, PluginError: the operator cannot be built.
         """
-        return self.make_side(reporter)[0]
+        return self.build_control_side(reporter)[0]
 
-    def make_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
+    def build_control_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
         """The robot that this process commands, not connected, and what sends the commands.
 
         Raises:
@@ -108,8 +108,8 @@ class ControlSetup:
         self._import_registered()
         if self.runner is not None:
             runner = build_runner_from_cfg(self.runner, self._context(reporter))
-            robot = WholeRobot(runner.ros_operator, self._spec(), sends=True)
-            execute, observe = runner.commanding_side(robot, self.cameras or ())
+            robot = UndividedRobot(runner.ros_operator, self._spec(), sends=True)
+            execute, observe = runner.control_side(robot, self.cameras or ())
             robot.observed_by(observe)
             return robot, execute
         made = self._operators_robot(reporter)
@@ -118,7 +118,7 @@ class ControlSetup:
     def _operators_robot(self, reporter: Reporter) -> Robot:
         built = build_operator_from_cfg(self.operator, self._context(reporter))
         if self.cameras is not None:
-            return WholeRobot(built, self._spec())
+            return UndividedRobot(built, self._spec())
         return Robot(Operator.adapt(built).without_cameras() or built, self._spec())
 
     def make_filters(self, reporter: Reporter) -> list[ActionFilter]:

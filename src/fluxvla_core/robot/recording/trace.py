@@ -96,7 +96,7 @@ class JsonLines(Log):
 
 
 def _json(value: Any) -> str:
-    """A chunk row by row: one call for all would keep the interpreter from the sending thread."""
+    """A chunk as lists, row by row: one call for all would hold the GIL for too long."""
     if isinstance(value, np.ndarray) and value.ndim > 1:
         return "[" + ", ".join(map(_json, value)) + "]"
     return json.dumps(value, default=ros.numpy_as_json)
@@ -235,8 +235,8 @@ class EpisodeTrace:
         return JsonLines(self.folder)
 
     def _run(self) -> None:
-        # The sending thread waits for the interpreter while this thread has it.
-        realtime.just_below_real_time()
+        # The sending thread waits for the GIL while this thread holds it.
+        realtime.raise_priority()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -250,7 +250,7 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
-        with realtime.normal():
+        with realtime.normal_priority():
             self._finish()
 
     def _finish(self) -> None:
@@ -271,7 +271,7 @@ class EpisodeTrace:
             self._log.add(item)
             return
         camera, stamp, image = item
-        with realtime.normal():
+        with realtime.normal_priority():
             if stamp is None:
                 self._film(camera, image)
             elif image.ndim == 2:
@@ -300,7 +300,7 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
-        with realtime.normal():
+        with realtime.normal_priority():
             self._poll_all(self._source)
 
     def _poll_all(self, source: Source) -> None:

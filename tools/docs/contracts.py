@@ -114,6 +114,7 @@ PAGES = (
         {
             _CONTRACTS.format("training"): (
                 "VLA",
+                "PartWeights",
                 "Dataset",
                 "InferenceDataset",
                 "Transform",

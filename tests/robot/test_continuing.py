@@ -99,6 +99,29 @@ def test_actions_relative_to_the_state_are_scaled_by_the_present_state():
         np.testing.assert_allclose(chunk, given.actions, atol=1e-5)
 
 
+def test_the_rest_of_a_relative_chunk_is_moved_to_the_present_state():
+    """A chunk counted from one state goes on as counted from the next one.
+
+    What is handed over is where the arm is going to be, so each relative joint is counted anew;
+    one that is not relative (a gripper) keeps its value; each step has its own scale.
+    """
+    rows = {"mean": [[0.1, -0.2]] * T, "std": [[0.1 * (j + 1), 2.0] for j in range(T)]}
+    entry = {**rows, "relative": [1, 0]}
+    scale = DenormalizePrivateAction(norm_stats={"private": {"action": entry}})
+    local = policy(Obedient(), scale)
+    then, now = np.array([0.3, -0.4]), np.array([0.8, 0.1])
+    normalized = np.random.default_rng(1).uniform(-1, 1, (T, D))
+    going = scale({"action": normalized, "states": then})
+
+    chunk = local.continue_action(observation(now), Continuation(going, np.ones(T), 2))
+
+    previous = local.model.given[0][0, :, :D].numpy()
+    shift = (then - now)[0] / np.array(rows["std"])[:, 0]
+    np.testing.assert_allclose(previous[:, 0], normalized[:, 0] + shift, rtol=1e-4)
+    np.testing.assert_allclose(previous[:, 1], normalized[:, 1], atol=1e-5)
+    np.testing.assert_allclose(chunk, going, atol=1e-5)
+
+
 def test_its_model_may_differentiate_only_when_it_is_guided():
     local = policy(Obedient())
     local.predict_action(observation())

@@ -1,8 +1,8 @@
 """Rollout of an episode: observe, predict, execute some of the chunk, observe again.
 
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
-commands are formed by the same path as on a robot: keyframes are joined linearly from the last
-command on and kept within the same limits. Other actions pass the limits unchanged.
+commands are formed by the same path as on a robot: a chunk's actions are joined linearly from the
+last command on and kept within the same limits. Other actions pass the limits unchanged.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ChunkCommands:
 
     Args:
         spec: the environment's description.
-        action_rate_hz: keyframes a second; the environment's rate by default.
+        action_rate_hz: actions a second; the environment's rate by default.
     """
 
     def __init__(self, spec: EnvironmentSpec, action_rate_hz: float | None) -> None:

@@ -24,9 +24,7 @@ from fluxvla_openvla.heads import (
 )
 from fluxvla_openvla.language import Prompt, hidden_states
 from fluxvla_openvla.prismatic import Prismatic
-from fluxvla_openvla.sizes import LanguageSize, TowerSize
-
-HEADS = ("l1", "diffusion")
+from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize
 
 
 class OpenVLAOFT(Prismatic):

@@ -1,4 +1,4 @@
-"""``LocalSource``: chunks of a policy that computes in a thread of this process."""
+"""``LocalPolicyClient``: asks a policy that computes in a thread of this process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fluxvla_core.robot.control.delays import DelaySource
 from fluxvla_core.robot.control.joiners import Ahead
-from fluxvla_core.robot.control.source import Answer, ChunkSource
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.events import ChunkAccepted, Event, Reading, Refused
 from fluxvla_core.robot.observation import ObservationReader
 from fluxvla_core.robot.policy_calls import PolicyAnswer, PolicyCaller, PolicyThread
@@ -19,7 +19,7 @@ from fluxvla_core.robot.robot import Robot
 Array = npt.NDArray[np.float64]
 
 
-class LocalSource(ChunkSource):
+class LocalPolicyClient(PolicyClient):
     """Observes a robot and asks a policy, in one episode.
 
     On a robot both happen in the policy's thread. In a lockstep simulation observing happens in the
@@ -61,9 +61,8 @@ class LocalSource(ChunkSource):
 
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
-        assert isinstance(answer.keyframes, np.ndarray)
         now = self._robot.clock.now()
-        self._emit(ChunkAccepted(now, answer.reading, answer.keyframes, answer.stages))
+        self._emit(ChunkAccepted(now, answer.reading, answer.checked(), answer.stages))
 
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)

@@ -1,4 +1,4 @@
-"""``RemoteSource``: the control process's chunks, which the policy in the main process makes."""
+"""``RemotePolicyClient``: asks the policy in the main process, from the control process."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from fluxvla_core.errors import RunFailed
 from fluxvla_core.robot.control.chunks import Chunk
 from fluxvla_core.robot.control.delays import DelaySource
 from fluxvla_core.robot.control.joiners import Ahead, RestOfChunk
-from fluxvla_core.robot.control.source import Answer, ChunkSource
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.process.inbox import Inbox, RemoteAnswer
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Array, Message, error_of
+from fluxvla_core.robot.process.messages import Array, Kind, Message, error_of
 from fluxvla_core.robot.robot import Robot
 
 # How often a wait for a reply looks for it, and how long one about delays may take.
@@ -25,8 +25,8 @@ _LINK = DelaySource(
 )
 
 
-class RemoteSource(ChunkSource):
-    """Chunks of the policy in the main process, for one episode.
+class RemotePolicyClient(PolicyClient):
+    """Asks the policy in the main process, for one episode.
 
     Args:
         link: the control process's end.
@@ -42,49 +42,49 @@ class RemoteSource(ChunkSource):
 
     def first_state(self) -> Array:
         # The main process gives the robot its time, and says so if that was not enough.
-        return self._request("first state", None).arrays[0]
+        return self._request(Kind.FIRST_STATE, None).arrays[0]
 
     def reset(self) -> None:
-        self._request("reset", self._patience_s)
+        self._request(Kind.RESET, self._patience_s)
 
     def ask(self, ahead: Ahead | None) -> Future[Answer]:
         self._asked += 1
         future: Future[Answer] = Future()
         self._inbox.answers[self._asked] = future
         fields, arrays = _continued(ahead)
-        self._link.post("ask", arrays, number=self._asked, **fields)
+        self._link.send(Kind.ASK, arrays, number=self._asked, **fields)
         return future
 
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, RemoteAnswer)
-        self._link.post("accepted", number=answer.number)
+        self._link.send(Kind.ACCEPTED, number=answer.number)
 
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, RemoteAnswer)
-        self._link.post("refused", number=answer.number)
+        self._link.send(Kind.REFUSED, number=answer.number)
 
     def late(self, since: float) -> tuple[DelaySource, float]:
         own = self._robot.delays.longest(since)
-        self._link.send("late", since=since)
+        self._link.try_send(Kind.LATE, since=since)
         until = time.monotonic() + _LATE_S
-        while "late" not in self._inbox.replies and time.monotonic() < until:
+        while Kind.LATE not in self._inbox.replies and time.monotonic() < until:
             self._inbox.poll()
             time.sleep(_POLL_S)
-        reply = self._inbox.replies.pop("late", None)
+        reply = self._inbox.replies.pop(Kind.LATE, None)
         if reply is None:
             return _LINK, time.monotonic() - since
         if reply["seconds"] < own[1]:
             return own
         return DelaySource(reply["name"], reply["cause"], reply["next"]), reply["seconds"]
 
-    def _request(self, what: str, patience_s: float | None) -> Message:
+    def _request(self, what: Kind, patience_s: float | None) -> Message:
         """Ask the main process while nothing moves; its reply."""
         began = time.monotonic()
-        self._link.post(what)
+        self._link.send(what)
         while (reply := self._inbox.replies.pop(what, None)) is None:
             self._inbox.check()
             if patience_s is not None and time.monotonic() - began > patience_s:
-                raise RunFailed(f"the policy's {what} did not return within {patience_s:g} s")
+                raise RunFailed(f"the policy's {what.value} did not return within {patience_s:g} s")
             if self.meanwhile is None:
                 time.sleep(_POLL_S)
             else:
@@ -105,17 +105,17 @@ def _continued(ahead: Ahead | None) -> tuple[dict[str, Any], tuple[Array, ...]]:
         "schedule": ahead.schedule,
         "max_guidance_weight": ahead.max_guidance_weight,
     }
-    return fields, (ahead.chunk.keyframes, ahead.chunk.anchor)
+    return fields, (ahead.chunk.actions, ahead.chunk.anchor)
 
 
 def ahead_of(message: Message) -> Ahead | None:
-    """What the policy has to continue, of the message ``ask``; in the main process."""
+    """The rest of the chunk in a message ``ASK``, which the policy has to continue."""
     if not message.arrays:
         return None
-    keyframes, anchor = message.arrays
+    actions, anchor = message.arrays
     fields = message.fields
     return RestOfChunk(
-        Chunk(keyframes, fields["rate_hz"], fields["observed"], anchor),
+        Chunk(actions, fields["rate_hz"], fields["observed"], anchor),
         fields["latency_s"],
         fields["schedule"],
         fields["max_guidance_weight"],

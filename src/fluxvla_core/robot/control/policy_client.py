@@ -1,4 +1,4 @@
-"""``ChunkSource``: where the control loop gets its chunks from, in this process or in another."""
+"""``PolicyClient``: how the control loop asks a policy, in this process or in another."""
 
 from __future__ import annotations
 
@@ -37,14 +37,27 @@ class Answer:
 
     Args:
         observed: when the observation that it answers was made, on the robot's clock.
-        keyframes: ``(T, D)`` targets, read-only, or why they are refused.
+        actions: ``(T, D)`` targets, read-only; None if the chunk is refused.
+        error: why the chunk is refused; None if it is not.
     """
 
     observed: float
-    keyframes: Array | BadChunk
+    actions: Array | None
+    error: BadChunk | None
+
+    def checked(self) -> Array:
+        """``(T, D)`` the actions.
+
+        Raises:
+            BadChunk: the chunk is refused.
+        """
+        if self.error is not None:
+            raise self.error
+        assert self.actions is not None, "an answer has actions or an error"
+        return self.actions
 
 
-class ChunkSource(ABC):
+class PolicyClient(ABC):
     """Observes the robot and asks the policy, for one episode.
 
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
@@ -96,4 +109,4 @@ class ChunkSource(ABC):
 
     @abstractmethod
     def late(self, since: float) -> tuple[DelaySource, float]:
-        """What took most of the time since then (monotonic, in seconds), and how many seconds."""
+        """What took longest since ``since`` (monotonic, in seconds), and how many seconds of it."""

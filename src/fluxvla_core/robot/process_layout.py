@@ -1,8 +1,8 @@
-"""Which process commands a robot: one of its own where that is possible.
+"""``choose_layout``: whether a control process of its own commands a robot, or the main process.
 
-An operator may be divided: one process commands the robot, the other reads its cameras. One that
-cannot be divided runs as a whole in the process that commands, which shows its pictures to the
-other one.
+A control process is used wherever that is possible. An operator may be divided between the two: the
+control process commands the robot, the main process reads its cameras. One that cannot be divided
+runs as a whole in the control process, which sends its images to the main process.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Embodiment: TypeAlias = "EmbodimentSpec | Mapping[str, Any] | None"
 
 
 @dataclass(frozen=True)
-class Tables:
-    """What another process builds the robot's commanding side from.
+class ControlTables:
+    """The tables that the control process builds the operator and the filters from.
 
     Args:
         operator: the operator's table; an object cannot be built there.
@@ -41,33 +41,33 @@ class Tables:
 
 
 @dataclass(frozen=True)
-class Division:
-    """Whether another process commands the robot.
+class ProcessLayout:
+    """Which parts of a robot this process and, if there is one, its control process have.
 
     Args:
-        operator: what this process has of the robot.
+        operator: this process's operator, or the part of it that this process has.
         robot: made of it; not connected.
-        tables: what the other process builds its part from; None where there is no other.
-        obstacle: why there is none; None where there is.
-        frames: ``operator``, where the other process has all of the robot.
-        runner: the table of the runner, where that process needs its methods too.
+        tables: what the control process is built from; None where there is none.
+        why_single_process: why there is no control process; None where there is one.
+        frames: ``operator``, where the control process has all of the robot.
+        runner: the table of the runner, where the control process needs its methods too.
     """
 
     operator: Any
     robot: Robot
-    tables: Tables | None = None
-    obstacle: str | None = None
+    tables: ControlTables | None = None
+    why_single_process: str | None = None
     frames: RemoteOperator | None = None
     runner: Mapping[str, Any] | None = None
 
     @property
-    def remark(self) -> str | None:
-        """What a person is to know of it, if anything."""
+    def notice(self) -> str | None:
+        """What to tell the user about it; None for nothing."""
         if self.frames is not None:
             return f"{self.robot.name} is not divided: the control process reads its pictures too"
-        if self.obstacle is None or self.robot.lockstep:
+        if self.why_single_process is None or self.robot.lockstep:
             return None
-        return f"no control process: {self.obstacle}"
+        return f"no control process: {self.why_single_process}"
 
 
 _SENDING = ("_execute_actions",)
@@ -79,8 +79,8 @@ _USUAL = ("_abc_impl", "api")
 
 
 @dataclass(frozen=True)
-class RunnersOwn:
-    """What a runner does with its operator by methods of its own.
+class RunnerOverrides:
+    """Which methods a runner's class overrides, and whether a control process can have them.
 
     Args:
         runner: the name of its class.
@@ -97,8 +97,8 @@ class RunnersOwn:
     obstacle: str | None
 
     @classmethod
-    def of(cls, runner: type, base: type, context: RunContext) -> RunnersOwn:
-        """Of a class that is derived from ``BaseInferenceRunner``; ``context`` is the run's."""
+    def of(cls, runner: type, base: type, context: RunContext) -> RunnerOverrides:
+        """The overrides of a class derived from ``base``, which is ``BaseInferenceRunner``."""
         derived = runner.__mro__[: runner.__mro__.index(base)]
         defined = {name for each in derived for name in vars(each)}
         known = {*_SENDING, *_OBSERVING, *_USUAL}
@@ -124,7 +124,7 @@ class RunnersOwn:
         )
 
     @property
-    def keeps_here(self) -> str | None:
+    def why_single_process(self) -> str | None:
         """Why its methods keep the operator in this process; None if they do not."""
         if self.obstacle is None or not (self.sends or self.observes):
             return None
@@ -132,15 +132,15 @@ class RunnersOwn:
         return f"{self.runner} {method} by a method of its own, and {self.obstacle}"
 
 
-def divide(
+def choose_layout(
     build: Callable[[], Any],
-    tables: Tables,
+    tables: ControlTables,
     config: Mapping[str, Any],
     embodiment: Embodiment,
-    own: RunnersOwn,
+    overrides: RunnerOverrides,
     obstacle: str | None,
-) -> Division:
-    """Choose what commands a robot.
+) -> ProcessLayout:
+    """Choose which process commands a robot.
 
     Args:
         build: builds the operator in this process; it is not connected by that, if it has a
@@ -148,50 +148,60 @@ def divide(
         tables: what it is built from, or objects.
         config: the whole config.
         embodiment: what the config says of the robot.
-        own: what the runner does itself.
+        overrides: the runner's.
         obstacle: why this process is to command it; None where that depends on the rest.
 
     Raises:
         ConfigError, PluginError: the operator cannot be built, or lacks something.
     """
-    obstacle = obstacle or _obstacle(tables, config) or (own.keeps_here if own.sends else None)
+    obstacle = (
+        obstacle
+        or _obstacle(tables, config)
+        or (overrides.why_single_process if overrides.sends else None)
+    )
     # What is not there is an error of ``build``.
     name: str = "" if obstacle else tables.operator.get("type", "")
     cls = OPERATORS.get(name) if name in OPERATORS else None
-    known = None if cls is None else _known_before(cls, embodiment)
-    if cls is not None and known is not None and own.keeps_here is None:
-        return _whole(RemoteOperator(cls.__name__, known), embodiment, cls, tables, own)
+    known = None if cls is None else _embodiment_before_connect(cls, embodiment)
+    if cls is not None and known is not None and overrides.why_single_process is None:
+        return _undivided(RemoteOperator(cls.__name__, known), embodiment, cls, tables, overrides)
     made = build()
     operator = Operator.adapt(made)
     if obstacle is None and in_lockstep(clock_of(operator)):
         obstacle = "the time of this simulation stands still between commands"
     if obstacle is not None:
-        return Division(made, Robot(made, embodiment, own.sends), obstacle=obstacle)
-    if implements(made, Operator, "without_cameras") and not own.sends:
+        return ProcessLayout(
+            made, Robot(made, embodiment, overrides.sends), why_single_process=obstacle
+        )
+    if implements(made, Operator, "without_cameras") and not overrides.sends:
         part = operator.without_commands()
         if part is not None:
-            return Division(part, Robot(part, embodiment), tables)
+            return ProcessLayout(part, Robot(part, embodiment), tables)
     # All that is wrong with it is found here, before another process is started.
-    robot = Robot(made, embodiment, own.sends)
-    obstacle = own.keeps_here or _keeps_here(robot, operator)
+    robot = Robot(made, embodiment, overrides.sends)
+    obstacle = overrides.why_single_process or _why_single_process(robot, operator)
     if obstacle is not None:
-        return Division(made, robot, obstacle=obstacle)
+        return ProcessLayout(made, robot, why_single_process=obstacle)
     stand_in = RemoteOperator(robot.name, robot.embodiment, operator.domain_id)
-    return _whole(stand_in, None, type(made), tables, own)
+    return _undivided(stand_in, None, type(made), tables, overrides)
 
 
-def _whole(
-    frames: RemoteOperator, embodiment: Embodiment, cls: type, tables: Tables, own: RunnersOwn
-) -> Division:
+def _undivided(
+    frames: RemoteOperator,
+    embodiment: Embodiment,
+    cls: type,
+    tables: ControlTables,
+    overrides: RunnerOverrides,
+) -> ProcessLayout:
     runner = None
-    if own.table is not None and (own.sends or own.observes):
-        given = {"operator": tables.operator} if "operator" in own.table else {}
-        runner = {**own.table, **given}
-    robot = Robot(frames, embodiment, own.sends, kind=cls)
-    return Division(frames, robot, tables, frames=frames, runner=runner)
+    if overrides.table is not None and (overrides.sends or overrides.observes):
+        given = {"operator": tables.operator} if "operator" in overrides.table else {}
+        runner = {**overrides.table, **given}
+    robot = Robot(frames, embodiment, overrides.sends, kind=cls)
+    return ProcessLayout(frames, robot, tables, frames=frames, runner=runner)
 
 
-def _known_before(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
+def _embodiment_before_connect(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
     """The embodiment of an operator that connects in its constructor, as far as it is known."""
     if implements(cls, Operator, "connect"):
         return None
@@ -201,7 +211,7 @@ def _known_before(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:
     return EmbodimentSpec.from_dict(embodiment) if isinstance(embodiment, Mapping) else embodiment
 
 
-def _keeps_here(robot: Robot, operator: Operator) -> str | None:
+def _why_single_process(robot: Robot, operator: Operator) -> str | None:
     """Why an operator that cannot be divided does not run as a whole in another process."""
     name = robot.name
     if not robot.follows:
@@ -213,7 +223,7 @@ def _keeps_here(robot: Robot, operator: Operator) -> str | None:
     return None
 
 
-def _obstacle(tables: Tables, config: Mapping[str, Any]) -> str | None:
+def _obstacle(tables: ControlTables, config: Mapping[str, Any]) -> str | None:
     if sys.platform != "linux":
         return "this system has no memory that two processes share by a descriptor"
     for registry, built in ((OPERATORS, [tables.operator]), (ACTION_FILTERS, tables.filters)):

@@ -103,13 +103,12 @@ class VLA(Contract):
 
     # -- an answer in two parts, which is what lets it be captured in a CUDA graph ---------------
 
-    def observe(self, **observation: Any) -> Mapping[str, Any]:
-        """What every denoising step needs of an observation: name -> tensor.
+    observe: Callable[..., Mapping[str, Any]]
+    """What every denoising step needs of an observation: name -> tensor.
 
-        Its parameters are those of ``predict_action`` that belong to the observation. What does
-        not depend on the noisy actions is computed here, once.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no observe()")
+    A method; its parameters are those of ``predict_action`` that belong to the observation. What
+    does not depend on the noisy actions is computed here, once.
+    """
 
     def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:
         """All denoising steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.

@@ -67,7 +67,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vlas": ("OpenVLA", "OpenVLAOFT"),
     },
     "fluxvla-pi": {
-        "checkpoint_formats": ("LeRobotPi", "OpenPi"),
+        "checkpoint_formats": ("LeRobotPi", "OpenPi", "TransformersPi0"),
         "vlas": ("PI05FlowMatching", "PI0FlowMatching"),
     },
     "fluxvla-report": {"commands": ("report",)},

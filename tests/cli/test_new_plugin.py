@@ -245,6 +245,11 @@ def test_a_robot_on_ros2_is_described_and_its_tests_skipped_without_it(
     )
     assert done.returncode == 0, done.stdout
     assert "pip install 'fluxvla-core[ros2]'" in done.stdout
+    alone = [sys.executable, "-m", "fluxvla_rolling_rover.driver"]
+    done = subprocess.run(alone, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "pip install 'fluxvla-core[ros2]'" in done.stderr
+    assert "Traceback" not in done.stderr
     check = [sys.executable, "-m", "fluxvla_core", "config", "check", "configs/rolling_rover.toml"]
     done = subprocess.run(
         check, cwd=ros2_rover, env=env, capture_output=True, text=True, timeout=120, check=False
@@ -260,6 +265,17 @@ def test_a_robot_on_ros2_is_formatted_for_any_joints_and_cameras(rendered: Rende
     for words in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = rendered.python("-m", "ruff", *words, place)
         assert done.returncode == 0, done.stdout
+
+
+def test_a_robot_requires_what_its_episodes_videos_are_written_with(
+    fluxvla: Fluxvla, tmp_path: Path
+) -> None:
+    """Without PyAV a run in an environment of its own ends with an error."""
+    for name, more in (("plain", []), ("nodes", ["--ros2"])):
+        words = ["new-plugin", name, "--kind", "operator", "--dir", str(tmp_path)]
+        assert fluxvla(*words, *more).code == 0
+        text = (tmp_path / f"fluxvla-{name}" / "pyproject.toml").read_text()
+        assert 'dependencies = ["fluxvla-core[data]>=' in text
 
 
 def test_a_robot_on_ros2_says_how_to_stand_in_for_it(fluxvla: Fluxvla, tmp_path: Path) -> None:

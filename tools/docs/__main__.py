@@ -21,7 +21,7 @@ def build(site: Path = SITE) -> list[str]:
     Raises:
         subprocess.CalledProcessError: mkdocs found something.
     """
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--clean"]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--clean"]
     subprocess.run([*command, "-d", str(site)], cwd=ROOT, env={**os.environ, **QUIET}, check=True)
     return links.problems(site)
 

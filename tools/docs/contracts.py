@@ -114,6 +114,7 @@ PAGES = (
         {
             _CONTRACTS.format("training"): (
                 "VLA",
+                "PartWeights",
                 "Dataset",
                 "InferenceDataset",
                 "Transform",
@@ -312,7 +313,7 @@ def _section(section: griffe.DocstringSection) -> str:
     if title is None:
         return as_markdown(str(section.value))
     lines = [
-        f"- `{one.annotation}`: {as_markdown(one.description)}"
+        f"- `{str(one.annotation).strip('()')}`: {as_markdown(one.description)}"
         if one.annotation
         else f"- {as_markdown(one.description)}"
         for one in section.value

@@ -68,7 +68,7 @@ KINDS: Mapping[str, Kind] = {
         ),
         ("operator",),
         "A robot for FluxVLA",
-        (),
+        ("data",),  # an episode leaves a video of each camera
         f"{RUN} --task 1",
     ),
     "policy": Kind(

@@ -30,7 +30,7 @@ _TABLES = frozenset({"dict", "Dict", "Mapping", "MutableMapping"})
 
 
 def value_schema(parameter: Parameter, nested: Callable[[Signature], Schema]) -> Schema:
-    """What a parameter's annotation says of its values; ``{}``, which allows all, if nothing.
+    """JSON Schema of a parameter's annotation; ``{}``, which allows all, without one.
 
     Args:
         nested: the schema of a table that a dataclass or a ``TypedDict`` describes.

@@ -280,7 +280,7 @@ class _Walk:
         return f"{text}; {'or ' if near else ''}{history}" if history else text
 
     def _left_over(self, key: str, name: str) -> str:
-        """What to do about a key that was written for another class; empty if it was not."""
+        """Advice for a key that was written for another class; empty if it was not."""
         here, there = (self.config.where(join_key(key, n)) for n in (name, "type"))
         if _typed(here):
             return ""
@@ -293,7 +293,7 @@ class _Walk:
 
 
 def _typed(place: str) -> bool:
-    """Whether a place is an option of the command line and no line of a file."""
+    """Whether a value came from an option such as ``--set``, not from a file."""
     return place.startswith("--")
 
 

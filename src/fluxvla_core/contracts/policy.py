@@ -119,7 +119,7 @@ class Policy(Actor):
 
     @attribute
     def source(self) -> object:
-        """Where it comes from, for the record: a checkpoint's path, a server's address."""
+        """The origin of the policy, for the record: a checkpoint's path, a server's address."""
         return ""
 
     @attribute

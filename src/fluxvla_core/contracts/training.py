@@ -70,7 +70,7 @@ class VLA(Contract):
 
     @attribute
     def frozen_source(self) -> str | None:
-        """Where the frozen weights come from when the model is built (a package, a file).
+        """The origin of the frozen weights when the model is built (a package, a file).
 
         They are not saved in checkpoints, only their hash. None: they are saved. Any module inside
         the model may have this attribute for its own frozen weights.
@@ -103,13 +103,12 @@ class VLA(Contract):
 
     # -- an answer in two parts, which is what lets it be captured in a CUDA graph ---------------
 
-    def observe(self, **observation: Any) -> Mapping[str, Any]:
-        """What every denoising step needs of an observation: name -> tensor.
+    observe: Callable[..., Mapping[str, Any]]
+    """What every denoising step needs of an observation: name -> tensor.
 
-        Its parameters are those of ``predict_action`` that belong to the observation. What does
-        not depend on the noisy actions is computed here, once.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no observe()")
+    A method; its parameters are those of ``predict_action`` that belong to the observation. What
+    does not depend on the noisy actions is computed here, once.
+    """
 
     def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:
         """All denoising steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
@@ -152,7 +151,7 @@ class Dataset(Contract):
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
 
     seed: Any = None
-    """What its samples draw by, a whole number; None if unknown."""
+    """The seed of its random numbers, an integer; None if unknown."""
     datasets: Sequence[Any] = ()
     """The datasets that a mixture is made of."""
 
@@ -275,7 +274,7 @@ class _AnyTransform(Contract):
         raise NotImplementedError(f"{type(self).__name__} normalises no actions")
 
     def defer(self, sample: Sample) -> Sample:
-        """As ``__call__``, with the normalisation of pictures left to be done on the device."""
+        """As ``__call__``, but images are left for normalisation on the device."""
         raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
 
 
@@ -311,7 +310,7 @@ class Tokenizer(Contract):
     padding_side: str = "right"
     pad_token_id: int | None = None
     model_path: str | None = None
-    """Where it was loaded from, as a config says it."""
+    """The path or name that it was loaded from, as in a config."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

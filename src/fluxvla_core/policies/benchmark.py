@@ -201,9 +201,10 @@ def inference_work(policy: LocalPolicy, observation: Observation) -> dict[str, W
     plain = Eager(policy.model)
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=policy.precision == "bf16")
     with torch.inference_mode(), mixed:
-        if plain.parts is None:
+        parts = plain.parts
+        if parts is None:
             return {"forward": work_of(lambda: policy.model.predict_action(**batch))[1]}
-        seen, prefix = work_of(lambda: policy.model.observe(**plain.parts.observation(batch)))
+        seen, prefix = work_of(lambda: policy.model.observe(**parts.observation(batch)))
         tables = plain.tables()
         _, steps = work_of(lambda: policy.model.denoise(seen, batch["noise"], tables))
     return {"prefix": prefix, "denoise": steps}
@@ -260,7 +261,7 @@ def bandwidth_gb_s(device: str) -> tuple[float, str]:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What a figure belongs to: device, threads and versions."""
+    """The device, threads and versions that a measurement belongs to."""
     import torch
 
     gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None

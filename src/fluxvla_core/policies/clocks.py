@@ -57,6 +57,6 @@ def clock_of(device: str) -> Clock:
 def _event() -> Any:
     import torch
 
-    event = torch.cuda.Event(enable_timing=True)
+    event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
     event.record()
     return event

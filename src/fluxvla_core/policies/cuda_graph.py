@@ -36,8 +36,13 @@ WARM_UP = 3
 class Recorded(Protocol):
     """A function that was recorded with fixed memory."""
 
-    inputs: Tensors
-    outputs: Tensors
+    @property
+    def inputs(self) -> Tensors:
+        """The memory that it reads."""
+
+    @property
+    def outputs(self) -> Tensors:
+        """The memory that it writes."""
 
     def __call__(self, inputs: Tensors) -> Tensors:
         """Run it on ``inputs``, of the names, shapes and dtypes of the recording.
@@ -67,7 +72,7 @@ class CudaGraph:
         self.inputs = dict(inputs)
         device = next(iter(self.inputs.values())).device
         with torch.cuda.device(device):
-            side = torch.cuda.Stream()
+            side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
                 for _ in range(WARM_UP):

@@ -44,7 +44,7 @@ def load_policy(
         ckpt_path: a checkpoint's folder, or a work dir, whose newest undamaged one is taken.
         device: a torch device; a plain ``cuda`` is ``own_device``'s.
         dataset: table or object that prepares observations instead of the training dataset's
-            transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
+            transforms (a ``PrivateInferenceDataset``); what it does not set,
             ``norm_stats`` and ``processors``, is the checkpoint's.
         denormalize_action: table or object instead of the inverse of the training's
             normalisation; ``norm_stats`` is the checkpoint's if it is not set.
@@ -198,7 +198,7 @@ def _denormalize(given: Any, prepare: Any, checkpoint: Checkpoint) -> Any:
 
 
 def _taken(table: Any, registry: Registry, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Those ``defaults`` that the class which a table names has parameters for."""
+    """The ``defaults`` for which the class that a table names has parameters."""
     if not isinstance(table, Mapping) or not isinstance(table.get("type"), str):
         return {}
     names = parameters(registry.get(table["type"]))

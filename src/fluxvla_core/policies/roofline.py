@@ -73,9 +73,9 @@ def known_bandwidth(name: str) -> float | None:
     return next((rate for part, rate in BANDWIDTHS_GB_S if part in words), None)
 
 
-class _Counter(TorchDispatchMode):
+class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.kernels: list[tuple[int, int]] = []
 
     def __torch_dispatch__(
@@ -89,7 +89,8 @@ class _Counter(TorchDispatchMode):
             return func(*args, **named) if parts is NotImplemented else parts
         found = func(*args, **named)
         if packet is _CPU_ATTENTION:
-            flops = sdpa_flop_count(*(tensor.shape for tensor in args[:3]))
+            shapes = (tensor.shape for tensor in args[:3])
+            flops = sdpa_flop_count(*shapes)  # type: ignore[no-untyped-call]
         else:
             flops = flop_registry[packet](*args, **named, out_val=found)
         tensors = [t for t in tree_leaves((args, named, found)) if isinstance(t, Tensor)]

@@ -81,7 +81,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class EpisodeParts:
-    """What a run drives a robot with, in all of its episodes.
+    """The objects that all episodes of a run share.
 
     Args:
         robot: connected.
@@ -221,7 +221,7 @@ class Episode:
             raise
 
     def resend(self) -> None:
-        """As ``hold``, but whoever calls it stops the robot where something goes wrong."""
+        """As ``hold``, but on an error the caller has to stop the robot."""
         ticks = self._rate.ticks
         self._sender.hold()
         if self._rate.ticks == ticks:
@@ -341,7 +341,7 @@ class Episode:
         self._emit(Stopped(now, rule, problem, now - began, failure))
 
     def _state(self) -> Array | None:
-        """Where the robot is now; None where it does not tell, or only plays a recording."""
+        """The robot's current state; None if it does not tell, or only plays a recording."""
         try:
             measured = self._robot.state() if self._robot.follows else None
         except FluxError:

@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Phase(str, Enum):
-    """Where an episode is, as its record has it."""
+    """The phase of an episode, as its record names it."""
 
     __str__ = str.__str__  # its value, also in Python 3.10, which has no StrEnum
 

@@ -1,4 +1,4 @@
-"""``make_engine``: what commands the robot in a run, in this process or in one of its own."""
+"""``make_engine``: the object that commands a robot, with a control process or without."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from fluxvla_core.robot.tasks import Task
 
 @dataclass(frozen=True)
 class RunParts:
-    """What a run drives a robot with.
+    """The objects and settings of a run.
 
     Args:
         robot: not connected; where another process commands it, the part without commands.
@@ -64,7 +64,7 @@ class RunParts:
 def make_engine(
     parts: RunParts, layout: ProcessLayout, interrupts: Interrupts, thread: PolicyThread
 ) -> Engine:
-    """What commands the robot in one run.
+    """The engine of one run: ``RemoteEngine`` with a control process, else ``LocalEngine``.
 
     Args:
         parts: what the run drives the robot with.

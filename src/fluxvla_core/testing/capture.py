@@ -43,7 +43,7 @@ class Refused(AssertionError):
     """An operation that a capture does not allow."""
 
 
-class NoWaiting(TorchDispatchMode):
+class NoWaiting(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Refuses operations that would wait for a GPU, or copy from the host.
 
     Raises:
@@ -121,13 +121,13 @@ def check_capturable(function: Callable[[], Any]) -> Any:
     Raises:
         Refused: an operation of it would.
     """
-    with NoWaiting():
+    with NoWaiting():  # type: ignore[no-untyped-call]
         return function()
 
 
-class _Recorder(NoWaiting):
+class _Recorder(NoWaiting):  # type: ignore[no-untyped-call]
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.steps: list[tuple[Any, Any, Any, Any]] = []
 
     def __torch_dispatch__(

@@ -77,7 +77,8 @@ class EvalRunnerConformance(Conformance):
             load_plugin_files([_PUSHING])
 
     @pytest.fixture(scope="class")
-    def done(self, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    @classmethod
+    def done(cls, tmp_path_factory: pytest.TempPathFactory) -> Done:
         """Evaluations that several checks look at."""
         return Done(tmp_path_factory.mktemp("evaluations"))
 

@@ -47,7 +47,8 @@ def near(spec: EmbodimentSpec, place: Array, seconds: float) -> Array:
         0.0 if joint.by_speed else min(seconds * joint.velocity, (joint.upper - at) / 2.0)
         for joint, at in zip(spec.joints, place, strict=True)
     ]
-    return place + np.array(ways)
+    goal: Array = place + np.array(ways)
+    return goal
 
 
 class StandInRobot(Operator):

@@ -195,7 +195,7 @@ class TrainRunnerConformance(Conformance):
         self._compare(moved, tmp_path / "one", f"one process that goes on from {self.ranks}")
 
     def test_training_follows_from_its_seed(self, tmp_path: Path) -> None:
-        runs = [
+        runs: list[dict[str, Any]] = [
             {"config": self.config(max_steps=1, seed=seed), "work_dir": str(tmp_path / str(seed))}
             for seed in (42, 43)
         ]

@@ -108,7 +108,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.training.stop import StopRequest, stopped
         from fluxvla_core.training.trainer import Trainer
 
-        self._prepare()
+        self._join()
         self.progress = Progress()
         outcome = "failed"
         try:
@@ -152,11 +152,14 @@ class BaseTrainRunner(Strategy):
         distributed.stop(self.world, failed=outcome == "failed")
 
     def run_setup(self, n_train_examples: int) -> None:
-        """Build and wrap the model, its optimizer and its schedule.
+        """Join the other ranks, choose a checkpoint to resume from, and build what is trained.
+
+        The checkpoint is loaded by ``Trainer``, once the dataset is known.
 
         Args:
             n_train_examples: samples in the dataset; with the batch size, an epoch's steps.
         """
+        self._join()
         self.vla = self._build_vla()
         self.vla = self._wrap_model(self.vla)
         self.optimizer = self._build_optimizer()
@@ -171,7 +174,8 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.training.rng import seed_all
         from fluxvla_core.training.weights import base_to_note, start_training_from
 
-        self._prepare()
+        # For a ``run_setup`` that calls this method alone.
+        self._join()
         if "model" not in self.cfg:
             raise ConfigError(
                 "the config has no 'model' to train",
@@ -237,8 +241,8 @@ class BaseTrainRunner(Strategy):
         every = self.options.save_steps
         return every is not None and self.progress.step % every == 0
 
-    def _prepare(self) -> None:
-        """Join the other ranks, take over the work dir, choose a checkpoint to resume from."""
+    def _join(self) -> None:
+        """Join the other ranks, lock the work dir, choose a checkpoint to resume from; once."""
         from fluxvla_core.training import distributed
         from fluxvla_core.training.resuming import choose_checkpoint, lock_on_first
 

@@ -364,9 +364,9 @@ class Strategy(TrainRunner):
 
     @property
     def world(self) -> World:
-        """This process among those that train; known from ``_build_vla`` on."""
+        """This process among those that train; known from ``run_setup`` on."""
         if self._world is None:
-            raise RuntimeError("the world is known from _build_vla on")
+            raise RuntimeError("the world is known from run_setup on")
         return self._world
 
     @property

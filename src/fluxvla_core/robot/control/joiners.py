@@ -31,13 +31,18 @@ SAME_S = 5e-7
 
 
 class Ahead(ABC):
-    """What is known about the motion under way when a policy is asked; it does not change."""
+    """The chunk that is being executed when a policy is asked; immutable."""
 
     @abstractmethod
     def seen_at(self, observed: float, horizon: int) -> Continuation | None:
-        """For a chunk of ``horizon`` actions that answers an observation of time ``observed``.
+        """The rest of the current chunk at the times of the next chunk's actions.
 
-        None if what is known ends before the first of them.
+        Args:
+            observed: time of the observation that the next chunk answers.
+            horizon: how many actions the next chunk has.
+
+        Returns:
+            None if the current chunk ends before the next one's first action.
         """
 
 

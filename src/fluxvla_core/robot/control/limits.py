@@ -253,7 +253,7 @@ class CommandLimiter:
         return given.copy(), self._clamps(before, target, reachable, raw, given, braked)
 
     def snapshot(self) -> tuple[Array, ...]:
-        """What the next command depends on; for ``restore``."""
+        """The state that the next command depends on; for ``restore``."""
         smoothing = self._smoothing.snapshot()
         return self.last, self._raw.copy(), self._speed.copy(), self._target.copy(), smoothing
 

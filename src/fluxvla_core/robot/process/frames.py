@@ -71,7 +71,7 @@ def make_frame_memory(size: int) -> FrameMemory:
 
 @dataclass(frozen=True)
 class Look:
-    """What one look at a robot gave.
+    """One reading of a robot, as it is sent to the main process.
 
     Args:
         fields: JSON values.

@@ -96,6 +96,6 @@ class Link:
         self._times[self._own] = time.monotonic_ns()
 
     def silent_s(self) -> float:
-        """For how many seconds the other process has not run; 0 before it ever did."""
+        """How many seconds the other process has not run; 0 before it ever did."""
         last = self._times[self._other]
         return (time.monotonic_ns() - last) * 1e-9 if last else 0.0

@@ -244,7 +244,7 @@ class RemoteEngine(Engine):
             raise ending from self._original(ending)
 
     def _original(self, error: FluxError) -> BaseException | None:
-        """What was raised here and came back as ``error``: it has a traceback."""
+        """The exception that was raised in this process and came back as ``error``, if any."""
         known = [(e, error_fields(e)["what"]) for e in self._server.raised]
         return next((e for e, what in known if error.what.startswith(what)), None)
 
@@ -388,7 +388,7 @@ class RemoteEngine(Engine):
             raise self._gone(f"did not run for {silent_s:.1f} s and was killed")
 
     def _patience_s(self) -> float | None:
-        """For how long the control process may not run; None while it waits for the operator."""
+        """How long the control process may not run; None while it waits for the operator."""
         if self._server.client is None:
             return _HUNG_S if self._holding else None
         phase = self._server.phase

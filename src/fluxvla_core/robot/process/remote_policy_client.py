@@ -109,7 +109,7 @@ def _continued(ahead: Ahead | None) -> tuple[dict[str, Any], tuple[Array, ...]]:
 
 
 def ahead_of(message: Message) -> Ahead | None:
-    """What the policy has to continue, of the message ``ask``; in the main process."""
+    """The rest of the chunk in a message ``ASK``, which the policy has to continue."""
     if not message.arrays:
         return None
     actions, anchor = message.arrays

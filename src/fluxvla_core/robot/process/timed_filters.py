@@ -64,7 +64,7 @@ def timed_filters(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a filter made, ``(dim,)``; or what it raised."""
+    """A filter's output, ``(dim,)``, or the exception that it raised."""
 
     action: Array | None = None
     error: BaseException | None = None

@@ -1,4 +1,4 @@
-"""``UndividedRobot``: in the control process, a robot whose pictures are read there too."""
+"""``UndividedRobot``: a robot whose commands and images are both handled in the control process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fluxvla_core.robot.robot import Measured, Robot, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
-"""What a runner makes of one look, and the frame that it is of, where there is one."""
+"""Makes a runner's observation, and returns the frame that it was made of, if there is one."""
 
 
 class UndividedRobot(Robot):
@@ -94,7 +94,7 @@ class UndividedRobot(Robot):
         return self._states.popleft()
 
     def _look(self, channel: FrameChannel) -> Look:
-        """What one ``get_frame`` gives, or why it gives nothing."""
+        """The result of one ``get_frame``, or its error."""
         try:
             look = self._seen()
             if channel.fits(look):
@@ -131,7 +131,7 @@ class UndividedRobot(Robot):
         return look
 
     def _keep_state(self, found: Any, stamp: float | None) -> None:
-        """For the watch of the arm; what is wrong with it the main process finds, too."""
+        """Keep a valid state for the tracking check; the main process reports an invalid one."""
         try:
             state = as_state(found, self.embodiment, self.reading.name)
         except FluxError:

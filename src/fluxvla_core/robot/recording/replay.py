@@ -108,7 +108,7 @@ class ReplayOperator(Operator):
             )
 
     def get_frame(self) -> RobotFrame:
-        """What belongs together now; pictures in fresh arrays, depth and base where recorded.
+        """The matched readings of this moment; images in new arrays, depth and base if recorded.
 
         Streams are as late, and as far apart, as they were when the robot was looked at last. No
         stream runs backwards: the recorded looks bound what is shown between them.

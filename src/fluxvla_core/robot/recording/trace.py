@@ -48,7 +48,7 @@ safe to call from any thread."""
 
 
 class Log(Protocol):
-    """Where events go: JSON lines, or a bag that ROS tools open, which has the pictures too.
+    """A file that events are written to: JSON lines, or a bag for ROS tools, also with images.
 
     Both take the same events and give the same events back (``recording.recorded``). Every method
     is called in one thread, but for the constructor.
@@ -104,7 +104,7 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """What is asked for beyond events and videos.
+    """What a complete recording holds beyond events and videos.
 
     Args:
         names: ``state`` and ``action`` -> joint names.
@@ -288,7 +288,7 @@ class EpisodeTrace:
         self._videos[camera].add(image)
 
     def _between(self) -> None:
-        """What is due from time to time."""
+        """Do the periodic work: poll, flush."""
         now = time.monotonic()
         if now - self._looked >= _POLL_S:
             self._looked = now

@@ -397,3 +397,13 @@ def test_a_model_that_inherits_can_be_given_another_class_as_fsdp_does():
         model = type("Model", bases, {})()
         model.__class__ = type("ShardedModel", (Sharded, type(model)), {})
         assert isinstance(model, Sharded)
+
+
+def test_a_model_chooses_what_of_an_observation_it_takes():
+    class Looks(VLA, nn.Module):
+        def forward(self, x): ...
+        def predict_action(self, images, lang_tokens, noise): ...
+        def observe(self, images, lang_tokens, lang_masks=None): ...
+        def denoise(self, seen, noise, tables): ...
+
+    check_class("vlas", Looks, "here")

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.rtc import DELAYS, WAYS
 from benchmarks.step_loop import MOST_MS, ONE_LAYER, SMALL
 from fluxvla_core.robot.control.joiners import METHODS
 
@@ -95,3 +96,24 @@ def test_for_which_steps_the_loop_costs_nothing_to_speak_of() -> None:
     assert f"(the goal there is {MOST_MS})" in text
     (low, high) = map(float, re.findall(r"on the machine: ([\d.]+) to ([\d.]+), where", text)[0])
     assert low <= cases[ONE_LAYER]["own_cpu_ms"] <= high
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_how_chunks_are_joined_at_each_delay(way: str) -> None:
+    found = [row for row in results("rtc")["rows"] if row["chunk_joining"] == way]
+    assert tuple(row["delay_s"] for row in found) == DELAYS
+    table = rows("control", "| delay 0 / 50 / 100 / 200 / 300 ms |")
+    ((_, *said),) = (row for row in table if row[0] == f"`{way}`")
+    (episodes,) = {row["episodes"] for row in found}
+    assert f"{episodes} episodes per row and delay" in page("control")
+    assert {row["successes"] for row in found} == {0}
+    assert "completes no hand-over yet" in page("control")
+    assert {row["late"] for row in found} == {0.0}
+    assert "No chunk was late" in page("control")
+    assert f"after {results('rtc')['step']} training steps" in page("control")
+    assert said == [
+        joined(found, "gap_rad", 2),
+        joined(found, "largest_step_rad", 2),
+        joined(found, "acceleration_rms", 1),
+        joined(found, "jerk_rms", 0),
+    ]

@@ -77,15 +77,20 @@ class Wavering:
         return mixed
 
 
-def episode(
-    policy: Any, method: str, latency: float, seed: int, limits: EmbodimentSpec = ARMS
-) -> dict[str, float]:
-    """One episode's figures; ``policy`` None is the one that wavers."""
+def drive(
+    policy: Any,
+    method: str,
+    latency: float,
+    seed: int,
+    limits: EmbodimentSpec = ARMS,
+    task: str = "2",
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """One episode's result and the events of its record; ``policy`` None is the one that wavers."""
     operator = AlohaSimOperator(
         camera_names=("top",), height=CAMERA.height, width=CAMERA.width, seed=500 + seed
     )
     with tempfile.TemporaryDirectory() as folder:
-        context = RunContext(config={}, section="inference", work_dir=Path(folder), task="2")
+        context = RunContext(config={}, section="inference", work_dir=Path(folder), task=task)
         table = {
             "type": "AlohaInferenceRunner",
             "policy": policy or Wavering(operator.clock.now),
@@ -103,17 +108,29 @@ def episode(
         runner.run_setup()
         result = runner.run()
         (trace,) = Path(folder).glob("inference/*/trace.jsonl")
-        rows = [json.loads(line) for line in trace.read_text().splitlines()]
-    sent = [row for row in rows if row["event"] == "command" and row["phase"] == "run"]
-    wanted, commands = (
-        np.array([row[key] for row in sent])[:, ARM_COLUMNS] for key in ("wanted", "command")
+        return result, [json.loads(line) for line in trace.read_text().splitlines()]
+
+
+def commands(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The commands of a record that a policy is behind."""
+    return [row for row in events if row["event"] == "command" and row["phase"] == "run"]
+
+
+def episode(
+    policy: Any, method: str, latency: float, seed: int, limits: EmbodimentSpec = ARMS
+) -> dict[str, float]:
+    """One episode's figures; ``policy`` None is the one that wavers."""
+    result, events = drive(policy, method, latency, seed, limits)
+    wanted, sent = (
+        np.array([row[key] for row in commands(events)])[:, ARM_COLUMNS]
+        for key in ("wanted", "command")
     )
-    jerk = np.diff(commands, 3, axis=0) * HZ**3
+    jerk = np.diff(sent, 3, axis=0) * HZ**3
     return {
         "success": float(bool(result["success"])),
         "seconds": result["steps"] / HZ,
         "largest_step_rad": float(np.abs(np.diff(wanted, axis=0)).max()),
-        "acceleration_rms": float(np.sqrt(np.square(np.diff(commands, 2, axis=0) * HZ**2).mean())),
+        "acceleration_rms": float(np.sqrt(np.square(np.diff(sent, 2, axis=0) * HZ**2).mean())),
         "jerk_rms": float(np.sqrt(np.square(jerk).mean())),
         "largest_jerk": float(np.abs(jerk).max()),
     }

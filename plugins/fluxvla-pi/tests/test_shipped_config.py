@@ -13,7 +13,9 @@ from fluxvla_pi.pi05 import PI05FlowMatching
 from safetensors.torch import save_file
 
 from fluxvla_core import Camera, EmbodimentSpec, Joint
+from fluxvla_core.build import build_transform_from_cfg, build_vla_from_cfg
 from fluxvla_core.cli.main import main
+from fluxvla_core.config.load import load_config
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
 
@@ -100,3 +102,25 @@ def test_it_trains_from_published_weights_and_acts(tmp_path, monkeypatch):
     )
     assert found.shape == (50, 14)
     assert np.isfinite(found).all()
+
+
+TINY = ROOT / "configs" / "aloha_sim_pi05_tiny.py"
+
+
+def test_nothing_is_wrong_with_the_tiny_one(capsys):
+    pytest.importorskip("fluxvla_sim")
+    assert main(["config", "check", str(TINY)]) == 0
+    assert "no problems" in capsys.readouterr().out
+    model = load_config(TINY).tree["model"]
+    count = sum(p.numel() for p in build_vla_from_cfg(model).parameters())
+    assert f"{count / 1e6:.1f} million parameters" in TINY.read_text()
+
+
+@pytest.mark.parametrize("value", [-9.0, -0.5, 9.0])
+def test_prompts_of_any_state_fit_the_tiny_one(value):
+    tree = load_config(TINY).tree
+    tables = tree["train_dataloader"]["dataset"]["transforms"]
+    (prompt, tokens) = (build_transform_from_cfg(t) for t in tables if "Prompt" in t["type"])
+    for text in tree["inference"]["task_descriptions"].values():
+        sample = prompt({"task_description": text, "states": np.full(14, value)})
+        assert tokens(sample)["lang_masks"].sum() <= tables[-2]["max_len"]

@@ -22,7 +22,7 @@ WRONG = re.compile(r"cannot be|is not known|have \d+ numbers|has no camera|no tr
     [name if name == QUICK else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
 )
 def test_a_recipe_is_complete(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for package in ("torch", "transformers", "peft", "deepspeed"):
+    for package in ("torch", "transformers", "peft"):
         pytest.importorskip(package)
     words = ["--config", str(CONFIGS / f"{name}.py"), "--section", "runner", "--dry-run"]
     assert main(["run", *words, "--nproc", "2", "--log-format", "json"]) == 0

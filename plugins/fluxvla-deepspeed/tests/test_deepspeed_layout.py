@@ -40,20 +40,11 @@ def held(work_dir, stage):
     with runner.sync_gradients(last=True):
         runner.backward(runner._training_step(batch))
     zero, parameters = runner.vla.optimizer, list(runner.model.parameters())
-    if stage == 3:
-        assert zero.grad_partitions_flat_buffer.nbytes == said.gradients
-        parts = [p.ds_tensor.data for p in parameters]
-        flat = sum(t.nbytes for t in zero.fp32_partitioned_groups_flat)
-        assert sum(t.numel() * t.element_size() for t in parts) + size(runner.model.buffers()) == (
-            said.parameters
-        )
-        assert flat == sum(t.nbytes for group in said.optimized for t in group)
-    else:
-        flats = [*zero.bit16_groups_flat, *zero.single_partition_of_fp32_groups]
-        frozen = [p for p in parameters if not p.requires_grad]
-        assert size([*flats, *frozen, *runner.model.buffers()]) == said.parameters
-        owned = {p.untyped_storage()._cdata for p in parameters if p.requires_grad}
-        assert owned == {t.untyped_storage()._cdata for t in zero.bit16_groups_flat}
+    flats = [*zero.bit16_groups_flat, *zero.single_partition_of_fp32_groups]
+    frozen = [p for p in parameters if not p.requires_grad]
+    assert size([*flats, *frozen, *runner.model.buffers()]) == said.parameters
+    owned = {p.untyped_storage()._cdata for p in parameters if p.requires_grad}
+    assert owned == {t.untyped_storage()._cdata for t in zero.bit16_groups_flat}
     runner.optimizer_step()
     told = optimizer_bytes(runner.optimizer_settings.build, said.optimized)
     assert told == state_bytes(runner.optimizer)
@@ -61,7 +52,7 @@ def held(work_dir, stage):
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("deepspeed") is None, reason="DeepSpeed is not installed")
-@pytest.mark.parametrize("stage", [1, 2, 3])
+@pytest.mark.parametrize("stage", [1, 2])
 def test_the_parts_of_two_processes(tmp_path, stage):
     assert run_ranks(2, held, tmp_path, stage) == [0, 0]
 

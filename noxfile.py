@@ -4,7 +4,10 @@
     nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
     nox -s nightly [-- PYTEST ARGUMENTS]            the tests that take minutes each
     nox -s oracles                                  other implementations, again
+    nox -s skew [-- COMMIT]                         the released core with plugins at head, ...
+    nox -s py313 [-- PYTEST ARGUMENTS]              what needs no torch, on Python 3.13
     nox -s lint | types | layers | bench            one part of it
+    nox -s docs [-- serve]                          the documentation as a site, in site/
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
 """
@@ -25,12 +28,15 @@ sys.path.insert(0, str(ROOT))
 from tools import (  # noqa: E402
     envs,
     golden,
+    joined_env,
     lerobot_env,
     needs,
     oracle_env,
     project,
+    pythons,
     rendering,
     shell,
+    skew_check,
     skipped,
     torch_build,
     unseen,
@@ -52,6 +58,8 @@ OPTIONAL = {
     "fluxvla-libero": "libero",
     "fluxvla-metaworld": "metaworld",
 }
+# Counts as released until there is a tag v...: the state at which the contracts were 1.0.
+RELEASED = "bac7408"
 SKIPPED = ROOT / ".nox" / "skipped.jsonl"
 PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
 SLOWEST = "--durations=15"
@@ -106,12 +114,16 @@ def environments(session: nox.Session) -> None:
     """What the tests need besides .nox/dev: LeRobot to compare with, and the demo's environment."""
     with Steps(session) as step:
         step("LeRobot", lambda: lerobot_env.prepare(session.log))
+        step("LeRobot's policies", lambda: oracle_env.prepare_044(session.log))
         step("demo", lambda: demo_env(session))
 
 
 @nox.session
 def oracles(session: nox.Session) -> None:
-    """What other implementations compute, computed again and compared with the golden files."""
+    """What other implementations compute, computed again and compared with the golden files.
+
+    And the tests of fluxvla-lerobot that need LeRobot, with the LeRobot that most are made with.
+    """
     with Steps(session) as step:
         made: dict[Path, Path] = {}
         by_hand = [p for p in golden.programs(ROOT) if p.environment is None]
@@ -135,6 +147,41 @@ def oracles(session: nox.Session) -> None:
                 words = ["-m", "tools.golden", folder, committed, *some]
                 name = f"compare {committed.relative_to(ROOT).as_posix()}"
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
+        dev = dev_env(session)
+        make_renderable(session, dev)
+        both = joined_env.join(env, dev)
+        words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
+        variables = {**rendering.VARIABLES, **alone}
+        step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))
+
+
+@nox.session
+def skew(session: nox.Session) -> None:
+    """The released core with plugins at head, and released plugins with the core at head."""
+    place = ROOT / ".nox" / "skew"
+    with Steps(session) as step:
+        builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
+        commit = skew_check.released(ROOT, RELEASED, *session.posargs[:1])
+        before = skew_check.unpack(ROOT, commit, place / "released")
+        pairs = (
+            skew_check.Pair(f"core of {commit[:7]}, plugins at head", before, ROOT),
+            skew_check.Pair(f"core at head, plugins of {commit[:7]}", ROOT, before),
+        )
+        for number, pair in enumerate(pairs):
+            folder = place / str(number)
+            for check in (skew_check.check, skew_check.check_refusal):
+                words = (pair, folder, builder)
+                step(f"{check.__name__}: {pair.name}", lambda c=check, w=words: print(c(*w)))
+
+
+@nox.session
+def py313(session: nox.Session) -> None:
+    """What needs no torch, on Python 3.13: core, robots, hooks, kits, and the command line."""
+    with Steps(session) as step:
+        pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
+        env = pythons.filled(ROOT, nox.project.dependency_groups(pyproject, "dev"), session.log)
+        words = session.posargs or pythons.TESTED
+        step("pytest", lambda: env.run("pytest", *words, cwd=ROOT, env=rendering.VARIABLES))
 
 
 @nox.session
@@ -166,6 +213,15 @@ def layers(session: nox.Session) -> None:
     with Steps(session) as step:
         dev = dev_env(session)
         step("layers", lambda: dev.run("lint-imports", *session.posargs, cwd=ROOT))
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation as a site, in site/, without a dead link; ``-- serve`` shows it."""
+    with Steps(session) as step:
+        env = docs_env(session)
+        words = ["-m", "tools.docs", *session.posargs]
+        step("docs", lambda: env.run("python", *words, cwd=ROOT))
 
 
 @nox.session
@@ -215,6 +271,21 @@ def dev_env(session: nox.Session) -> envs.Env:
         env.run("python", "-m", "pip", "uninstall", "--yes", "--quiet", "opencv-python")
 
     env.filled(base_of((*needs, *sum(extras.values(), ()))), parts, base, install)
+    return env
+
+
+def docs_env(session: nox.Session) -> envs.Env:
+    """.nox/docs: what builds the site, and what the core cannot be imported without."""
+    env = envs.Env(ROOT / ".nox" / "docs")
+    pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
+    needs = nox.project.dependency_groups(pyproject, "docs")
+    needs = (*needs, *pyproject["project"]["dependencies"])
+
+    def install() -> None:
+        session.log(f"installing {len(needs)} packages and their dependencies")
+        env.pip_install(*needs, constraints=project.CONSTRAINTS)
+
+    env.filled(base_of(needs), {}, install, lambda changed, fresh: None)
     return env
 
 

@@ -101,38 +101,38 @@ def no_record(stage: Stage) -> None:
 
 
 def at(row: int, column: int, value: float) -> Callable[[Array], Array]:
-    def spoil(keyframes: Array) -> Array:
-        keyframes[row, column] = value
-        return keyframes
+    def spoil(actions: Array) -> Array:
+        actions[row, column] = value
+        return actions
 
     return spoil
 
 
-def jump(keyframes: Array) -> Array:
-    # Within the limits at every keyframe, but for a way that nothing explains.
-    keyframes[:, 1] = -2.0
-    keyframes[::2, 1] = 2.0
-    return keyframes
+def jump(actions: Array) -> Array:
+    # Within the limits at every action, but for a way that nothing explains.
+    actions[:, 1] = -2.0
+    actions[::2, 1] = 2.0
+    return actions
 
 
-def hasty(keyframes: Array) -> Array:
-    keyframes[:, 0] = np.where(np.arange(len(keyframes)) % 4 < 2, -0.4, 0.4)
-    return keyframes
+def hasty(actions: Array) -> Array:
+    actions[:, 0] = np.where(np.arange(len(actions)) % 4 < 2, -0.4, 0.4)
+    return actions
 
 
-def beyond(keyframes: Array) -> Array:
-    keyframes[:, 0] = np.linspace(0.9, 1.2, len(keyframes))
-    return keyframes
+def beyond(actions: Array) -> Array:
+    actions[:, 0] = np.linspace(0.9, 1.2, len(actions))
+    return actions
 
 
-def diverge(keyframes: Array) -> Array:
+def diverge(actions: Array) -> Array:
     raise ValueError("out of memory")
 
 
 def pause(seconds: float) -> Callable[[Array], Array]:
-    def spoil(keyframes: Array) -> Array:
+    def spoil(actions: Array) -> Array:
         time.sleep(seconds)
-        return keyframes
+        return actions
 
     return spoil
 
@@ -291,8 +291,8 @@ ROBOT = [
     ),
 ]
 POLICY = [
-    Fault("NaN in a chunk", chunk(at(3, 1, np.nan)), "not finite: keyframe 3, wrist", rule="chunk"),
-    Fault("Inf in a chunk", chunk(at(3, 1, np.inf)), "not finite: keyframe 3, wrist", rule="chunk"),
+    Fault("NaN in a chunk", chunk(at(3, 1, np.nan)), "not finite: action 3, wrist", rule="chunk"),
+    Fault("Inf in a chunk", chunk(at(3, 1, np.inf)), "not finite: action 3, wrist", rule="chunk"),
     Fault("chunk of a wrong shape", chunk(lambda c: c[:, :2]), "chunk has shape", rule="chunk"),
     Fault("chunk that jumps", chunk(jump), "wants wrist to jump", rule="chunk"),
     Fault("chunk far beyond a position limit", chunk(at(4, 0, 9.0)), "far beyond", rule="chunk"),

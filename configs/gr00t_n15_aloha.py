@@ -113,5 +113,6 @@ inference = dict(
         transforms=TRANSFORMS,
     ),
     denormalize_action=dict(type="DenormalizePrivateAction", norm_type="mean_std", action_dim=14),
+    # A real robot also needs arms="arx_x5" or "piper": connecting is refused without it.
     operator=dict(type="AlohaOperator"),
 )

@@ -54,6 +54,7 @@ inference = dict(
     seed=7,
     task_descriptions={"1": "put the yellow corn into the pot"},
     execute_horizon=HORIZON,
+    # A real robot also needs arms="arx_x5" or "piper": connecting is refused without it.
     operator=dict(
         type="AlohaOperator",
         camera_names=("cam_high", "cam_left_wrist", "cam_right_wrist"),

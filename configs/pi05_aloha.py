@@ -99,5 +99,6 @@ inference = dict(
     seed=7,
     task_descriptions=TASKS,
     execute_horizon=25,
+    # A real robot also needs arms="arx_x5" or "piper": connecting is refused without it.
     operator=dict(type="AlohaOperator"),
 )

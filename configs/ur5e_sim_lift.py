@@ -10,7 +10,7 @@ fluxvla run --config configs/ur5e_sim_lift.py --section inference --task 1
 _base_ = "aloha_sim_transfer.py"
 
 DATASET = "work_dirs/ur5e_sim/dataset"
-HORIZON = 10  # keyframes of 0.1 s
+HORIZON = 10  # actions of 0.1 s
 
 model = dict(
     vla_head=dict(type="FlowMatchingHead", horizon=HORIZON, action_dim=7),
@@ -65,6 +65,7 @@ inference = dict(
     task_descriptions={"1": "pick up the red cube"},
     execute_horizon=5,
     max_publish_step=300,
-    # What every UR takes, simulated or real: ``type`` alone says which it is.
+    # Other URs, real ones too, take the same values under another ``type``. UROperator sends 125
+    # commands a second, so that an episode needs a larger max_publish_step (ur5e_sim_ros2.py).
     operator=dict(type="URSimOperator", camera_names=("front", "wrist"), height=96, width=128),
 )

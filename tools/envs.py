@@ -105,6 +105,8 @@ class Env:
         if not changed and not fresh:
             return False
         if fresh:
+            if self.root.is_symlink():  # another checkout's, which is not to be emptied
+                self.root.unlink()
             self.create()
             install_base()
         unchanged = {name: text for name, text in parts.items() if name not in changed}

@@ -1,8 +1,8 @@
 """From config tables to objects: ``build_<kind>_from_cfg`` for each registry.
 
 A table is built one level deep: ``type`` names the class, the other keys are its arguments, and a
-class builds its own children (a runner its operator, a dataset its transforms). That is how the
-specification's code does it, and it leaves a class free to fill in what the config left out.
+class builds its own children (a runner its operator, a dataset its transforms), as upstream
+FluxVLA's classes do. So a class can fill in what the config left out.
 """
 
 from __future__ import annotations

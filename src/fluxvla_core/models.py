@@ -13,17 +13,24 @@ if TYPE_CHECKING:
     from fluxvla_core.build import build_projector_from_cfg as build_projector_from_cfg
     from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
     from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
+    from fluxvla_core.checkpoints.foreign import chosen_robot as chosen_robot
+    from fluxvla_core.checkpoints.foreign import foreign_folder as foreign_folder
     from fluxvla_core.checkpoints.foreign import renamed as renamed
     from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
+    from fluxvla_core.checkpoints.foreign import without_cameras as without_cameras
     from fluxvla_core.checkpoints.parts import Stored as Stored
     from fluxvla_core.contracts.checkpoint_format import CheckpointFormat as CheckpointFormat
     from fluxvla_core.contracts.checkpoint_format import ForeignCheckpoint as ForeignCheckpoint
     from fluxvla_core.contracts.frame import Observation as Observation
     from fluxvla_core.contracts.policy import Policy as Policy
     from fluxvla_core.contracts.training import VLA as VLA
+    from fluxvla_core.contracts.training import PartWeights as PartWeights
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
     from fluxvla_core.policies.loading import load_policy as load_policy
+    from fluxvla_core.training.foreign import embodiment_in as embodiment_in
+    from fluxvla_core.training.model import built_without_memory as built_without_memory
+    from fluxvla_core.training.model import has_values as has_values
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -35,13 +42,21 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "build_vision_backbone_from_cfg",
             "build_vlm_backbone_from_cfg",
         ],
-        "fluxvla_core.checkpoints.foreign": ["renamed", "safetensors_in"],
+        "fluxvla_core.checkpoints.foreign": [
+            "chosen_robot",
+            "foreign_folder",
+            "renamed",
+            "safetensors_in",
+            "without_cameras",
+        ],
         "fluxvla_core.checkpoints.parts": ["Stored"],
         "fluxvla_core.contracts.checkpoint_format": ["CheckpointFormat", "ForeignCheckpoint"],
         "fluxvla_core.contracts.frame": ["Observation"],
         "fluxvla_core.contracts.policy": ["Policy"],
-        "fluxvla_core.contracts.training": ["VLA"],
+        "fluxvla_core.contracts.training": ["PartWeights", "VLA"],
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
         "fluxvla_core.policies.loading": ["load_policy"],
+        "fluxvla_core.training.model": ["built_without_memory", "has_values"],
+        "fluxvla_core.training.foreign": ["embodiment_in"],
     },
 )

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks import memory
 from benchmarks.rtc import DELAYS, WAYS
 from benchmarks.step_loop import MOST_MS, ONE_LAYER, SMALL
 from fluxvla_core.robot.control.joiners import METHODS
@@ -117,3 +118,43 @@ def test_how_chunks_are_joined_at_each_delay(way: str) -> None:
         joined(found, "acceleration_rms", 1),
         joined(found, "jerk_rms", 0),
     ]
+
+
+def test_the_memory_of_each_family_is_the_recorded_one() -> None:
+    families = results("memory")["families"]
+    assert list(families) == list(memory.FAMILIES)
+    said = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    assert memory.table(families) in said
+    for family in families.values():
+        if family["published"] is not None and family["published"] != family["parameters"]:
+            assert f"{family['published']:,}" in said
+
+
+def test_parameters_are_as_many_as_published() -> None:
+    """Where the model has fewer, the rest is never read: the plugins' tests of names say what."""
+    families = results("memory")["families"]
+    for name in ("SmolVLA", "OpenVLA"):
+        assert families[name]["parameters"] == families[name]["published"], name
+    for file, name in (("pi0-openpi", "PI0"), ("pi05-openpi", "PI0.5")):
+        keys = ROOT / "plugins" / "fluxvla-pi" / "tests" / "keys" / f"{file}.json"
+        assert json.loads(keys.read_text())["parameters"] == families[name]["published"]
+        # The expert embeds no words.
+        unread = families[name]["published"] - families[name]["parameters"]
+        assert unread == 257152 * 1024
+
+
+QUICK = ("CompactVLA", "ACT")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+        for name in memory.FAMILIES
+    ],
+)
+def test_the_recorded_memory_is_what_the_program_counts(name: str) -> None:
+    for package in ("deepspeed", "peft", "transformers"):
+        pytest.importorskip(package)
+    found = json.loads(json.dumps(memory.of_family(memory.FAMILIES[name])))
+    assert found == results("memory")["families"][name]

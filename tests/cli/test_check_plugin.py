@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.cli.check_plugin import KITS
+from fluxvla_core.cli.check_plugin import EVALUATES, KITS, TRAINS
 from fluxvla_core.registries import REGISTRIES
 
 from .conftest import Fluxvla
@@ -66,6 +66,13 @@ class TestChecked(OperatorConformance):
 """
 
 
+DRIVER = """
+from fluxvla_core import RUNNERS, BaseInferenceRunner
+
+@RUNNERS.register_module()
+class CheckedInferenceRunner(BaseInferenceRunner):
+    api = "1.0"
+"""
 KITS_BEGIN = "class TestOther"
 
 
@@ -115,13 +122,31 @@ def test_arguments_reach_the_constructor(fluxvla: Fluxvla) -> None:
     assert "LowPass: share must be above 0" in " ".join(ended.out.split())
 
 
+def test_a_runner_that_drives_a_robot_has_a_kit(fluxvla: Fluxvla, tmp_path: Path) -> None:
+    path = tmp_path / "drive.py"
+    path.write_text(DRIVER)
+    ended = fluxvla("plugins", "check", "CheckedInferenceRunner", "--plugin", str(path))
+    assert (ended.code, ended.out.splitlines()[-1]) == (0, "CheckedInferenceRunner: 15 ok")
+    ended = fluxvla("plugins", "check", "CheckedInferenceRunner", "--set", "free_tasks=true")
+    assert ended.code == 1
+    assert "--task '7 no such task' gave None" in " ".join(ended.out.split())
+
+
+def test_a_runner_that_evaluates_has_a_kit(fluxvla: Fluxvla) -> None:
+    ended = fluxvla("plugins", "check", "EvalRunner", "--set", "max_steps=2")
+    assert ended.code == 1
+    said = " ".join(ended.out.split())
+    assert "FAILED a policy that always succeeds does 'expert' failed in 12 of 12" in said
+    assert ended.out.splitlines()[-1] == "EvalRunner: 11 ok, 1 FAILED"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["LowPas"], "did you mean 'LowPass'?"),
         (["CheckedOperater"], "did you mean 'CheckedOperator'?"),
         (["AdamW"], "for which there is no kit; there are kits for action_filters"),
-        (["EvalRunner"], "is a runner that does not train"),
+        (["RobotEvalRunner"], "neither trains, nor takes an operator and a policy"),
         (["CheckedTrainRunner"], "tested in processes of their own"),
         (["LowPass", "--set", "share"], "expected KEY=VALUE"),
         (["LowPass", "--set", "=1"], "expected KEY=VALUE"),
@@ -198,4 +223,5 @@ def test_every_kit_is_of_a_registry() -> None:
     from fluxvla_core import testing
 
     assert set(KITS) <= set(REGISTRIES)
-    assert set(KITS.values()) == {n for n in testing.__all__ if n.endswith("Conformance")}
+    kits = {n for n in testing.__all__ if n.endswith("Conformance")}
+    assert {*KITS.values(), TRAINS, EVALUATES} == kits

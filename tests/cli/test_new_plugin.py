@@ -112,6 +112,9 @@ def test_a_name_of_any_length_is_formatted(rendered: Rendered) -> None:
         for name in ("q", "a" * 24):
             words = ["new-plugin", name, "--kind", kind, "--dir", place / kind]
             assert rendered.python("-m", "fluxvla_core", *words).returncode == 0
+            if kind == "operator":
+                words[-1] = place / "ros2"
+                assert rendered.python("-m", "fluxvla_core", *words, "--ros2").returncode == 0
     for words in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = rendered.python("-m", "ruff", *words, place)
         assert done.returncode == 0, done.stdout
@@ -179,6 +182,115 @@ def test_a_mobile_robot_passes_its_kit_and_stops_its_base(rendered: Rendered) ->
     assert said == "[0.0, 0.0] ('base_forward', 'base_turn')\n"
 
 
+ROVER = "rolling-rover"
+
+
+@pytest.fixture(scope="module")
+def ros2_rover(rendered: Rendered) -> Path:
+    """A robot on ROS 2, with a base and a camera, installed beside the others."""
+    place = rendered.folder / "ros2"
+    words = ["new-plugin", ROVER, "--kind", "operator", "--ros2", "--mobile-base", "--joints", "9"]
+    words += ["--cameras", "1", "--dir", str(place)]
+    assert rendered.python("-m", "fluxvla_core", *words).returncode == 0
+    folder = place / f"fluxvla-{ROVER}"
+    install = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    done = rendered.python(*install, "--target", rendered.site, folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.network
+def test_a_robot_on_ros2_passes_its_kit_and_runs(rendered: Rendered, ros2_rover: Path) -> None:
+    """In domains that its own tests claim, on this machine alone."""
+    pytest.importorskip("rclpy")
+    words = [
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        "--junitxml",
+        "r.xml",
+    ]
+    done = rendered.python(*words, ros2_rover / "tests")
+    assert done.returncode == 0, done.stdout
+    cases = list(ElementTree.parse(rendered.folder / "r.xml").iter("testcase"))
+    ran = {case.get("name") for case in cases if len(case) == 0}
+    assert {
+        "test_the_command_of_the_readme_works",
+        "test_a_command_moves_its_own_joint",
+        "test_a_later_stop_sends_the_arm_nothing",
+        "test_a_command_of_one_part_is_seen_by_the_other",
+    } <= ran
+
+
+def test_a_robot_on_ros2_is_described_and_its_tests_skipped_without_it(
+    rendered: Rendered, ros2_rover: Path
+) -> None:
+    stub = rendered.folder / "no_ros"
+    stub.mkdir()
+    (stub / "rclpy.py").write_text("raise ImportError('no ROS 2 here')\n")
+    env = {**rendered.env(), "PYTHONPATH": f"{stub}{os.pathsep}{rendered.site}"}
+    words = ["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    done = subprocess.run(
+        [sys.executable, *words, str(ros2_rover / "tests")],
+        cwd=rendered.folder,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "pip install 'fluxvla-core[ros2]'" in done.stdout
+    alone = [sys.executable, "-m", "fluxvla_rolling_rover.driver"]
+    done = subprocess.run(alone, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "pip install 'fluxvla-core[ros2]'" in done.stderr
+    assert "Traceback" not in done.stderr
+    check = [sys.executable, "-m", "fluxvla_core", "config", "check", "configs/rolling_rover.toml"]
+    done = subprocess.run(
+        check, cwd=ros2_rover, env=env, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_robot_on_ros2_is_formatted_for_any_joints_and_cameras(rendered: Rendered) -> None:
+    place = rendered.folder / "shapes"
+    for number, more in enumerate((["--cameras", "0"], ["--joints", "1", "--mobile-base"])):
+        words = ["new-plugin", f"shape{number}", "--kind", "operator", "--ros2", *more]
+        assert rendered.python("-m", "fluxvla_core", *words, "--dir", place).returncode == 0
+    for words in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
+        done = rendered.python("-m", "ruff", *words, place)
+        assert done.returncode == 0, done.stdout
+
+
+def test_a_robot_requires_what_its_episodes_videos_are_written_with(
+    fluxvla: Fluxvla, tmp_path: Path
+) -> None:
+    """Without PyAV a run in an environment of its own ends with an error."""
+    for name, more in (("plain", []), ("nodes", ["--ros2"])):
+        words = ["new-plugin", name, "--kind", "operator", "--dir", str(tmp_path)]
+        assert fluxvla(*words, *more).code == 0
+        text = (tmp_path / f"fluxvla-{name}" / "pyproject.toml").read_text()
+        assert 'dependencies = ["fluxvla-core[data]>=' in text
+
+
+def test_a_robot_on_ros2_says_how_to_stand_in_for_it(fluxvla: Fluxvla, tmp_path: Path) -> None:
+    ended = fluxvla("new-plugin", "rover", "--kind", "operator", "--ros2", "--dir", str(tmp_path))
+    assert ended.code == 0, ended.err
+    said = ended.out.splitlines()
+    assert said[3].endswith(
+        "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST  # here and in another terminal"
+    )
+    assert said[4] == "  python -m fluxvla_rover.driver  # there: it stands in for the robot"
+    assert said[5].endswith("fluxvla run --config configs/rover.toml --task 1")
+    ci = (tmp_path / "fluxvla-rover" / ".github" / "workflows" / "ci.yml").read_text()
+    assert "-e '.[testing]' 'fluxvla-core[ros2]'" in ci
+
+
 def test_a_robot_has_as_many_joints_and_cameras_as_asked(
     fluxvla: Fluxvla, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -222,7 +334,9 @@ def test_bad_input_is_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("option", [["--joints", "2"], ["--cameras", "2"], ["--mobile-base"]])
+@pytest.mark.parametrize(
+    "option", [["--joints", "2"], ["--cameras", "2"], ["--mobile-base"], ["--ros2"]]
+)
 def test_what_is_said_of_a_robot_is_refused_of_others(
     fluxvla: Fluxvla, tmp_path: Path, option: list[str]
 ) -> None:
@@ -261,7 +375,8 @@ def test_names_follow_from_one_another() -> None:
 
 
 def test_every_template_is_of_a_kind() -> None:
-    used = {scaffold.COMMON, *(folder for kind in KINDS.values() for folder in kind.folders)}
+    kinds = (*KINDS.values(), scaffold.ROS2)
+    used = {scaffold.COMMON, *(folder for kind in kinds for folder in kind.folders)}
     assert {path.name for path in scaffold.TEMPLATES.iterdir()} == used
     files = [path for path in scaffold.TEMPLATES.rglob("*") if path.is_file()]
     assert {path.suffix for path in files} == {scaffold.SUFFIX}

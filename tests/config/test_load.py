@@ -195,7 +195,7 @@ def test_two_bases_may_share_a_base(write: Write) -> None:
 def test_a_circle_is_named(write: Write) -> None:
     write("a.py", "_base_ = 'b.toml'\n")
     write("b.toml", "_base_ = 'a.py'\n")
-    assert "_base_ goes round in a circle: a.py -> b.toml -> a.py" in message("a.py")
+    assert "circular _base_: a.py -> b.toml -> a.py" in message("a.py")
 
 
 def test_a_base_that_is_not_there_or_no_name(write: Write) -> None:

@@ -240,7 +240,7 @@ def test_a_class_for_another_contract_is_refused_in_every_registry(install, regi
         files={"acme_late.py": "class Late:\n    api = '9.0'\n"},
     )
     there = BY_NAME[registry]
-    message = rf"Late is written for {registry} 9\.0, this core speaks 1\.0"
+    message = rf"Late is written for {registry} 9\.0, this core supports 1\.0"
     with pytest.raises(IncompatiblePlugin, match=message):
         there.register_module()(type("Late", (), {"api": "9.0"}))
     with pytest.raises(IncompatiblePlugin, match=message):

@@ -64,6 +64,15 @@ def test_an_observation_becomes_a_batch_of_one(stats):
     np.testing.assert_allclose(batch["states"][0], expected, rtol=1e-5)
 
 
+def test_a_model_without_cameras_gets_no_pictures(shared):
+    transforms = [{"type": "NormalizeStatesAndActions", "norm_type": "mean_std"}]
+    trained = ParquetDataset(str(shared), transforms, [])
+    prepare = PrivateInferenceDataset([], transforms, trained.statistics)
+    batch = prepare(observe(qpos=trained.loaded[0].states[2]))
+    assert set(batch) == {"states"}
+    np.testing.assert_array_equal(batch["states"][0], trained[2]["states"])
+
+
 def test_it_prepares_as_training_did(shared, stats):
     """The same frame through both doors, with the transforms that only training wants left out."""
     kept = [TRANSFORMS[i] for i in (1, 2, 4, 5)]

@@ -27,6 +27,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,10 +37,12 @@ from tools.envs import Env
 ROOT = Path(__file__).parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
     *sorted((ROOT / "plugins").glob("*/README.md")),
     *sorted((ROOT / "examples").glob("*/README.md")),
 ]
+REAL_TIME = {"docs/tutorials/recordings-to-policy.md", "docs/tutorials/your-robot.md"}
+"""Pages that drive an arm that does not wait for a busy machine."""
 BLOCK = re.compile(
     r"^(?:<!-- (?P<marker>[\w ]+): (?P<text>.+?) -->\n)?```(?P<language>\w*)\n"
     r"(?P<body>.*?)^```$",
@@ -56,7 +59,10 @@ NO_INDEX = (
 )
 HUB = "fetches weights from the Hugging Face hub; the plugin's tests import a folder of their own"
 EXAMPLE = "as in tests/examples, which install the examples in environments of their own"
+KIT = "it starts and kills processes for minutes; tests/cli/test_new_plugin.py runs it every night"
+HARDWARE = "moves a robot, with a person's consent"
 FOLDER = "FOLDER is what somebody trained; the plugin's tests import what they make themselves"
+LEROBOT = "needs LeRobot beside FluxVLA; the plugin's tests run it in an environment that has both"
 STRATEGY = "FILE is the reader's; the plugin's tests run it with their own"
 WEIGHTS = "needs published weights; the plugin's tests run it on tiny ones that they make"
 NOT_RUN: dict[tuple[str, str], str] = {
@@ -80,17 +86,40 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "--work-dir shared/out",
             ),
         ],
+        KIT: [
+            ("docs/tutorials/your-training-strategy.md", "python -m pytest fluxvla-centred/tests"),
+        ],
+        HARDWARE: [
+            (
+                "docs/tutorials/your-robot.md",
+                "fluxvla plugins check RollerOperator --hardware --set address=/dev/ttyUSB0",
+            ),
+        ],
         STRATEGY: [
             ("plugins/fluxvla-ddp/README.md", "fluxvla run --config FILE --nproc 2"),
             ("plugins/fluxvla-fsdp/README.md", "fluxvla run --config FILE --nproc 2"),
         ],
         FOLDER: [
             (
+                "docs/porting/lerobot.md",
+                "fluxvla import-checkpoint FOLDER policy --embodiment arm.json --rate 30",
+            ),
+            (
                 "plugins/fluxvla-models/README.md",
                 "fluxvla import-checkpoint FOLDER work/imported --embodiment arm.json --rate 50",
             ),
         ],
+        LEROBOT: [
+            (
+                "plugins/fluxvla-lerobot/README.md",
+                "fluxvla run --config acting.py --section eval --work-dir work",
+            ),
+        ],
         NO_INDEX: [
+            (
+                "docs/installation.md",
+                "pip install -c constraints.txt -e . -e plugins/fluxvla-libero",
+            ),
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
             ("plugins/fluxvla-gr00t/README.md", "pip install fluxvla-gr00t 'fluxvla-core[hub]'"),
             (
@@ -109,6 +138,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "# with Meta-World 3.1; Python 3.10 to 3.13",
             ),
             ("plugins/fluxvla-latency/README.md", "pip install fluxvla-latency"),
+            ("plugins/fluxvla-lerobot/README.md", "pip install 'fluxvla-lerobot[lerobot]'"),
             ("plugins/fluxvla-openvla/README.md", "pip install fluxvla-openvla"),
             ("plugins/fluxvla-pi/README.md", "pip install fluxvla-pi"),
             ("plugins/fluxvla-report/README.md", "pip install fluxvla-report"),
@@ -120,6 +150,7 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "plugins/fluxvla-smolvla/README.md",
                 "pip install fluxvla-smolvla 'fluxvla-core[hub]'",
             ),
+            ("plugins/fluxvla-wandb/README.md", "pip install fluxvla-wandb"),
         ],
         HUB: [
             (
@@ -176,6 +207,8 @@ NOT_RUN: dict[tuple[str, str], str] = {
 """Page, and the first line of a command block that is not run -> why it cannot be."""
 MARKERS = {"", "file", "fragment", "CI", "nightly", "demo", "terminal", "checkout"}
 AFTER_DEMO = {"demo", "terminal"}
+FRESH = (ROOT / "README.md", ROOT / "docs" / "quickstart.md", ROOT / "docs" / "demo.md")
+"""Pages whose blocks for every night are run in a fresh clone, one page after the other."""
 NIGHTLY = AFTER_DEMO | {"nightly"}
 TERMINAL_S = 120.0
 
@@ -238,7 +271,13 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
     return env
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def of_page(page: Path) -> Any:
+    """The parameter of a test of ``page``."""
+    name = page.relative_to(ROOT).as_posix()
+    return pytest.param(page, id=name, marks=[pytest.mark.realtime] if name in REAL_TIME else [])
+
+
+@pytest.mark.parametrize("page", [of_page(page) for page in PAGES])
 def test_what_a_page_tells_to_do_works(page: Path, env: Env, tmp_path: Path) -> None:
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     for block in blocks(page.read_text(encoding="utf-8")):
@@ -339,11 +378,11 @@ def test_what_is_done_with_the_demos_policy_works(page: Path, env: Env, after_de
 @pytest.mark.slow
 @pytest.mark.timeout(4 * 3600)
 def test_what_installs_and_trains_works(tmp_path: Path) -> None:
-    """README and the demo's page as they are typed in a fresh clone, README's other blocks too."""
+    """The pages of ``FRESH`` as they are typed in a fresh clone."""
     clone = cloned(tmp_path / "clone")
     faulthandler.cancel_dump_traceback_later()
     path = os.pathsep.join([str(clone / "env" / "bin"), os.environ.get("PATH", os.defpath)])
-    for page in (ROOT / "README.md", ROOT / "docs" / "demo.md"):
+    for page in FRESH:
         for block in blocks(page.read_text(encoding="utf-8")):
             if block.marker in {"", "file", "nightly"}:
                 do(block, clone, {"PATH": path})
@@ -360,7 +399,7 @@ def test_a_page_leaves_no_command_out() -> None:
             if block.marker == "checkout":
                 assert page == ROOT / "CONTRIBUTING.md"
             if block.marker == "nightly":
-                assert page in (ROOT / "README.md", ROOT / "docs" / "demo.md")
+                assert page in FRESH
 
 
 def test_every_block_says_what_it_is() -> None:

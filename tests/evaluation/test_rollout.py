@@ -85,7 +85,7 @@ def test_joint_targets_are_joined_and_kept_within_the_limits(walk):
     found = episode(
         world, says, replan_every=1, max_steps=8, on_step=lambda w, n: places.append(w.place)
     )
-    assert found["calls"] == 4, "a keyframe lasts two control steps"
+    assert found["calls"] == 4, "an action lasts two control steps"
     assert found["clamped"] > 0
     moves = np.abs(np.diff(places))
     assert moves.max() < 3.0 * 0.1 + 0.2, "3 m/s at 10 steps a second, and the ground's shaking"
@@ -110,7 +110,7 @@ def test_chunks_of_another_shape_are_refused(walk, chunk, text):
 def test_a_chunk_that_is_not_finite_is_a_failure_that_says_why(walk, value, limited):
     found = episode(walk.Walk(limited=limited), Says([[0.1], [value]]))
     assert (found["success"], found["steps"], found["calls"]) == (False, 0, 1)
-    assert found["problem"] == f"the policy's chunk is not finite: keyframe 1, x is {value}"
+    assert found["problem"] == f"the policy's chunk is not finite: action 1, x is {value}"
     assert episode(walk.Walk(), Says([[0.1]]))["problem"] is None
 
 

@@ -109,7 +109,7 @@ def test_a_crashed_environment_is_tried_again_and_then_is_no_failure_of_the_poli
     assert "right: 3/3 = 100%" in " ".join(listener.lines)
 
 
-NAN = "the policy's chunk is not finite: keyframe 0, x is nan"
+NAN = "the policy's chunk is not finite: action 0, x is nan"
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,17 @@ class StepVLA(torch.nn.Module):
         return [self.gain]
 
 
+class QueryVLA(StepVLA):
+    """Hands a weight of its own to its block, as models with learnt queries do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.query = torch.nn.Parameter(torch.ones(4, 2))
+
+    def predict_action(self, images: Any, states: Any, noise: Any) -> Any:
+        return self.gain(self.query)[None] + noise
+
+
 @pytest.fixture(autouse=True)
 def model() -> Any:
     VLAS.register_module()(StepVLA)
@@ -75,20 +86,72 @@ def test_each_stage_of_each_mode(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert figures["model"] == "StepVLA"
     assert figures["parameters"] == 4
     assert figures["weights"] == "random weights"
+    assert figures["answers_sha256"]
     assert figures["gflops"] == round(2 * 4 * 2 * 2 / 1e9, 3)  # (4, 2) times (2, 2)
     assert figures["cameras"] == {"front": [8, 8], "wrist": [6, 8]}
     assert (figures["peak_tflops"], figures["peak_is"]) == (0.5, "given")
     assert list(figures["modes"]) == ["eager", "compiled"]
     for found in figures["modes"].values():
-        for stage in ("preprocess", "inference", "postprocess", "total"):
+        for stage in ("preprocess", "transfer", "forward", "inference", "postprocess", "total"):
             assert 0 < found[stage]["p50_ms"] <= found[stage]["p95_ms"] <= found[stage]["p99_ms"]
         assert found["total"]["p50_ms"] >= found["inference"]["p50_ms"]
         assert found["hz"] == pytest.approx(1e3 / found["total"]["p50_ms"], rel=0.05)
         assert found["memory_mb"] > 0
     shown = capsys.readouterr().out
     assert "StepVLA: 0.0 M parameters, float32" in shown
-    assert "inference" in shown
-    assert "of the peak of 0.5 TFLOP/s (given)" in shown
+    lines = shown.splitlines()
+    assert [line.split()[0] for line in lines[3:8]] == [
+        "preprocess", "transfer", "forward", "postprocess", "total",
+    ]  # fmt: skip
+    assert lines[1].split() == ["ms", "eager", "compiled"]
+    assert "peak: 0.5 TFLOP/s (given)" in shown
+    assert max(map(len, lines[1:11])) <= 57
+
+
+def test_a_graph_without_a_gpu_is_no_column(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out = tmp_path / "b.json"
+    words = [*written(tmp_path), "--calls", "1", "--warmup", "0", "--json", str(out)]
+    assert main([*words, "--modes", "graph,eager"]) == 0
+    assert "graph: not run: execution 'graph' needs a GPU" in capsys.readouterr().out
+    figures = json.loads(out.read_text())
+    assert list(figures["modes"]) == ["eager", "graph"]
+    assert "needs a GPU" in figures["modes"]["graph"]["not_run"]
+
+
+def test_the_fixture_is_what_was_asked_and_answered(tmp_path: Path) -> None:
+    from fluxvla_core.policies.benchmark import digest
+
+    words = [*written(tmp_path), "--calls", "1", "--warmup", "0", "--seed", "5"]
+    for name in ("one", "two"):
+        assert main([*words, "--out", str(tmp_path / name)]) == 0
+    kept = []
+    for name in ("one", "two"):
+        folder = tmp_path / name
+        figures = json.loads((folder / "figures.json").read_text())
+        inputs, answers = (dict(np.load(folder / f"{n}.npz")) for n in ("inputs", "answers"))
+        assert figures["inputs_sha256"] == digest(inputs)
+        assert figures["answers_sha256"] == digest(answers)
+        assert inputs["images.front"].shape == (4, 8, 8, 3)
+        assert answers["eager"].shape == (4, 4, 2)
+        assert json.loads((folder / "config.json").read_text())["model"] == {"type": "StepVLA"}
+        kept.append((figures["inputs_sha256"], figures["answers_sha256"]))
+    assert kept[0] == kept[1]
+
+
+def test_a_weight_that_a_block_is_given_is_counted(tmp_path: Path) -> None:
+    VLAS.register_module()(QueryVLA)
+    try:
+        words = written(tmp_path)
+        config = tmp_path / "c.py"
+        config.write_text(config.read_text().replace("StepVLA", "QueryVLA"))
+        out = tmp_path / "bench.json"
+        assert main([*words, "--calls", "1", "--json", str(out), "--peak-tflops", "1"]) == 0
+    finally:
+        VLAS.unregister("QueryVLA")
+    assert json.loads(out.read_text())["gflops"] == round(2 * 4 * 2 * 2 / 1e9, 3)
 
 
 def test_a_peak_that_nobody_gives_is_measured(tmp_path: Path) -> None:
@@ -126,7 +189,8 @@ def test_the_same_seed_asks_the_same(tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["--checkpoint", "x"], "give either --config FILE or --checkpoint DIR"),
-        (["--modes", "eager,graph"], "'graph' is none of eager, compiled"),
+        (["--modes", "eager,fast"], "'fast' is none of eager, compiled, graph"),
+        (["--quantization", "int4"], "invalid choice: 'int4'"),
         (["--peak-tflops", "-1"], "--peak-tflops -1 is no number of operations"),
         (["--calls", "0"], "0 is less than 1"),
         (["--set", "train_dataloader.dataset.transforms=[]"], "no transform of train_dataloader"),

@@ -290,6 +290,21 @@ def test_a_work_dir_means_its_newest_whole_checkpoint(tmp_path):
     assert find_checkpoint(None, tmp_path).name == "step-000000100"
 
 
+def test_a_work_dir_that_is_named_means_its_newest_whole_checkpoint_too(tmp_path, caplog):
+    from fluxvla_core.policies.loading import find_checkpoint, load_policy
+
+    whole = save(tmp_path, step=100)
+    damaged = save(tmp_path, step=200)
+    (damaged / "model.safetensors").write_bytes(b"")
+
+    assert find_checkpoint(tmp_path, tmp_path / "elsewhere") == whole
+    assert "damaged" in caplog.text
+    assert damaged.name in caplog.text
+    assert load_policy(tmp_path).source == str(whole)
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_policy(damaged)
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [

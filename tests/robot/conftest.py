@@ -119,7 +119,7 @@ class Rover(Arm):
 
 
 class Waver:
-    """Moves the shoulder towards ``goal`` in steps of at most ``stride`` a keyframe."""
+    """Moves the shoulder towards ``goal`` in steps of at most ``stride`` an action."""
 
     def __init__(self, goal: float = 0.8, stride: float = 0.1, horizon: int = 5) -> None:
         self.embodiment = ARM

@@ -16,9 +16,9 @@ RATE = 10.0
 
 
 def chunk(values, observed=0.0, anchor=None):
-    keyframes = np.asarray(values, dtype=float).reshape(len(values), -1)
-    start = keyframes[0] if anchor is None else np.atleast_1d(np.asarray(anchor, dtype=float))
-    return Chunk(keyframes, RATE, observed, start)
+    actions = np.asarray(values, dtype=float).reshape(len(values), -1)
+    start = actions[0] if anchor is None else np.atleast_1d(np.asarray(anchor, dtype=float))
+    return Chunk(actions, RATE, observed, start)
 
 
 def at(joiner, time):
@@ -34,7 +34,7 @@ def act_ensemble(chunks, step, m):
 
 
 @pytest.mark.parametrize("m", [0.01, 0.5, -0.3])
-def test_asked_once_a_keyframe_it_is_acts_ensemble(m):
+def test_asked_once_an_action_it_is_acts_ensemble(m):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(8, 5))
     joiner = TemporalEnsemble(coefficient=m)

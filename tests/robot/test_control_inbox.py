@@ -23,8 +23,8 @@ def ends():
 
 def test_a_signal_right_after_the_order_to_play_ends_the_episode(ends):
     main, inbox = ends
-    main.post("play")
-    main.post("signal", number=signal.SIGINT)
+    main.send("play")
+    main.send("signal", number=signal.SIGINT)
 
     assert inbox.order().kind == "play"
     with pytest.raises(Interrupted, match="SIGINT"):
@@ -33,14 +33,14 @@ def test_a_signal_right_after_the_order_to_play_ends_the_episode(ends):
 
 def test_what_ended_one_episode_says_nothing_of_the_next(ends):
     main, inbox = ends
-    main.post("signal", number=signal.SIGTERM)
+    main.send("signal", number=signal.SIGTERM)
     inbox.poll()
     inbox.stopping = True
 
-    main.post("play")
+    main.send("play")
     assert inbox.order().kind == "play"
     inbox.check()
 
-    main.post("signal", number=signal.SIGINT)
+    main.send("signal", number=signal.SIGINT)
     with pytest.raises(Interrupted, match="SIGINT"):
         inbox.check()

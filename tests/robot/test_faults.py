@@ -70,7 +70,7 @@ def assert_braked(bench) -> None:
 def test_a_chunk_that_is_not_finite(bench, call, bad):
     bench.policy.faults[call] = spoil(3, 1, bad)
 
-    fails(bench, SafetyStop, "chunk is not finite: keyframe 3, elbow is")
+    fails(bench, SafetyStop, "chunk is not finite: action 3, elbow is")
     assert_stopped(bench, "chunk", "not finite")
     assert len(bench.arm.sent) <= 35 * (call - 1)
 
@@ -86,8 +86,8 @@ def test_a_chunk_of_a_wrong_shape(bench, shape):
 def test_a_chunk_of_another_length_than_the_policy_said(bench):
     bench.policy.faults[2] = lambda chunk: chunk[:3]
 
-    fails(bench, SafetyStop, "chunk has 3 keyframes; it said 5")
-    assert_stopped(bench, "chunk", "3 keyframes")
+    fails(bench, SafetyStop, "chunk has 3 actions; it said 5")
+    assert_stopped(bench, "chunk", "3 actions")
 
 
 @pytest.mark.parametrize("answer", ["left a bit", None, np.zeros((5, 3), complex)])
@@ -107,7 +107,7 @@ def test_a_chunk_that_jumps(bench):
 
     bench.policy.faults[2] = jump
 
-    fails(bench, SafetyStop, "keyframe 2 wants shoulder to jump by -2.5; at full speed")
+    fails(bench, SafetyStop, "action 2 wants shoulder to jump by -2.5; at full speed")
     assert_stopped(bench, "chunk", "jump")
     assert_braked(bench)
 
@@ -115,7 +115,7 @@ def test_a_chunk_that_jumps(bench):
 def test_a_chunk_far_beyond_a_limit(bench):
     bench.policy.faults[2] = spoil(4, 0, 9.0)
 
-    fails(bench, SafetyStop, r"keyframe 4 wants shoulder at 9, far beyond its limits \[-1, 1.5\]")
+    fails(bench, SafetyStop, r"action 4 wants shoulder at 9, far beyond its limits \[-1, 1.5\]")
     assert_stopped(bench, "chunk", "far beyond")
 
 

@@ -117,7 +117,7 @@ FAULTS = {
     "chunk of a wrong shape": Fault(
         "chunk", "chunk has shape (5, 2)", chunks(lambda chunk: chunk[:, :2])
     ),
-    "chunk that jumps": Fault("chunk", "keyframe 2 wants shoulder to jump", chunks(jumping)),
+    "chunk that jumps": Fault("chunk", "action 2 wants shoulder to jump", chunks(jumping)),
     "chunk beyond position limits": Fault("chunk", "far beyond its limits [-1, 1.5]", chunks(far)),
     "chunk faster than the velocity limit": Fault(
         "chunk", "wants elbow to jump by", chunks(too_fast)

@@ -1,4 +1,4 @@
-"""Keyframes to commands: where each command lies, how many there are, what is refused."""
+"""Actions to commands: where each command lies, how many there are, what is refused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from fluxvla_core.robot.control.chunks import interpolate, sample
 
 
-def test_five_commands_lead_to_each_keyframe():
+def test_five_commands_lead_to_each_action():
     commands = interpolate([0.0, 10.0], [[1.0, 10.0], [1.0, 5.0]], 10, 50)
 
     assert commands.shape == (10, 2)
@@ -28,7 +28,7 @@ def test_equal_rates_give_the_chunk_itself():
     ("count", "rate", "control", "expected"),
     [(3, 10, 50, 15), (20, 10, 50, 100), (1, 3, 100, 33), (2, 50, 10, 1), (4, 30, 30, 4)],
 )
-def test_as_many_commands_as_fit_before_the_last_keyframe(count, rate, control, expected):
+def test_as_many_commands_as_fit_before_the_last_action(count, rate, control, expected):
     commands = interpolate([0.0], np.ones((count, 1)), rate, control)
 
     assert len(commands) == expected

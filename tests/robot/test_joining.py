@@ -84,5 +84,5 @@ def test_a_moment_of_a_chunk_is_that_of_its_samples_bit_for_bit():
             [random.uniform(-0.2, count / 10 + 0.2, 40), np.arange(count + 1) / 10]
         )
         for elapsed in moments:
-            expected = sample(one.anchor, one.keyframes, one.rate_hz, [elapsed])[0]
+            expected = sample(one.anchor, one.actions, one.rate_hz, [elapsed])[0]
             np.testing.assert_array_equal(one.at(elapsed), expected)

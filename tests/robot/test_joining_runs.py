@@ -106,12 +106,12 @@ def test_a_simulated_latency_is_between_observation_and_chunk(bench, going, meth
     bench.assert_within_limits()
 
 
-def test_frozen_keyframes_follow_the_simulated_latency(bench, make_waver):
+def test_frozen_actions_follow_the_simulated_latency(bench, make_waver):
     bench.policy = going = Going(make_waver(horizon=10))
     bench.run(chunk_joining="rtc", simulated_latency=0.25, max_publish_step=100)
 
     frozen = [rest.frozen for rest in going.told if rest is not None]
-    # The first answer took no time; from the second on 0.26 s were measured: three keyframes.
+    # The first answer took no time; from the second on 0.26 s were measured: three actions.
     assert frozen[0] == 0
     assert set(frozen[1:]) == {3}
 
@@ -126,7 +126,7 @@ def test_in_real_time_the_policy_is_told_what_is_executed_meanwhile(bench, make_
     told = [rest for rest in going.told if rest is not None]
     assert going.told[0] is None, "nothing is under way at first"
     assert len(told) >= 3
-    # 0.12 s and more are two keyframes of 10 Hz at least; and never more than there are.
+    # 0.12 s and more are two actions of 10 Hz at least; and never more than there are.
     assert all(2 <= rest.frozen <= 5 for rest in told)
     assert all((rest.weights[: rest.frozen] == 1).all() for rest in told)
     bench.assert_within_limits()
@@ -150,7 +150,7 @@ def test_the_target_has_no_seam_where_a_policy_keeps_to_what_is_frozen(bench, ma
             if row["event"] == "command" and row["phase"] == "run"
         ]
         jumps[method] = max(abs(b - a) for a, b in itertools.pairwise(wanted))
-    # 0.05 rad a keyframe are 0.01 rad a command; a beat that is missed makes it a few times that.
+    # 0.05 rad an action are 0.01 rad a command; a tick that is missed makes it a few times that.
     assert jumps["rtc"] < jumps["latest_only"]
 
 

@@ -42,8 +42,8 @@ def test_other_schedules():
 
 def line(observed, start=0.0, slope=1.0):
     """A chunk on the line ``start + slope * t`` from its observation on."""
-    keyframes = start + slope * (np.arange(HORIZON)[:, None] + 1) / RATE
-    return Chunk(keyframes, RATE, observed, np.array([start]))
+    actions = start + slope * (np.arange(HORIZON)[:, None] + 1) / RATE
+    return Chunk(actions, RATE, observed, np.array([start]))
 
 
 def test_nothing_is_under_way_at_first():
@@ -55,12 +55,12 @@ def test_the_rest_of_the_chunk_is_read_off_at_the_times_of_the_new_one():
     joiner = RealTime()
     joiner.add(line(observed=5.0), now=5.25)
 
-    # Observed 0.33 s later: no multiple of a keyframe.
+    # Observed 0.33 s later: no multiple of an action.
     found = joiner.ahead().seen_at(5.33, HORIZON)
 
     times = 0.33 + (np.arange(HORIZON) + 1) / RATE
     np.testing.assert_allclose(found.actions[:, 0], np.minimum(times, 1.0))
-    assert found.frozen == 3  # 0.25 s need the first three keyframes
+    assert found.frozen == 3  # 0.25 s need the first three actions
     np.testing.assert_allclose(found.weights, soft_mask(HORIZON, 3, 6))
     assert found.max_guidance_weight == 5.0
 
@@ -102,7 +102,7 @@ def test_an_answer_in_no_time_freezes_nothing():
     assert joiner.ahead().seen_at(2.1, HORIZON).frozen == 0
 
 
-def test_the_old_chunk_is_played_up_to_the_first_keyframe_that_is_not_over():
+def test_the_old_chunk_is_played_up_to_the_first_action_that_is_not_over():
     joiner = RealTime()
     joiner.add(line(observed=0.0), now=0.1)
     joiner.add(line(observed=0.25, start=5.0), now=0.4)
@@ -140,9 +140,9 @@ def test_chunks_that_are_over_are_forgotten():
 
 def obedient(continuation, observed, anchor, rng):
     """A policy that keeps to what is frozen, and does something else afterwards."""
-    keyframes = rng.normal(size=(HORIZON, 1))
-    keyframes[: continuation.frozen] = continuation.actions[: continuation.frozen]
-    return Chunk(keyframes, RATE, observed, anchor)
+    actions = rng.normal(size=(HORIZON, 1))
+    actions[: continuation.frozen] = continuation.actions[: continuation.frozen]
+    return Chunk(actions, RATE, observed, anchor)
 
 
 @settings(max_examples=40, deadline=None)
@@ -170,7 +170,7 @@ def test_a_policy_that_keeps_to_what_is_frozen_leaves_no_seam(seed, rounds):
         now = arrives
     path += [(t, joiner.target(t)) for t in np.arange(now, now + 0.3, 0.004)]
     known = [(t, p[0]) for t, p in path if p is not None]
-    # Keyframes are normal: 4 ms of the steepest line between two of them is below 0.35.
+    # Actions are normal: 4 ms of the steepest line between two of them is below 0.35.
     steps = [abs(b - a) for (s, a), (t, b) in itertools.pairwise(known) if t - s < 0.005]
     assert steps
     assert max(steps) < 0.35

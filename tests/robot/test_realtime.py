@@ -47,7 +47,7 @@ def test_everything_is_as_before_afterwards_also_after_an_error():
 
     def fail() -> None:
         with realtime.real_time():
-            assert sys.getswitchinterval() == pytest.approx(realtime.SHARED_S)
+            assert sys.getswitchinterval() == pytest.approx(realtime.GIL_SHARED_S)
             assert gc.get_freeze_count() > 0
             raise KeyError
 
@@ -121,7 +121,7 @@ def test_what_a_command_is_made_of_gives_the_interpreter_to_nobody(counted):
         time.sleep(0.05)  # whoever waits with the old interval is done with it
         before = counted[0]
         for step in range(250):
-            check_beginning(chunk.keyframes, spec, limiter.last, 50.0, settings)
+            check_beginning(chunk.actions, spec, limiter.last, 50.0, settings)
             (command,), _ = limiter.run(chunk.at(step / 50)[None])
             watch.sent(command, step / 50)
             watch.check(command, step / 50)
@@ -152,15 +152,15 @@ def test_from_waking_to_its_command_a_thread_keeps_the_interpreter_and_then_shar
 @on_linux
 def test_the_interpreter_is_kept_only_where_somebody_goes_first():
     before = sys.getswitchinterval()
-    realtime.keep_interpreter()
-    realtime.share_interpreter()
+    realtime.hold_gil()
+    realtime.share_gil()
     assert sys.getswitchinterval() == before
     with realtime.real_time():
-        realtime.keep_interpreter()
-        assert sys.getswitchinterval() == pytest.approx(realtime.KEPT_S)
+        realtime.hold_gil()
+        assert sys.getswitchinterval() == pytest.approx(realtime.GIL_HELD_S)
         realtime.wait_until(time.monotonic())
-        assert sys.getswitchinterval() == pytest.approx(realtime.SHARED_S)
-        realtime.keep_interpreter()
+        assert sys.getswitchinterval() == pytest.approx(realtime.GIL_SHARED_S)
+        realtime.hold_gil()
     assert sys.getswitchinterval() == before
 
 
@@ -213,7 +213,7 @@ def test_the_second_comes_right_behind_the_first():
         "import threading\n"
         "seen = []\n"
         "def work():\n"
-        "    allowed = realtime.just_below_real_time()\n"
+        "    allowed = realtime.raise_priority()\n"
         "    seen.append((allowed, os.sched_getparam(0).sched_priority))\n"
         "with realtime.real_time():\n"
         "    thread = threading.Thread(target=work); thread.start(); thread.join()\n"
@@ -228,9 +228,9 @@ def test_the_second_comes_right_behind_the_first():
 def test_the_second_is_an_ordinary_one_while_it_computes_for_long():
     printed = inside(
         "def show(): print(os.sched_getparam(0).sched_priority)\n"
-        "with realtime.normal(): show()\n"
-        "realtime.just_below_real_time(); show()\n"
-        "with realtime.normal(): show()\n"
+        "with realtime.normal_priority(): show()\n"
+        "realtime.raise_priority(); show()\n"
+        "with realtime.normal_priority(): show()\n"
         "show()"
     )
 

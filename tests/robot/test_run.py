@@ -62,13 +62,13 @@ def test_an_instruction_in_words_is_passed_on(bench):
     assert bench.episode("001-stir-the-soup")["instruction"] == "stir the soup"
 
 
-def test_the_horizon_says_after_how_many_keyframes_the_policy_is_asked_again(bench):
+def test_the_horizon_says_after_how_many_actions_the_policy_is_asked_again(bench):
     bench.run(execute_horizon=2, max_publish_step=50)
-    # 50 commands at 50 Hz are 10 keyframes at 10 Hz.
+    # 50 commands at 50 Hz are 10 actions at 10 Hz.
     assert len(bench.policy.asked) == 5
 
 
-def test_an_action_chunk_of_one_uses_one_keyframe(bench):
+def test_an_action_chunk_of_one_uses_one_action(bench):
     bench.run(action_chunk=1, max_publish_step=20)
 
     assert len(bench.policy.asked) == 4

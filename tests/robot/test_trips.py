@@ -114,8 +114,8 @@ LAST = np.array([0.0, 0.5, 0.0])
 
 
 def checked(rows, rate=10.0, settings=SETTINGS):
-    keyframes = check_chunk(np.array(rows, dtype=float), ARM, rate, settings)
-    check_beginning(keyframes, ARM, LAST, rate, settings)
+    actions = check_chunk(np.array(rows, dtype=float), ARM, rate, settings)
+    check_beginning(actions, ARM, LAST, rate, settings)
 
 
 def test_a_motion_passes_as_float64():
@@ -136,11 +136,11 @@ def test_a_gripper_may_be_wanted_well_beyond_closed():
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ([[2.5, 0.5, 0.0]], "keyframe 0 wants turn to jump by 2.5; at full speed that takes 1.15"),
-        ([[0, 0.05, 0], [0, 1.0, 0]], r"keyframe 1 wants slide to jump by 0\.95"),
-        ([[0, 1.3, 0]], r"keyframe 0 wants slide at 1.3, far beyond its limits \[0, 1\] m"),
-        ([[0, 0.5, -1.1]], r"keyframe 0 wants jaw at -1\.1, far beyond"),
-        ([[0, 0.5, 0], [0, np.nan, 0]], "not finite: keyframe 1, slide is nan"),
+        ([[2.5, 0.5, 0.0]], "action 0 wants turn to jump by 2.5; at full speed that takes 1.15"),
+        ([[0, 0.05, 0], [0, 1.0, 0]], r"action 1 wants slide to jump by 0\.95"),
+        ([[0, 1.3, 0]], r"action 0 wants slide at 1.3, far beyond its limits \[0, 1\] m"),
+        ([[0, 0.5, -1.1]], r"action 0 wants jaw at -1\.1, far beyond"),
+        ([[0, 0.5, 0], [0, np.nan, 0]], "not finite: action 1, slide is nan"),
         ([[0, 0.5]], r"has shape \(1, 2\); arm takes \(T, 3\)"),
     ],
 )
@@ -165,8 +165,8 @@ def test_numbers_of_other_kinds_are_taken_and_words_are_not():
 
 def test_only_the_way_to_its_beginning_depends_on_where_the_arm_is():
     rows = np.array([[2.5, 0.5, 0.0], [2.5, 0.5, 0.0]])
-    keyframes = check_chunk(rows, ARM, 10.0, SETTINGS)
+    actions = check_chunk(rows, ARM, 10.0, SETTINGS)
 
-    check_beginning(keyframes, ARM, rows[0], 10.0, SETTINGS)
-    with pytest.raises(SafetyStop, match=r"keyframe 0 wants turn to jump by 2\.5"):
-        check_beginning(keyframes, ARM, LAST, 10.0, SETTINGS)
+    check_beginning(actions, ARM, rows[0], 10.0, SETTINGS)
+    with pytest.raises(SafetyStop, match=r"action 0 wants turn to jump by 2\.5"):
+        check_beginning(actions, ARM, LAST, 10.0, SETTINGS)

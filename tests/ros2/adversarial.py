@@ -211,7 +211,7 @@ class Adversary:
 
 
 def chunk_of(kind: str, a: float, b: float, pose: np.ndarray) -> np.ndarray:
-    """``(4, 3)`` keyframes, or what somebody took for it."""
+    """``(4, 3)`` actions, or what somebody took for it."""
     steps = np.arange(1, 5)[:, None]
     way = np.array([a, b, a - b])
     if kind == "far":

@@ -385,7 +385,7 @@ class TestFaults:
             robot.tell(fault="/second/state=clock:-0.2")
             error = frame_error(two, "second is stamped 0.")
             assert error.what.endswith(
-                "before arm, with which it arrives; at most 0.1 s is allowed"
+                "earlier than arm, although they arrive together; at most 0.1 s is allowed"
             )
             assert error.cause.startswith("the clock that stamps second is 0.")
             assert (type(error), error.rule) == (Stale, "freshness")

@@ -103,7 +103,8 @@ def test_two_arms_that_are_stamped_apart_are_no_one_state():
         check_together({"left": off, "right": right}, max_skew=0.1, wall=0.0)
 
     assert caught.value.what == (
-        "left is stamped 0.190 s before right, with which it arrives; at most 0.1 s is allowed"
+        "left is stamped 0.190 s earlier than right, although they arrive together; "
+        "at most 0.1 s is allowed"
     )
     assert caught.value.cause.startswith("the clock that stamps left is 0.21 s behind this mach")
     check_together({"left": off, "right": right}, max_skew=0.3, wall=0.0)

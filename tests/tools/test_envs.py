@@ -84,6 +84,20 @@ def test_a_missing_interpreter_means_a_new_environment(recorder: Recorder) -> No
     assert recorder.taken()[0] == "create"
 
 
+def test_the_environment_of_another_checkout_is_not_emptied(
+    tmp_path: Path, recorder: Recorder
+) -> None:
+    """A checkout may borrow one by a symbolic link until it needs another."""
+    other = tmp_path / "other"
+    recorder.fill("1", core="a")
+    recorder.env.root.rename(other)
+    recorder.env.root.symlink_to(other)
+    assert recorder.fill("1", core="a") is False
+    assert recorder.fill("2", core="a") is True
+    assert not recorder.env.root.is_symlink()
+    assert json.loads((other / envs.STAMP).read_text())["core"] == "a"
+
+
 def test_an_interrupted_installation_goes_on_where_it_was(recorder: Recorder) -> None:
     def fail(changed: list[str], fresh: bool) -> None:
         raise shell.StepFailed(["pip"], 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,14 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    chosen_robot,
+    renamed,
+    safetensors_in,
+    without_cameras,
+)
 from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS, VLAS
 from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
@@ -205,6 +213,9 @@ def test_two_formats_that_recognise_it_are_told_apart_by_name(tmp_path):
         (["--format", "raech"], "there is no checkpoint format 'raech'; did you mean 'reach'?"),
         (["--camera", "wrist=front"], "the checkpoint has no such camera; it has base"),
         (["--camera", "front"], "'front' is not THEIRS=OURS"),
+        (["--camera", "base=a", "--camera", "base=b"], "--camera base=… is given twice"),
+        (["--camera", "base=none"], "ReachVLA (reach) needs the pictures of all cameras"),
+        (["--robot", "arm"], "a checkpoint of ReachVLA (reach) is of one robot"),
         (["--rate", "0"], "--rate 0 is not a rate"),
         (["--rate", "nan"], "--rate nan is not a rate"),
         (["--embodiment", "nowhere"], "there is no embodiment.json at nowhere"),
@@ -213,6 +224,71 @@ def test_two_formats_that_recognise_it_are_told_apart_by_name(tmp_path):
 def test_options_that_do_not_fit(tmp_path, capsys, words, said):
     source = published(tmp_path / "theirs")
     assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *words]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "ours").exists()
+
+
+class ManyFormat(ReachFormat):
+    """Two robots, three cameras, of which the model may lack some."""
+
+    name = "many"
+
+    def recognizes(self, folder):
+        return (folder / "many").is_file()
+
+    def read(self, folder, tokenizer=None):
+        return self.read_for(folder, tokenizer)
+
+    def read_for(self, folder, tokenizer=None, robot=None, absent=()):
+        found = super().read(folder, tokenizer)
+        chosen = chosen_robot(("acme_arm", "acme_dog"), robot, str(folder))
+        cameras = ("observation.images.base", "left", "right")
+        row = {**ROW, "mean": [len(chosen or ""), 0.0]}
+        return replace(
+            found,
+            img_keys=without_cameras(cameras, absent, str(folder)),
+            statistics={"private": {"proprio": row, "action": row}},
+            notes=(),
+        )
+
+
+@pytest.fixture
+def many(tmp_path):
+    CHECKPOINT_FORMATS.register_module()(ManyFormat)
+    source = published(tmp_path / "theirs")
+    (source / "many").touch()
+    yield [str(source), str(tmp_path / "ours"), "--format", "many"]
+    CHECKPOINT_FORMATS.unregister("ManyFormat")
+
+
+def test_one_of_several_robots_without_some_cameras(many, tmp_path, capsys):
+    cameras = ["--camera", "left=none", "--camera", "right=wrist"]
+    assert main(["import-checkpoint", *many, "--robot", "acme_dog", *cameras]) == 0
+    assert "cameras base, wrist; chunks of 4" in capsys.readouterr().out
+    written = Checkpoint.open(tmp_path / "ours")
+    assert written.statistics()["private"]["action"]["mean"] == [8, 0.0]
+    dataset = written.config()["train_dataloader"]["dataset"]
+    assert dataset["img_keys"] == ["base", "wrist"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--robot", "acme_arn"], "mean 'acme_arm'? It knows acme_arm, acme_dog"),
+        (["--camera", "wrist=none"], "has no such camera; it has base, left, right"),
+        (
+            [word for name in ("base", "left", "right") for word in ("--camera", f"{name}=none")],
+            "no camera is left of base, left, right",
+        ),
+        (
+            ["--camera", "left=wrist", "--camera", "right=wrist"],
+            "left and right would both be the robot's camera 'wrist'",
+        ),
+        (["--camera", "left=right"], "left and right would both be the robot's camera 'right'"),
+    ],
+)
+def test_choices_that_a_checkpoint_does_not_have(many, tmp_path, capsys, words, said):
+    assert main(["import-checkpoint", *many, *words]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "ours").exists()
 
@@ -229,6 +305,7 @@ def test_another_robot_is_refused(tmp_path):
     with pytest.raises(SpecMismatch, match="looks at base; arm has front") as caught:
         import_checkpoint(source, tmp_path / "ours", embodiment=ARM)
     assert "--camera base=NAME" in str(caught.value)
+    assert "base=none if it has no such camera" in str(caught.value)
     joints = (*ARM.joints, Joint("c", "rad", -1.0, 1.0, 1.0, 1.0))
     longer = EmbodimentSpec("longer", joints, ARM.cameras, 50.0)
     with pytest.raises(SpecMismatch, match="'action' have 2 dimensions, longer has 3"):

@@ -340,7 +340,7 @@ def test_processors_are_saved_with_the_checkpoint(tmp_path):
 
 def test_several_processes_need_a_strategy(tmp_path):
     runner = make(tmp_path)
-    runner._prepare()
+    runner._join()
     runner._world = type(runner.world)(0, 2, 0, torch.device("cpu"))
     with pytest.raises(ConfigError) as caught:
         runner._wrap_model(torch.nn.Linear(1, 1))
@@ -364,7 +364,7 @@ def test_without_a_context_a_config_is_enough(tmp_path, monkeypatch):
 
 def test_what_only_exists_inside_a_run_says_so(tmp_path):
     runner = make(tmp_path)
-    with pytest.raises(RuntimeError, match="the world is known from _build_vla on"):
+    with pytest.raises(RuntimeError, match="the world is known from run_setup on"):
         _ = runner.world
     with pytest.raises(RuntimeError, match=r"there is a trainer only inside run\(\)"):
         _ = runner.trainer

@@ -12,9 +12,15 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_core import RUNNERS, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.operators import Frame, RunContext, SimulatedClock
+from fluxvla_core.testing import InferenceRunnerConformance
 
 SPEC = embodiment.aloha_spec(cameras=())
 START_POSE = embodiment.start_pose("viperx300")
+
+
+class TestConformance(InferenceRunnerConformance):
+    entry_point = "AlohaInferenceRunner"
+    spec = SPEC
 
 
 class Still:
@@ -111,21 +117,21 @@ def test_it_goes_to_the_start_pose_if_asked_for(tmp_path):
 
 
 class Replay:
-    """An expert's plan, as keyframes of 10 Hz."""
+    """An expert's plan, as actions at 10 Hz."""
 
     action_rate_hz, horizon = 10.0, 5
 
     def __init__(self, spec, plan):
         self.embodiment = spec
-        self.keyframes = plan[4::5]
+        self.actions = plan[4::5]
 
     def reset(self, seed):
         self.at = 0
 
     def predict_action(self, observation):
-        rows = self.keyframes[self.at : self.at + 5]
+        rows = self.actions[self.at : self.at + 5]
         self.at += 5
-        return np.vstack([rows, np.repeat(self.keyframes[-1:], 5 - len(rows), axis=0)])
+        return np.vstack([rows, np.repeat(self.actions[-1:], 5 - len(rows), axis=0)])
 
 
 def test_an_experts_motion_passes_the_limits_and_does_the_task(tmp_path):

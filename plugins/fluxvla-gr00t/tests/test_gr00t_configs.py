@@ -106,7 +106,7 @@ def test_the_specification_s_configuration_acts(tmp_path, monkeypatch, capsys):
     other = {**observation, "task_description": "pick up the green bowl with right arm"}
     assert np.abs(policy.predict_action(other) - first).max() > 1e-6
 
-    # Real-time chunking: the first two keyframes are being executed, and the others may change.
+    # Real-time chunking: the first two actions are being executed, and the others may change.
     weights = np.array([1.0, 1.0, 0.5, 0.0, 0.0, 0.0])
     rest = Continuation(actions=first + 0.1, weights=weights, frozen=2)
     assert policy.continues

@@ -13,7 +13,7 @@ from fluxvla_gr00t.lerobot_format import LeRobotGR00TFormat
 from safetensors.torch import load_file, save_file
 
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
 from tests.oracles import fill
 
@@ -107,8 +107,56 @@ def test_a_checkpoint_of_several_robots_is_to_train_on(version, tmp_path, monkey
     found = FORMATS[version]().read(source)
     assert found.statistics == {"private": {}}
     assert found.model["embodiment_id"] == 0
-    assert "knows several robots (gr1, oxe_droid)" in found.notes[0]
+    assert "knows several robots (gr1, oxe_droid): choose one by --robot" in found.notes[0]
     assert len(found.tensors) == len(published.model(version).state_dict())
+
+
+@pytest.mark.parametrize("version", ["n1.5", "n1.7"])
+def test_of_several_robots_one_is_chosen(version, tmp_path, monkeypatch):
+    monkeypatch.setitem(robots.N15_EMBODIMENTS, "gr1", 1)
+    tags = ("gr1", "new_embodiment", "oxe_droid")
+    source = published.folder(version, tmp_path / "theirs", monkeypatch, tags)
+    file = source / "experiment_cfg" / "metadata.json"
+    if version == "n1.7":
+        published.write(source / "embodiment_id.json", {"gr1": 1, "new_embodiment": 2})
+        file = source / "statistics.json"
+    content = json.loads(file.read_text())
+    own = content["gr1"] if version == "n1.7" else content["gr1"]["statistics"]
+    own["action"]["arm"] = {name: [-7.0] * 4 for name in own["action"]["arm"]}
+    own["action"]["arm"] |= {"max": [8.0] * 4, "q99": [8.0] * 4}
+    file.write_text(json.dumps(content))
+
+    left, chosen = FORMATS[version]().read(source), FORMATS[version]().read_for(source, robot="gr1")
+
+    assert (left.model["embodiment_id"], chosen.model["embodiment_id"]) == (2, 1)
+    low = "q01" if version == "n1.7" else "min"
+    assert chosen.statistics["private"]["action"][low] == [-7.0] * 4 + [joined("action", low)[4]]
+    assert left.statistics["private"]["action"][low] == joined("action", low).tolist()
+    with pytest.raises(UsageError, match=r"mean 'gr1'. It knows gr1, new_embodiment, oxe_droid"):
+        FORMATS[version]().read_for(source, robot="gr2")
+
+
+@pytest.mark.parametrize("project", SAVED)
+@pytest.mark.parametrize("version", ["n1.5", "n1.7"])
+def test_a_camera_that_the_robot_lacks_has_no_place(version, project, tmp_path, monkeypatch):
+    source = SAVED[project](version, tmp_path / "theirs", monkeypatch)
+    kind = LeRobotGR00TFormat if project == "lerobot" else FORMATS[version]
+    found, both = kind().read_for(source, absent=("front",)), kind().read(source)
+    assert (found.img_keys, both.img_keys) == (("wrist",), CAMERAS)
+    prompts, of_both = (
+        next(table for table in read.transforms if "max_len" in table) for read in (found, both)
+    )
+    if version == "n1.5":
+        assert (prompts["num_images"], of_both["num_images"]) == (1, 2)
+    assert prompts["max_len"] < of_both["max_len"]
+    with pytest.raises(UsageError, match="no such camera; it has front, wrist"):
+        kind().read_for(source, absent=("top",))
+
+
+def test_lerobots_folders_are_of_one_robot(tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
+    with pytest.raises(UsageError, match="It knows none by name"):
+        LeRobotGR00TFormat().read_for(source, robot="gr1")
 
 
 @pytest.mark.parametrize("version", ["n1.5", "n1.7"])
@@ -228,10 +276,65 @@ def test_what_lerobot_does_to_actions_and_is_not_done_here(step, words, tmp_path
 
 def test_a_processor_of_another_policy_is_refused(tmp_path, monkeypatch):
     source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
-    steps = [{"registry_name": "normalizer_processor"}]
+    steps = [{"registry_name": "device_processor"}]
     published.write(source / "policy_preprocessor.json", {"steps": steps})
-    with pytest.raises(CheckpointError, match="has the steps normalizer_processor; one of groot_p"):
+    with pytest.raises(CheckpointError, match="has the steps device_processor; one of groot_pack"):
         LeRobotGR00TFormat().read(source)
+
+
+@pytest.mark.parametrize("version", ["n1.5", "n1.7"])
+@pytest.mark.parametrize("stem", ["policy_preprocessor", "policy_postprocessor"])
+def test_a_step_that_is_not_done_here_is_refused(version, stem, tmp_path, monkeypatch):
+    """It would change what the model or the robot is told, and be lost without a word."""
+    source = published.lerobot_folder(version, tmp_path / "theirs", monkeypatch)
+    file = source / f"{stem}.json"
+    steps = json.loads(file.read_text())["steps"]
+    LeRobotGR00TFormat().read(source)
+    for name in ("normalizer_processor", "image_crop_resize_processor"):
+        published.write(file, {"steps": [*steps, {"registry_name": name, "config": {}}]})
+        with pytest.raises(CheckpointError, match=f"the step '{name}' .* not known") as caught:
+            LeRobotGR00TFormat().read(source)
+        assert str(file) in str(caught.value)
+    published.write(file, {"steps": [*steps, {"class": "mine.Blur"}]})
+    with pytest.raises(CheckpointError, match=r"the step 'mine\.Blur' .* not known here"):
+        LeRobotGR00TFormat().read(source)
+
+
+@pytest.mark.parametrize(
+    ("version", "pack", "words"),
+    [
+        ("n1.7", {"normalize_min_max": False}, "normalize_min_max is False"),
+        ("n1.5", {"formalize_language": True}, "formalize_language is True; False is known"),
+    ],
+)
+def test_settings_of_a_step_that_are_not_done_here(version, pack, words, tmp_path, monkeypatch):
+    source = published.lerobot_folder(version, tmp_path / "theirs", monkeypatch, **pack)
+    with pytest.raises(CheckpointError, match=words):
+        LeRobotGR00TFormat().read(source)
+
+
+def test_cameras_that_lerobot_renames_keep_the_robots_name(tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
+    file = source / "policy_preprocessor.json"
+    steps = json.loads(file.read_text())["steps"]
+    names = {"observation.images.top": "observation.images.front"}
+    steps[0]["config"]["rename_map"] = names
+    published.write(file, {"steps": steps})
+    assert LeRobotGR00TFormat().read(source).img_keys == ("top", "wrist")
+    steps[0]["config"]["rename_map"] = {"a": 3}
+    published.write(file, {"steps": steps})
+    with pytest.raises(CheckpointError, match=r"rename_map is \{'a': 3\}, no table of names"):
+        LeRobotGR00TFormat().read(source)
+
+
+def test_relative_actions_that_lerobot_counts_itself(tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
+    file = source / "policy_preprocessor.json"
+    steps = json.loads(file.read_text())["steps"]
+    for enabled in (True, False):
+        step = {"registry_name": "relative_actions_processor", "config": {"enabled": enabled}}
+        published.write(file, {"steps": [*steps, step]})
+        assert bool(LeRobotGR00TFormat().read(source).statistics["private"]) is not enabled
 
 
 @pytest.mark.parametrize(

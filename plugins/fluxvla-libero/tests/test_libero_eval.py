@@ -278,7 +278,7 @@ def test_inference_with_a_chunk_that_is_not_finite_fails_and_says_why(
 ):
     lost = np.full((1, 7), np.nan)
     monkeypatch.setattr(LiberoExpert, "predict_action", lambda self, observation: lost)
-    with pytest.raises(RunFailed, match="the policy's chunk is not finite: keyframe 0, ") as caught:
+    with pytest.raises(RunFailed, match="the policy's chunk is not finite: action 0, ") as caught:
         infer(tmp_path, listener, "2")
     summary = json.loads((tmp_path / "inference" / "001-2" / "episode.json").read_text())
     assert (summary["outcome"], summary["problem"]) == ("failed", caught.value.what)

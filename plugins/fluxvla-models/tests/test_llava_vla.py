@@ -17,7 +17,8 @@ from fluxvla_models.pretrained_backbones import (
     SigLIPBackbone,
 )
 
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.training.part_weights import put_parts
 
 TEXT = {
     "hidden_size": 16,
@@ -316,3 +317,53 @@ def test_in_mixed_precision(folders, make) -> None:
     loss.backward()
     assert loss.item() == pytest.approx(expected, rel=0.05)
     assert all(p.grad.dtype == torch.float32 for p in model.parameters())
+
+
+def new(folders: dict[str, str], **more: object) -> LlavaVLA:
+    """The halves with weights drawn anew."""
+    return LlavaVLA(
+        vision_backbone={
+            "type": "SigLIPBackbone",
+            "model_folder": folders["siglip"],
+            "num_cameras": 2,
+            "pretrained": False,
+        },
+        projector={"type": "FusedMLPProjector"},
+        llm_backbone={
+            "type": "Qwen3Backbone",
+            "model_folder": folders["qwen3"],
+            "pretrained": False,
+        },
+        vla_head=HEAD,
+        **more,
+    )
+
+
+def test_weights_come_under_other_names(folders: dict[str, str]) -> None:
+    """The language model alone, from its own folder, which has a layer for words besides."""
+    mapping = {"llm_backbone.model.": "model."}
+    place = {"pretrained_name_or_path": folders["qwen3"], "name_mapping": mapping}
+    model = new(folders, **place, strict_mapping=False)
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    put_parts(model, model.part_weights)
+    theirs = halves(folders).llm_backbone.state_dict()
+    for name, tensor in model.state_dict().items():
+        part, _, rest = name.partition(".")
+        expected = theirs[rest] if part == "llm_backbone" else before[name]
+        assert torch.equal(tensor, expected), name
+    assert model.pretrained_name_or_path is None
+    strict = new(folders, **place)
+    with pytest.raises(CheckpointError, match=r"1 left over: lm_head\.weight"):
+        put_parts(strict, strict.part_weights)
+    wrong = new(folders, **{**place, "name_mapping": {"llm_backbone.": "model."}})
+    with pytest.raises(CheckpointError, match=r"missing: model\.model\.embed_tokens\.weight"):
+        put_parts(wrong, wrong.part_weights)
+
+
+def test_names_of_no_place_are_refused(folders: dict[str, str]) -> None:
+    for more in (
+        {"name_mapping": {"llm_backbone.": ""}},
+        {"name_mapping": {}, "pretrained_name_or_path": folders["qwen3"]},
+    ):
+        with pytest.raises(ConfigError, match="name_mapping says how weights are called in"):
+            new(folders, **more)

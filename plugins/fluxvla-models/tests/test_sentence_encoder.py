@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
 from fluxvla_core.data import resolve_model_path
@@ -33,3 +34,16 @@ def test_weights_that_cannot_be_read_are_named(tmp_path: Path, damage: bytes) ->
     (tmp_path / "model.safetensors").write_bytes(damage)
     with pytest.raises(ConfigError, match=str(tmp_path)):
         SentenceEncoder(str(tmp_path))
+
+
+def test_it_is_built_and_called_without_memory() -> None:
+    with torch.device("meta"):
+        bare = SentenceEncoder()
+        tokens = torch.ones(3, 8, dtype=torch.long)
+        found = bare(tokens, tokens.bool())
+    assert {p.device.type for p in bare.parameters()} == {"meta"}
+    assert not any(p.requires_grad for p in bare.parameters())
+    real = SentenceEncoder()
+    shapes = {name: (p.shape, p.dtype) for name, p in real.named_parameters()}
+    assert {name: (p.shape, p.dtype) for name, p in bare.named_parameters()} == shapes
+    assert (found.shape, found.dtype) == ((3, real.out_dim), torch.float32)

@@ -11,7 +11,7 @@ from fluxvla_openvla.formats import OpenVLAFormat
 
 from fluxvla_core import load_policy
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.errors import CheckpointError, ConfigError, UsageError
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 
 from . import published
@@ -144,6 +144,7 @@ def test_unmerged_lora_matrices_count(tmp_path):
 
 def test_of_several_statistics_one_is_chosen(tmp_path, capsys):
     both = {"bridge_orig": published.entry(), "fractal": published.entry()}
+    both["fractal"]["action"]["q99"] = [1.25] * 7
     published.openvla(tmp_path / "theirs", both)
     source, out = tmp_path / "theirs", tmp_path / "ours"
     words = ["--embodiment", arm(tmp_path, ("image",)), "--rate", "5"]
@@ -154,6 +155,20 @@ def test_of_several_statistics_one_is_chosen(tmp_path, capsys):
     sidecar = json.loads((source / "fluxvla_openvla.json").read_text())
     (source / "fluxvla_openvla.json").write_text(json.dumps({**sidecar, "unnorm_key": "fractal"}))
     assert run("import-checkpoint", source, tmp_path / "chosen", *words) == 0
+    read = OpenVLAFormat().read
+    found, chosen = read(source), OpenVLAFormat().read_for(source, robot="bridge_orig")
+    for got, name in ((found, "fractal"), (chosen, "bridge_orig")):
+        kept = {key: both[name][key] for key in ("proprio", "action")}
+        assert got.statistics == {"private": kept}
+    assert chosen.action_rate_hz == 5.0  # Bridge's
+    capsys.readouterr()
+    words += ["--robot", "bridge"]
+    assert run("import-checkpoint", source, tmp_path / "other", *words) == 2
+    told = capsys.readouterr().err
+    assert "--robot bridge: the checkpoint knows no such robot; did you mean 'bridge_orig'" in told
+    assert "It knows bridge_orig, fractal" in told
+    with pytest.raises(UsageError, match="OpenVLA needs the pictures of all cameras"):
+        OpenVLAFormat().read_for(source, absent=("image",))
     policy = load_policy(tmp_path / "chosen")
     policy.reset(0)
     images = {"image": SEEN["image"]}

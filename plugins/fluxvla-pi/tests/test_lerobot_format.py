@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner
@@ -157,6 +157,19 @@ def test_statistics_among_the_weights(tmp_path, family):
     for entry in ("proprio", "action"):
         for name in names:
             assert read.statistics["private"][entry][name] == expected[entry][name]
+
+
+def test_a_camera_that_the_robot_lacks(tmp_path, bring, capsys):
+    out = bring(lerobot_folder(tmp_path / "theirs", "pi05"), "--camera", "wrist=none")
+    assert "cameras front; " in capsys.readouterr().out
+    policy = load_policy(out)
+    policy.reset(pi_inputs.SEED)
+    chunk = policy.predict_action(observation("pi05"))
+    assert chunk.shape == (pi_inputs.HORIZON, pi_inputs.ROBOT_ACTIONS)
+    with pytest.raises(UsageError, match="no such camera; it has front, wrist"):
+        LeRobotPiFormat().read_for(tmp_path / "theirs", absent=("top",))
+    with pytest.raises(UsageError, match=r"--robot x: .* It knows none by name"):
+        LeRobotPiFormat().read_for(tmp_path / "theirs", robot="x")
 
 
 def test_a_base_model_without_statistics(tmp_path):

@@ -9,6 +9,7 @@ from fluxvla_pi.pi0 import PI0FlowMatching
 from fluxvla_pi.pi05 import PI05FlowMatching
 
 from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.training.footprint import fake, kept, kept_by_fake
 
 from .oracles.pi_inputs import ACTIONS, BATCH, HORIZON, SIZES
 from .tiny import acting_batch, model_of, relative, training_batch
@@ -355,3 +356,16 @@ def test_named_sizes():
         )
     assert model.action_shape == (50, 32)
     assert len(model.llm_backbone.layers) == len(model.llm_expert.layers) == 4
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16], ids=["float32", "bfloat16"])
+def test_its_activations_are_counted_without_memory(family, dtype):
+    with torch.device("meta"):
+        bare = model_of(family)
+    batch = training_batch()
+    told = kept_by_fake(fake(bare), batch, dtype)
+    found = kept(model_of(family), batch, dtype)
+    assert told.activations == pytest.approx(found.activations, rel=0.01)
+    assert told.recomputed == pytest.approx(found.recomputed, rel=0.01)
+    assert told.weight_copies == found.weight_copies

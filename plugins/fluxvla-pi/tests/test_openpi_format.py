@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core import Camera, EmbodimentSpec
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
 
 from .oracles import pi_inputs
@@ -25,13 +25,13 @@ ARM = EmbodimentSpec(
 )
 
 
-def brought(tmp_path, family):
+def brought(tmp_path, family, cameras=("top", "left", "right")):
     """A tiny checkpoint of openpi's, imported for a robot with three cameras."""
     source = openpi_folder(tmp_path / "theirs", family)
     words = tokenizer_folder(tmp_path / "words")
     (tmp_path / "arm.json").write_text(json.dumps(ARM.to_dict()))
     told = ["--tokenizer", str(words), "--embodiment", str(tmp_path / "arm.json"), "--rate", "10"]
-    for theirs, ours in zip(CAMERAS, ("top", "left", "right"), strict=True):
+    for theirs, ours in zip(CAMERAS, cameras, strict=True):
         told += ["--camera", f"{theirs}={ours}"]
     assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *told]) == 0
     return source, tmp_path / "ours"
@@ -165,8 +165,41 @@ def test_statistics_of_two_robots(tmp_path):
     source = openpi_folder(tmp_path / "theirs", "pi0")
     (source / "assets" / "other").mkdir()
     (source / "assets" / "other" / "norm_stats.json").write_text("{}")
-    with pytest.raises(CheckpointError, match="statistics of several robots: arm, other"):
-        OpenPiFormat().read(source)
+    found = OpenPiFormat().read(source)
+    assert (found.statistics, found.transforms) == ({"private": {}}, ())
+    text = " ".join(found.notes)
+    assert "statistics of several robots (acme/arm, other): choose one by --robot" in text
+    chosen = OpenPiFormat().read_for(source, robot="acme/arm")
+    alone = OpenPiFormat().read(openpi_folder(tmp_path / "alone", "pi0"))
+    assert chosen.statistics == alone.statistics
+    assert chosen.transforms == alone.transforms
+    with pytest.raises(UsageError, match=r"--robot arm: .* It knows acme/arm, other"):
+        OpenPiFormat().read_for(source, robot="arm")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(tmp_path, family, monkeypatch):
+    """openpi gives the model a picture of nothing, and masks it."""
+    _, out = brought(tmp_path, family, ("top", "none", "right"))
+    policy = load_policy(out)
+    assert policy.cameras == ("top", "right")
+    act, asked = policy.model.predict_action, []
+    monkeypatch.setattr(policy.model, "predict_action", lambda **b: asked.append(b) or act(**b))
+    images, state = pi_inputs.observation()
+    pictures = {"top": images["front"], "right": images["front"][::-1].copy()}
+    policy.reset(pi_inputs.SEED)
+    policy.predict_action({"qpos": state, "images": pictures, "task_description": "put it away"})
+
+    (batch,) = asked
+    top, right = batch["images"].chunk(2, 1)
+    masks = torch.tensor([[True, False, True]])
+    with torch.no_grad():
+        found = act(**batch)
+        masked = torch.cat([top, -torch.ones_like(top), right], 1)
+        expected = act(**{**batch, "images": masked, "img_masks": masks})
+        turned = act(**{**batch, "images": torch.cat([right, top], 1)})
+    torch.testing.assert_close(found, expected)
+    assert not torch.allclose(found, turned)
 
 
 def test_other_folders_are_not_recognised(tmp_path):

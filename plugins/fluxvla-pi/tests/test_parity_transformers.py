@@ -40,10 +40,9 @@ def decoder(size):
     }
 
 
-@pytest.fixture(scope="module")
-def pair():
-    """Our model and theirs, with the same weights."""
-    from transformers import PI0Config, PI0ForConditionalGeneration
+def their_config():
+    """Of a tiny model."""
+    from transformers import PI0Config
 
     vision = {
         "model_type": "siglip_vision_model",
@@ -55,7 +54,7 @@ def pair():
         "num_attention_heads": VISION["heads"],
         "vision_use_head": False,
     }
-    config = PI0Config(
+    return PI0Config(
         vlm_config={
             "model_type": "paligemma",
             "text_config": decoder(GEMMA),
@@ -68,7 +67,14 @@ def pair():
         max_state_dim=STATES,
         max_action_dim=ACTIONS,
     )
-    theirs = PI0ForConditionalGeneration(config).eval()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Our model and theirs, with the same weights."""
+    from transformers import PI0ForConditionalGeneration
+
+    theirs = PI0ForConditionalGeneration(their_config()).eval()
     ours = model_of("pi0", TRANSFORMERS)
     state = ours.state_dict()
     named = theirs.state_dict()

@@ -217,7 +217,7 @@ class TestAloha:
 
 
 class Waist:
-    """A policy that turns both waists; answers at 10 Hz, five keyframes at a time."""
+    """A policy that turns both waists; answers at 10 Hz, five actions at a time."""
 
     action_rate_hz = 10.0
     horizon = 5

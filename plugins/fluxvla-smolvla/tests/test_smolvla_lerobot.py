@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core import Camera, Continuation, EmbodimentSpec, Joint
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
-from fluxvla_core.errors import CheckpointError, ConfigError, FluxError
+from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, UsageError
 from fluxvla_core.models import load_policy
 from tests.oracles import fill
 
@@ -108,6 +108,29 @@ def test_it_acts_as_in_lerobot(source, tmp_path, tokenizer, golden, monkeypatch,
         expected = golden[f"act.{number}.actions"].double()
         assert chunk.shape == (HORIZON, ACTION)
         assert relative(torch.from_numpy(chunk), expected) < 1e-5
+
+
+def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(
+    source, tmp_path, tokenizer, monkeypatch, capsys
+):
+    first, *others = CAMERAS
+    policy = load_policy(
+        imported(source, tmp_path / "ours", tokenizer, "--camera", f"{first}=none")
+    )
+    assert f"cameras {', '.join(others)}; " in capsys.readouterr().out
+    act, asked = policy.model.predict_action, []
+    monkeypatch.setattr(policy.model, "predict_action", lambda **b: asked.append(b) or act(**b))
+    policy.predict_action(raw_observation(0))
+    (batch,) = asked
+    gone = -torch.ones_like(batch["images"][:, :3])
+    masks = torch.cat([torch.zeros(1, 1, dtype=torch.bool), batch["img_masks"].bool()], 1)
+    with torch.no_grad():
+        images = torch.cat([gone, batch["images"]], 1)
+        torch.testing.assert_close(
+            act(**batch), act(**{**batch, "images": images, "img_masks": masks})
+        )
+    with pytest.raises(UsageError, match=f"no such camera; it has {', '.join(CAMERAS)}"):
+        LeRobotSmolVLA().read_for(source, str(tokenizer), absent=("none_such",))
 
 
 def test_a_policy_continues_a_chunk(source, tmp_path, tokenizer):

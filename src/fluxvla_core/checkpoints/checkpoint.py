@@ -135,7 +135,7 @@ class Checkpoint:
             )
 
     def _damage(self) -> tuple[str, str] | None:
-        """What is wrong with the first file that is not whole, and its likely cause."""
+        """The first damaged file, what is wrong with it, and its likely cause."""
         for name, entry in sorted(self.manifest.files.items()):
             try:
                 problem = _difference(self.path / name, entry)
@@ -259,6 +259,9 @@ def folders(place: str | Path) -> list[Path]:
 def latest(place: str | Path) -> Checkpoint | None:
     """The newest checkpoint of a work dir, None when there is none yet.
 
+    Only its manifest is read. What loads a policy or resumes uses :func:`newest_whole`, which
+    verifies every file and passes over a damaged checkpoint.
+
     Raises:
         CheckpointError: the newest one's manifest is damaged; the one before it is offered.
     """
@@ -281,7 +284,7 @@ def newest_whole(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointE
 
 
 def _offer_previous(path: Path) -> str | None:
-    """What to say about the newest whole checkpoint before ``path``."""
+    """Text that names the newest undamaged checkpoint before ``path``."""
     step = step_of(path)
     for folder in reversed(folders(path.parent)):
         if step is None or (step_of(folder) or 0) >= step:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
 from torch import Tensor
 
 from fluxvla_core.checkpoints.parts import Stored, StoredTensors
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.data.lerobot import camera_name
+from fluxvla_core.errors import CheckpointError, UsageError, nearest
 from fluxvla_core.untrusted import read_json
 
 HUB = "hf:"
@@ -93,6 +94,46 @@ def renamed(
             cause="it was saved by another version of that project, or is of another model",
         )
     return Renamed(tensors, names)
+
+
+def chosen_robot(known: Iterable[str], robot: str | None, where: str) -> str | None:
+    """The robot that is meant: ``robot``, or the only one that a checkpoint knows; else None.
+
+    Raises:
+        UsageError: it knows no ``robot``; lists those that it knows.
+    """
+    names = sorted(known)
+    if robot is None:
+        return names[0] if len(names) == 1 else None
+    if robot not in names:
+        close = nearest(robot, names)
+        meant = f"; did you mean {close!r}?" if close else ""
+        raise UsageError(
+            f"--robot {robot}: the checkpoint knows no such robot{meant} It knows "
+            f"{', '.join(names) or 'none by name'}",
+            where=where,
+        )
+    return robot
+
+
+def without_cameras(cameras: Sequence[str], absent: Sequence[str], where: str) -> tuple[str, ...]:
+    """``cameras`` but for those that the robot lacks; names may have ``observation.images.``.
+
+    Raises:
+        UsageError: one of ``absent`` is none of them, or none is left.
+    """
+    gone = {camera_name(name) for name in absent}
+    unknown = sorted(gone - {camera_name(name) for name in cameras})
+    listed = ", ".join(camera_name(name) for name in cameras) or "none by name"
+    if unknown:
+        raise UsageError(
+            f"--camera {unknown[0]}=none: the checkpoint has no such camera; it has {listed}",
+            where=where,
+        )
+    left = tuple(name for name in cameras if camera_name(name) not in gone)
+    if not left:
+        raise UsageError(f"--camera …=none: no camera is left of {listed}", where=where)
+    return left
 
 
 def foreign_folder(place: str | Path) -> Path:

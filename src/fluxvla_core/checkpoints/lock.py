@@ -143,7 +143,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _path_of(descriptor: int) -> Path | None:
-    """Where an open folder is now, if the system says (Linux); None if it was removed."""
+    """The current path of an open folder, if the system tells it (Linux); None if removed."""
     try:
         found = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
     except OSError:

@@ -70,7 +70,7 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        """For indexing the whole tensor."""
+        """Slices that select this region of the full tensor."""
         return tuple(slice(o, o + n) for o, n in zip(self.offsets, self.sizes, strict=True))
 
     def common(self, other: Region) -> Region | None:
@@ -84,7 +84,7 @@ class Region:
         return Region(tuple(begins), tuple(sizes)) if all(n > 0 for n in sizes) else None
 
     def inside(self, outer: Region) -> tuple[slice, ...]:
-        """For indexing a tensor that holds just ``outer``."""
+        """Slices that select this region of a tensor that holds just ``outer``."""
         moved = [o - p for o, p in zip(self.offsets, outer.offsets, strict=True)]
         return Region(tuple(moved), self.sizes).slices
 
@@ -97,7 +97,7 @@ def is_split(tensor: Tensor) -> bool:
 
 
 def own_parts(tensors: Mapping[str, Tensor], first: bool) -> dict[str, Tensor]:
-    """Those of ``tensors`` that this rank saves its part of: each part is saved by one rank.
+    """The local shards of ``tensors`` that this rank saves; each shard is saved by one rank.
 
     Args:
         first: whether this rank saves what is not split.

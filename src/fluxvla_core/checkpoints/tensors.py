@@ -123,7 +123,7 @@ class TensorFile:
         return cls(name, _header(kept, describe_parts(named)), tuple(kept.values()), True)
 
     def gathered(self, keep: Callable[[int, Tensor], Tensor]) -> TensorFile:
-        """The same with whole tensors; all ranks call it, those that do not write get none.
+        """This file with full tensors instead of shards; all ranks call it, writers get tensors.
 
         Args:
             keep: given the place of each tensor that had to be gathered and the whole of it, before

@@ -29,11 +29,13 @@ KITS: Mapping[str, str] = {
     "metrics": "MetricConformance",
     "operators": "OperatorConformance",
     "policies": "PolicyConformance",
-    "runners": "TrainRunnerConformance",
+    "runners": "InferenceRunnerConformance",
     "transforms": "TransformConformance",
     "vlas": "ModelConformance",
 }
-"""Registry -> its kit in ``fluxvla_core.testing``; of runners, that of train runners."""
+"""Registry -> its kit in ``fluxvla_core.testing``; of runners, that of those that drive a robot."""
+TRAINS, EVALUATES = "TrainRunnerConformance", "EvalRunnerConformance"
+"""The kits of other runners."""
 INSTALL = "pip install 'fluxvla-core[testing]'"
 _MODULE = "test_plugin.py"
 _SOURCE = """\
@@ -96,7 +98,7 @@ class CheckPlugin:
             raise UsageError("the kits need pytest, which is not installed", next=INSTALL)
         load_plugin_files(args.plugin_files)
         registry = _registry_of(args.name)
-        kit = _kit_of(registry, args.name)
+        kit = _kit_of(registry, args.name, args.kit is not None)
         _agree(args, registry)
         if args.kit is not None and args.arguments:
             raise UsageError("--set is for a kit without a file; --kit has arguments of its own")
@@ -135,9 +137,13 @@ def _registry_of(name: str) -> str:
     return next((registry for registry in having if registry in KITS), having[0])
 
 
-def _kit_of(registry: str, name: str) -> str:
-    """Raises UsageError where there is no kit for the class, PluginError where it is broken."""
-    from fluxvla_core.contracts.check import is_train_runner
+def _kit_of(registry: str, name: str, own: bool) -> str:
+    """The kit for the class; "" where only a file (``own``) can have one.
+
+    Raises:
+        UsageError: there is none.
+        PluginError: the class is broken.
+    """
     from fluxvla_core.plugins.registry import BY_NAME
 
     if registry not in KITS:
@@ -147,18 +153,36 @@ def _kit_of(registry: str, name: str) -> str:
             next="fluxvla plugins doctor checks its class",
         )
     cls = BY_NAME[registry].get(name)
-    if registry == "runners" and not is_train_runner(cls):
-        raise UsageError(
-            f"{name} is a runner that does not train, for which there is no kit",
-            next="fluxvla plugins doctor checks its class",
-        )
-    if registry == "runners" and BY_NAME[registry].registered(name) is not None:
+    return _kit_of_runner(name, cls, own) if registry == "runners" else KITS[registry]
+
+
+def _kit_of_runner(name: str, cls: type, own: bool) -> str:
+    """By what its constructor takes; raises UsageError where no kit fits that."""
+    from fluxvla_core.build import parameters
+    from fluxvla_core.contracts.check import is_train_runner
+    from fluxvla_core.plugins.registry import RUNNERS
+
+    if is_train_runner(cls):
+        if RUNNERS.registered(name) is None:
+            return TRAINS
         raise UsageError(
             f"{name} is registered by a file, and train runners are tested in processes of their "
             "own, which know what is installed",
             next="pip install -e its distribution; fluxvla new-plugin begins one",
         )
-    return KITS[registry]
+    taken = set(parameters(cls))
+    if {"operator", "policy"} <= taken:
+        return KITS["runners"]
+    if {"policy", "episodes"} <= taken:
+        return EVALUATES
+    if own:
+        return ""
+    raise UsageError(
+        f"{name} neither trains, nor takes an operator and a policy to drive a robot, nor a policy "
+        "and episodes to evaluate it, and the kits of runners are for these",
+        next="fluxvla plugins doctor checks its class; a subclass of a kit says what its keys are "
+        "called (--kit FILE)",
+    )
 
 
 def _agree(args: argparse.Namespace, registry: str) -> None:

@@ -84,11 +84,11 @@ def _claimed(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
 def _run_section(
     plan: Plan, build: Any, context: Any, own_records: bool = False
 ) -> tuple[Any, int]:
-    """The call order of the specification: construct, ``run_setup``, ``run``.
+    """Run a section: construct its runner, call ``run_setup``, then ``run``.
 
     Args:
-        own_records: what evaluates leaves its config in its section's folder, unless its runner
-            keeps it where its results are.
+        own_records: write the config and the environment to the section's own folder, unless the
+            runner keeps them beside its results (``Runner.keeps_config``).
 
     Returns:
         What the section gave, and the signal that asked to stop it when it was done, or 0.

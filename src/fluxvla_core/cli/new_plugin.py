@@ -22,6 +22,8 @@ BASE = """(
     Joint.base("base_turn", "rad/s", speed=1.0, acceleration=2.0),
 )"""
 """The joints of a mobile base, in the words of an embodiment."""
+DOMAIN = "export ROS_DOMAIN_ID=42 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+"""So that no other robot is commanded."""
 
 
 class NewPlugin:
@@ -43,12 +45,16 @@ class NewPlugin:
         parser.add_argument(
             "--mobile-base", action="store_true", help="a robot that drives: two speeds more"
         )
+        parser.add_argument(
+            "--ros2", action="store_true", help="a robot whose drivers are ROS 2 nodes"
+        )
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.cli import scaffold
 
         kind, plugin = scaffold.kind_of(args.kind), scaffold.plugin_of(args.name)
         options = _options(args)
+        kind = scaffold.ROS2 if args.ros2 else kind
         _refuse_taken(plugin, kind)
         folder = Path(args.dir) / plugin.dist
         files = scaffold.render(plugin, kind, options)
@@ -68,6 +74,7 @@ def _options(args: argparse.Namespace) -> dict[str, str]:
         "joints": args.joints is not None,
         "cameras": args.cameras is not None,
         "mobile-base": args.mobile_base,
+        "ros2": args.ros2,
     }
     for name, there in given.items():
         if there and args.kind != ROBOT:
@@ -105,10 +112,13 @@ def _next_steps(folder: Path, plugin: Plugin, kind: Kind, files: int, todo: list
     place = shlex.quote(str(folder))
     name = class_name(plugin, kind.parts[0])
     run = Template(kind.run).substitute(short=plugin.short, type=name)
+    beside = Template(kind.beside).substitute(package=plugin.package)
     return [
         f"{folder}: {files} files. Next:",
         f"  pip install -e {shlex.quote(f'{folder}[testing]')}",
         f"  python -m pytest {place}",
+        *([f"  {DOMAIN}  # here and in another terminal"] if beside else []),
+        *([f"  {beside}  # there: it stands in for the robot"] if beside else []),
         f"  cd {place} && {run}",
         f"What only you can fill in is marked TODO: {', '.join(todo)}",
     ]

@@ -59,7 +59,7 @@ def make_plan(
 
 
 def _of_checkpoint(config: Config, file: Path, examined: Checked, given: Collection[str]) -> Config:
-    """The config of a checkpoint means that checkpoint, unless the command names another."""
+    """For a checkpoint's own config: ``ckpt_path`` set to that checkpoint, unless it was given."""
     if not _in_checkpoint(file):
         return config
     for use in examined.uses:

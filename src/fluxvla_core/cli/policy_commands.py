@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from fluxvla_core.atomic import json_text
 from fluxvla_core.cli.parser import Parser
@@ -107,23 +108,31 @@ class ImportCheckpoint:
             metavar="THEIRS=OURS",
             action="append",
             default=[],
-            help="the robot's name of a camera; may be repeated",
+            help="the robot's name of a camera, or 'none' where the robot has no such camera; may "
+            "be repeated",
+        )
+        parser.once(
+            "--robot",
+            metavar="NAME",
+            help="which one, if the checkpoint knows several: GR00T's embodiment tag, OpenVLA's "
+            "unnorm_key, the folder of openpi's statistics",
         )
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.training.foreign import embodiment_in, import_checkpoint
 
-        rate_hz, cameras = _rate(args.rate), dict(_pair(text) for text in args.camera)
-        robot = None if args.embodiment is None else embodiment_in(args.embodiment)
+        rate_hz, cameras = _rate(args.rate), _cameras(args.camera)
+        embodiment = None if args.embodiment is None else embodiment_in(args.embodiment)
         with heartbeat(f"importing {args.source}"):
             path, found = import_checkpoint(
                 args.source,
                 args.folder,
                 format=args.format,
                 tokenizer=args.tokenizer,
-                embodiment=robot,
+                embodiment=embodiment,
                 action_rate_hz=rate_hz,
                 cameras=cameras,
+                robot=args.robot,
             )
         name = "no robot" if found.embodiment is None else found.embodiment.name
         rate = "an unknown rate" if not found.action_rate_hz else f"{found.action_rate_hz:g} Hz"
@@ -142,8 +151,14 @@ def _rate(hz: float | None) -> float | None:
     return hz
 
 
-def _pair(text: str) -> tuple[str, str]:
-    theirs, equals, ours = text.partition("=")
-    if not (theirs and equals and ours):
-        raise UsageError(f"--camera {text!r} is not THEIRS=OURS")
-    return theirs, ours
+def _cameras(given: Sequence[str]) -> dict[str, str | None]:
+    """The checkpoint's camera -> the robot's; None for one that the robot lacks."""
+    found: dict[str, str | None] = {}
+    for text in given:
+        theirs, equals, ours = text.partition("=")
+        if not (theirs and equals and ours):
+            raise UsageError(f"--camera {text!r} is not THEIRS=OURS")
+        if theirs in found:
+            raise UsageError(f"--camera {theirs}=… is given twice")
+        found[theirs] = None if ours == "none" else ours
+    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import signal
@@ -103,7 +102,9 @@ class Run:
         _check_options(args, plan)
         after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
-            say(_outline(plan, args.log_format))
+            from fluxvla_core.cli.dry_run import outline
+
+            say(outline(plan, args.log_format, args.nproc))
             return 0
         if plan.trains:
             ranks.refuse_lost_work_dir()
@@ -226,34 +227,6 @@ def _command_line(args: argparse.Namespace) -> list[str]:
     for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
         argv += [word for value in values for word in (name, value)]
     return [*argv, "--log-format", args.log_format]
-
-
-def _outline(plan: Plan, log_format: str) -> str:
-    """The output of ``--dry-run``."""
-    from fluxvla_core.cli.config_commands import listing, used
-
-    if log_format == "json":
-        outline = {
-            "section": plan.section,
-            "trains": plan.trains,
-            "work_dir": str(plan.work_dir),
-            "plugins": [
-                {"key": u.key, "type": u.found.title, "provided_by": u.found.origin}
-                for u in plan.uses
-            ],
-            "config": plan.config.tree,
-            "origins": dict(plan.config.origins),
-        }
-        return json.dumps(outline)
-    lines = [
-        f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
-        f"work dir: {plan.work_dir}",
-        "plugins:",
-        *used(plan.uses),
-        "config:",
-        *(f"  {line}" for line in listing(plan.config, origin=True)),
-    ]
-    return "\n".join(lines)
 
 
 # -- --eval-after-train -----------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Template
 
@@ -44,6 +44,8 @@ class Kind:
         about: what the distribution is, in its metadata and its package's docstring.
         extras: of the core, that it cannot work without.
         run: the command that runs it, in the folder of the distribution.
+        beside: the command that has to run meanwhile, in another terminal.
+        ci: what its CI installs besides.
     """
 
     parts: tuple[Part, ...]
@@ -51,6 +53,8 @@ class Kind:
     about: str
     extras: tuple[str, ...]
     run: str
+    beside: str = ""
+    ci: str = ""
 
 
 RUN = "fluxvla run --config configs/${short}.toml"
@@ -64,7 +68,7 @@ KINDS: Mapping[str, Kind] = {
         ),
         ("operator",),
         "A robot for FluxVLA",
-        (),
+        ("data",),  # an episode leaves a video of each camera
         f"{RUN} --task 1",
     ),
     "policy": Kind(
@@ -134,6 +138,14 @@ KINDS: Mapping[str, Kind] = {
         RUN_STAND_IN,
     ),
 }
+ROS2 = replace(
+    KINDS["operator"],
+    folders=("operator", "operator-ros2"),
+    about="A robot on ROS 2 for FluxVLA",
+    beside="python -m ${package}.driver",
+    ci="'fluxvla-core[ros2]'",
+)
+"""The kind ``operator`` for a robot whose drivers are ROS 2 nodes."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +259,7 @@ def _values(plugin: Plugin, kind: Kind) -> dict[str, str]:
         "core_testing": f"fluxvla-core[testing]{bound}",
         "entry_points": entry_points,
         "about": kind.about,
+        "ci": f" {kind.ci}" if kind.ci else "",
         "type": class_name(plugin, kind.parts[0]),
         **{part.suffix: _attribute(plugin, part) for part in kind.parts},
     }

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from fluxvla_core.config.signature import Parameter, Signature, table_of
+from fluxvla_core.config.parameters import Parameter
+from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.source import dotted_name
 
 Schema = dict[str, Any]
@@ -29,7 +30,7 @@ _TABLES = frozenset({"dict", "Dict", "Mapping", "MutableMapping"})
 
 
 def value_schema(parameter: Parameter, nested: Callable[[Signature], Schema]) -> Schema:
-    """What a parameter's annotation says of its values; ``{}``, which allows all, if nothing.
+    """JSON Schema of a parameter's annotation; ``{}``, which allows all, without one.
 
     Args:
         nested: the schema of a table that a dataclass or a ``TypedDict`` describes.

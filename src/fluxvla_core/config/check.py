@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from fluxvla_core.config.parameters import Parameter
 from fluxvla_core.config.resolve import (
     INJECTED,
     LOADER_KEYS,
@@ -18,7 +19,7 @@ from fluxvla_core.config.resolve import (
     Found,
     resolve,
 )
-from fluxvla_core.config.signature import Parameter, Signature, table_of
+from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.tree import Config, all_keys, join_key
 from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem, nearest
 from fluxvla_core.plugins._metadata import canonical, version
@@ -27,6 +28,8 @@ from fluxvla_core.plugins.load import LIST
 
 REQUIRES = "requires"
 """The key of ``requires = ["fluxvla-ur>=0.3"]``: what a config says it needs (PEP 508)."""
+# ``inference_model`` is in configs of upstream FluxVLA. Nothing is built from it here: a policy is
+# built from the checkpoint's ``model``. Its classes are checked like any others.
 _NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, REQUIRES, "hooks")
 # Keys under which a table without ``type`` can only be a slip.
 _NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filters"}
@@ -277,7 +280,7 @@ class _Walk:
         return f"{text}; {'or ' if near else ''}{history}" if history else text
 
     def _left_over(self, key: str, name: str) -> str:
-        """What to do about a key that was written for another class; empty if it was not."""
+        """Advice for a key that was written for another class; empty if it was not."""
         here, there = (self.config.where(join_key(key, n)) for n in (name, "type"))
         if _typed(here):
             return ""
@@ -290,7 +293,7 @@ class _Walk:
 
 
 def _typed(place: str) -> bool:
-    """Whether a place is an option of the command line and no line of a file."""
+    """Whether a value came from an option such as ``--set``, not from a file."""
     return place.startswith("--")
 
 

@@ -29,7 +29,7 @@ class Change:
 
 
 def differences(old: Config, new: Config) -> list[Change]:
-    """What ``new`` has other than ``old``, in the order of ``new``, then what it lacks.
+    """The keys that differ between ``old`` and ``new``, in the order of ``new``, then removed ones.
 
     Values are compared as they are written: ``1`` and ``1.0`` and ``True`` differ, NaN equals NaN.
     Items of lists of tables (transforms) are aligned, so that an inserted one is one change; a key

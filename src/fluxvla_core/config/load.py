@@ -52,7 +52,7 @@ def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Co
     real = Path(os.path.realpath(path))
     if real in chain:
         names = " -> ".join(shown(p) for p in (*chain[chain.index(real) :], real))
-        raise ConfigError(f"{BASE} goes round in a circle: {names}", where=shown(chain[-1]))
+        raise ConfigError(f"circular {BASE}: {names}", where=shown(chain[-1]))
     if len(chain) >= _LONGEST_CHAIN:
         raise ConfigError(
             f"a chain of more than {_LONGEST_CHAIN} files by {BASE}", where=shown(chain[0])

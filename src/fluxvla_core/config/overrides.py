@@ -101,7 +101,7 @@ def parse_value(text: str) -> Any:
 
 
 def _number(text: str) -> float | int | None:
-    """What Python would read ``text`` as: silently a string is not what was meant."""
+    """``text`` as a number if Python reads it as one, else None: a string was hardly meant."""
     try:
         number = float(text)
     except ValueError:

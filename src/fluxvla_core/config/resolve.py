@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.config.signature import Parameter, Signature, read_signature
+from fluxvla_core.config.parameters import Parameter
+from fluxvla_core.config.signature import Signature, read_signature
 from fluxvla_core.config.source import Opaque, flaw, lacks
 from fluxvla_core.config.source import find as find_source
 from fluxvla_core.errors import (

@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fluxvla_core.config.docstrings import argument_texts, field_texts
+from fluxvla_core.config.parameters import OPTIONS, Parameter
 from fluxvla_core.config.signature import (
-    OPTIONS,
     Forward,
     Init,
-    Parameter,
     Signature,
     combine,
     with_kwargs,

@@ -19,9 +19,10 @@ from urllib.parse import quote
 from fluxvla_core.config.annotations import Schema, default_value, value_schema
 from fluxvla_core.config.check import REQUIRES
 from fluxvla_core.config.load import BASE
+from fluxvla_core.config.parameters import Parameter
 from fluxvla_core.config.resolve import INJECTED, LOADERS, SEARCHED, SLOTS, Found, installed
 from fluxvla_core.config.runtime_signature import inspect_signature
-from fluxvla_core.config.signature import Parameter, Signature
+from fluxvla_core.config.signature import Signature
 from fluxvla_core.config.tree import DELETE
 from fluxvla_core.errors import PluginError
 from fluxvla_core.plugins._metadata import CORE, Plugin, version

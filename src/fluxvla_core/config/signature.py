@@ -14,6 +14,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fluxvla_core.config.docstrings import argument_texts, field_texts
+from fluxvla_core.config.parameters import (
+    Parameter,
+    dataclass_fields,
+    is_dataclass,
+    is_dataclass_source,
+    options_order,
+)
 from fluxvla_core.config.source import (
     Module,
     Opaque,
@@ -22,64 +29,11 @@ from fluxvla_core.config.source import (
     dotted_name,
     find,
     linearize,
-    member,
 )
 from fluxvla_core.plugins._metadata import Plugin
 
-OPTIONS = "Options"
-"""The class attribute that names the dataclass of a constructor's ``**options``."""
 OPTIONS_KEYWORDS = "options"
 _ANY_TABLE = frozenset({"None", "Mapping", "dict", "Dict"})
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One constructor parameter.
-
-    Args:
-        stated: its annotation and default, as written or as nodes of its source.
-        module: the module of that source.
-    """
-
-    name: str
-    required: bool
-    place: str
-    stated: str | tuple[ast.expr | None, ast.expr | None] = ""
-    module: str = ""
-
-    @property
-    def text(self) -> str:
-        """Its annotation and default as written: ``: int = 3``."""
-        if isinstance(self.stated, str):
-            return self.stated
-        left = f": {self.annotation}" if self.annotation else ""
-        return f"{left} = {self.default}" if self.default else left
-
-    @property
-    def annotation(self) -> str | None:
-        """Its annotation as source; None if it has none."""
-        return self._part(0)
-
-    @property
-    def default(self) -> str | None:
-        """Its default as source; None if it has none."""
-        return self._part(1)
-
-    def _part(self, index: int) -> str | None:
-        part = self.nodes[index]
-        return ast.unparse(part) if part else None
-
-    @property
-    def nodes(self) -> tuple[ast.expr | None, ast.expr | None]:
-        """Its annotation and default as nodes; what cannot be parsed (a repr) is None."""
-        if not isinstance(self.stated, str):
-            return self.stated
-        with suppress(SyntaxError):
-            stated = ast.parse(f"def f({self.name}{self.stated}): ...").body[0]
-            if isinstance(stated, ast.FunctionDef):
-                spec = stated.args
-                return spec.args[0].annotation, spec.defaults[0] if spec.defaults else None
-        return None, None
 
 
 @dataclass(frozen=True)
@@ -162,8 +116,8 @@ def read_signature(plugin: Plugin) -> Signature | None:
             found = _class_init(base, order)
             if found is not None and not unknown:
                 inits.append(found)
-    options = _options_order(order)
-    parameters, is_open = combine(inits, unknown, _fields(options) if options else None)
+    options = options_order(order)
+    parameters, is_open = combine(inits, unknown, dataclass_fields(options) if options else None)
     return Signature(
         node.name,
         source.place,
@@ -192,10 +146,10 @@ def table_of(parameter: Parameter) -> Signature | None:
     order = linearize(source)
     typed = any(_is_typed_dict(base) for base in order)
     known = all(isinstance(base, Source) or base.plain for base in order)
-    if not typed and (not known or not _is_dataclass_source(source) or _init_of(source.node)):
+    if not typed and (not known or not is_dataclass_source(source) or _init_of(source.node)):
         return None
-    fields = _fields(order, _is_typed_dict if typed else _is_dataclass_source)
-    return Signature(source.node.name, source.place, fields, documented=lambda: _meanings(order))
+    found = dataclass_fields(order, _is_typed_dict if typed else is_dataclass_source)
+    return Signature(source.node.name, source.place, found, documented=lambda: _meanings(order))
 
 
 def read_help(plugin: Plugin) -> str:
@@ -272,8 +226,8 @@ def _class_init(base: Source, order: list[Any]) -> Init | None:
     init = _init_of(node)
     if init is not None:
         return _init(init, base.module)
-    if _is_dataclass(node):
-        return Init(_fields(order[order.index(base) :]))
+    if is_dataclass(node):
+        return Init(dataclass_fields(order[order.index(base) :]))
     return None
 
 
@@ -347,14 +301,6 @@ def _item(target: ast.expr, kwargs: str) -> str | None:
     return None
 
 
-def _is_dataclass(node: ast.ClassDef | ast.FunctionDef) -> bool:
-    return any(
-        (dotted_name(d.func if isinstance(d, ast.Call) else d) or "").rpartition(".")[2]
-        == "dataclass"
-        for d in node.decorator_list
-    )
-
-
 def _alternatives(node: ast.expr) -> list[str]:
     """The names in a union: ``X | None``, ``Optional[X]``, ``"X"``; "" for what is not a name."""
     if isinstance(node, ast.BinOp):
@@ -379,75 +325,6 @@ def _is_typed_dict(base: Any) -> bool:
     if any(name.rpartition(".")[2] == "TypedDict" for name in names):
         return True
     return any(_is_typed_dict(find(base.module.name, name)) for name in names if name)
-
-
-def _fields(order: list[Any], counts: Callable[[Any], bool] | None = None) -> tuple[Parameter, ...]:
-    """Fields of a dataclass and of the dataclasses that it inherits from, bases first.
-
-    Args:
-        counts: which classes have fields; dataclasses by default.
-    """
-    found: dict[str, Parameter] = {}
-    for base in reversed(order):
-        if not (counts or _is_dataclass_source)(base):
-            continue
-        for node in base.node.body:
-            if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-                continue
-            kind = (dotted_name(node.annotation) or "").rpartition(".")[2]
-            if kind in {"ClassVar", "KW_ONLY"} or _left_out(node.value):
-                continue
-            found[node.target.id] = Parameter(
-                node.target.id,
-                not _has_default(node.value),
-                base.module.place(node.lineno),
-                (node.annotation, _default(node.value)),
-                base.module.name,
-            )
-    return tuple(found.values())
-
-
-def _options_order(order: list[Any]) -> list[Any]:
-    """The dataclass that the class attribute ``Options`` names, and its bases; empty if none."""
-    for base in order:
-        found = member(base, OPTIONS) if isinstance(base, Source) else None
-        if found is not None:
-            is_data = isinstance(found, Source) and isinstance(found.node, ast.ClassDef)
-            bases = linearize(found) if is_data and isinstance(found, Source) else []
-            return bases if any(_is_dataclass_source(one) for one in bases) else []
-    return []
-
-
-def _is_dataclass_source(base: Any) -> bool:
-    return (
-        isinstance(base, Source)
-        and isinstance(base.node, ast.ClassDef)
-        and _is_dataclass(base.node)
-    )
-
-
-def _field_options(value: ast.expr | None) -> dict[str, ast.expr] | None:
-    if isinstance(value, ast.Call) and (dotted_name(value.func) or "").endswith("field"):
-        return {k.arg: k.value for k in value.keywords if k.arg}
-    return None
-
-
-def _left_out(value: ast.expr | None) -> bool:
-    option = (_field_options(value) or {}).get("init")
-    return isinstance(option, ast.Constant) and option.value is False
-
-
-def _has_default(value: ast.expr | None) -> bool:
-    return _default(value) is not None
-
-
-def _default(value: ast.expr | None) -> ast.expr | None:
-    """A field's default as an expression; a factory's is the call of it."""
-    options = _field_options(value)
-    if options is None:
-        return value
-    factory = options.get("default_factory")
-    return ast.Call(factory, [], []) if factory else options.get("default")
 
 
 def _doc(node: ast.ClassDef | ast.FunctionDef) -> str:

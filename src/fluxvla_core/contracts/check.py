@@ -129,7 +129,7 @@ def _contract_for(registry: str, cls: type) -> type[Contract]:
 
 
 def _problems(contract: type[Contract], cls: type, sets: tuple[Methods, ...]) -> list[str]:
-    """What keeps ``cls`` from having one of ``sets``; nothing if it has one."""
+    """The problems of ``cls`` with the nearest of ``sets``; empty if it has one of them."""
     tried = [_wrong(contract, cls, one) for one in sets]
     if not all(tried):
         return []
@@ -160,7 +160,7 @@ def is_train_runner(cls: type) -> bool:
 
 
 def missing_operator_methods(operator: object) -> list[str]:
-    """Methods of the full contract that an operator of the specification's shape lacks."""
+    """Methods of the full contract that ``operator``, written for upstream FluxVLA, lacks."""
     cls = type(operator)
     full = {m: n for m, n in methods(Operator).items() if m in abstract_methods(Operator)}
     lacks = [f"{m}()" for m, n in full.items() if _method_problem(Operator, cls, m, n)]
@@ -227,7 +227,7 @@ def chunk_problems(action_rate_hz: object, horizon: object) -> list[str]:
 
 
 def _lookup(contract: type[Contract], cls: type, method: str) -> Any:
-    """What ``cls`` or a base defines as ``method``, as it stands there; None if nothing.
+    """The attribute ``method`` of ``cls`` or a base, without binding it; None if there is none.
 
     Not what its metaclass has: every class is callable, and its objects need not be. Nor what the
     contract has: that is either a default, or abstract.

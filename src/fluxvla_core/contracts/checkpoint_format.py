@@ -68,6 +68,28 @@ class CheckpointFormat(Contract):
             CheckpointError: it is damaged, of a newer format, or of a model that is not built here.
         """
 
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """As ``read``, for one of several robots or without some of the cameras.
+
+        Args:
+            robot: whose statistics (and layers) are meant, where the checkpoint knows several, by
+                the name that it has for it: GR00T's embodiment tag, OpenVLA's ``unnorm_key``.
+            absent: cameras that the robot does not have, by the checkpoint's names. The model acts
+                as in that project when their pictures are missing.
+
+        Raises:
+            CheckpointError: as ``read``.
+            UsageError: the checkpoint knows no such robot or camera, or the model cannot do
+                without; it says which there are (``chosen_robot``, ``without_cameras``).
+        """
+        raise NotImplementedError(f"{type(self).__name__} reads its checkpoints as they are")
+
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
         """Write ``checkpoint`` into the empty ``folder`` as that project saves one.
 

@@ -70,7 +70,7 @@ class Contract(metaclass=ABCMeta):
 
     @classmethod
     def _enough(cls, candidate: type) -> tuple[tuple[str, ...], ...]:
-        """Sets of methods; a ``candidate`` that inherits nothing must have one as a whole."""
+        """Sets of methods; a ``candidate`` without the base class needs all methods of one set."""
         return (abstract_methods(cls),)
 
     @classmethod

@@ -48,7 +48,7 @@ class EnvironmentSpec:
         embodiment: what actions and states mean, control steps a second (``rate_hz``), and the
             cameras with their usual sizes.
         tasks: at least one.
-        limited: actions are joint targets that take the way of a robot's commands: keyframes are
+        limited: actions are joint targets that take the way of a robot's commands: they are
             joined at ``rate_hz`` and kept within the embodiment's limits. Otherwise each action of
             a chunk is one step.
         keep_together: going from one task to another takes seconds, so that episodes of one task

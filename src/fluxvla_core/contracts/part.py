@@ -1,4 +1,4 @@
-"""What one operator has of a robot that two processes divide between them."""
+"""``Part``: the whole robot, or the part of a divided one that an operator has."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Continuation:
 
     Args:
         actions: ``(T, dim)`` float64 in physical units, ``T`` being the policy's horizon: where
-            the arm is going to be at the times of the new chunk's keyframes if no new chunk comes.
+            the arm is going to be at the times of the new chunk's actions if no new chunk comes.
             Rows beyond the end of what is known repeat its last.
         weights: ``(T,)`` float64, how much the new chunk has to agree with each row: 1 for rows
             that will have been executed before the answer arrives, 0 for those that are free.
@@ -119,7 +119,7 @@ class Policy(Actor):
 
     @attribute
     def source(self) -> object:
-        """Where it comes from, for the record: a checkpoint's path, a server's address."""
+        """The origin of the policy, for the record: a checkpoint's path, a server's address."""
         return ""
 
     @attribute

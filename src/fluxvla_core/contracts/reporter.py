@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class Reporter:
-    """Where a run reports what it does; every report is dropped unless a subclass shows it.
+    """Receives the messages and progress of a run; this base class drops them all.
 
     Only rank 0 of a distributed run has one that shows anything.
     """

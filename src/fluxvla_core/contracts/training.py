@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute
@@ -19,6 +20,23 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 
+@dataclass(frozen=True)
+class PartWeights:
+    """Published weights of a part of a model, under the names that they have there.
+
+    Args:
+        place: a safetensors file, a folder of them, ``hf:<id>``, or a file of ``torch.save``.
+        names: a part of our weights' names -> what stands there instead. Of several the longest
+            counts; weights whose names have none of them are not in the file.
+        unread: parts of names there that nothing here needs. Whatever else is left over is an
+            error, as is whatever is missing.
+    """
+
+    place: str
+    names: Mapping[str, str]
+    unread: Sequence[str] = ()
+
+
 class VLA(Contract):
     """A model, and what training strategies must know of it: ``class MyVLA(VLA, nn.Module)``.
 
@@ -27,6 +45,7 @@ class VLA(Contract):
     """
 
     forward: Callable[..., Any]
+    _together: ClassVar[tuple[tuple[str, ...], ...]] = (("observe", "denoise"),)
 
     def batch_keys(self) -> Mapping[str, bool] | None:
         """Keys of a batch that ``forward`` takes, and whether each must be there; None takes all.
@@ -51,7 +70,7 @@ class VLA(Contract):
 
     @attribute
     def frozen_source(self) -> str | None:
-        """Where the frozen weights come from when the model is built (a package, a file).
+        """The origin of the frozen weights when the model is built (a package, a file).
 
         They are not saved in checkpoints, only their hash. None: they are saved. Any module inside
         the model may have this attribute for its own frozen weights.
@@ -65,6 +84,12 @@ class VLA(Contract):
         of the training holds comes after it."""
         return None
 
+    @attribute
+    def part_weights(self) -> Sequence[PartWeights]:
+        """Parts that a training starts from published weights of their own, where neither
+        ``runner.init_from`` nor ``pretrained_name_or_path`` names weights of the whole model."""
+        return ()
+
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.
 
@@ -74,6 +99,42 @@ class VLA(Contract):
         transformers), stand in a tuple: they are gathered in one operation before the first of
         them runs and released after the last.
         """
+        return []
+
+    # -- an answer in two parts, which is what lets it be captured in a CUDA graph ---------------
+
+    observe: Callable[..., Mapping[str, Any]]
+    """What every denoising step needs of an observation: name -> tensor.
+
+    A method; its parameters are those of ``predict_action`` that belong to the observation. What
+    does not depend on the noisy actions is computed here, once.
+    """
+
+    def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:
+        """All denoising steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+
+        ``seen`` is what ``observe`` gave and ``tables`` what ``step_tables`` gave. It only
+        launches operations on tensors: nothing is read back to the host, and neither the number
+        of steps nor a shape depends on a value.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no denoise()")
+
+    def step_tables(self) -> Mapping[str, Any]:
+        """What the steps need that follows from the weights alone: name -> tensor.
+
+        Embeddings of the times of a fixed number of steps, for instance. A policy computes them
+        once, after its weights have been loaded.
+        """
+        return {}
+
+    @attribute
+    def observe_is_capturable(self) -> bool:
+        """Whether ``observe``, too, launches operations on tensors only, as ``denoise`` does."""
+        return False
+
+    def exact_modules(self) -> Sequence[Any]:
+        """Modules that compute in float32 when the rest computes in bf16, so that their weights
+        are kept in float32."""
         return []
 
     @classmethod
@@ -90,7 +151,7 @@ class Dataset(Contract):
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
 
     seed: Any = None
-    """What its samples draw by, a whole number; None if unknown."""
+    """The seed of its random numbers, an integer; None if unknown."""
     datasets: Sequence[Any] = ()
     """The datasets that a mixture is made of."""
 
@@ -213,7 +274,7 @@ class _AnyTransform(Contract):
         raise NotImplementedError(f"{type(self).__name__} normalises no actions")
 
     def defer(self, sample: Sample) -> Sample:
-        """As ``__call__``, with the normalisation of pictures left to be done on the device."""
+        """As ``__call__``, but images are left for normalisation on the device."""
         raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
 
 
@@ -249,7 +310,7 @@ class Tokenizer(Contract):
     padding_side: str = "right"
     pad_token_id: int | None = None
     model_path: str | None = None
-    """Where it was loaded from, as a config says it."""
+    """The path or name that it was loaded from, as in a config."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

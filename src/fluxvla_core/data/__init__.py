@@ -17,6 +17,7 @@ name is imported when it is first used, so that importing this package loads no 
 ``model_folder``                a pretrained model's folder, checked for ``from_pretrained``
 ``resolve_model_path``          a pretrained model's folder, in the file system or in a package
 ``LeRobotWriter``               records a LeRobot v3.0 dataset
+``make_affine``                 offset and scale of states or actions by an entry of the statistics
 ``merge_datasets``              merges what several ``LeRobotWriter`` recorded
 ==============================  ==================================================================
 """
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
     from fluxvla_core.data.sampler import SampleKey as SampleKey
     from fluxvla_core.data.sampler import sample_rng as sample_rng
+    from fluxvla_core.data.statistics import make_affine as make_affine
     from fluxvla_core.data.transforms.images import split_images as split_images
     from fluxvla_core.data.transforms.images import stack_images as stack_images
     from fluxvla_core.data.transforms.pipeline import Pipeline as Pipeline
@@ -59,6 +61,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "resolve_model_path",
         ],
         "fluxvla_core.data.sampler": ["SampleKey", "sample_rng"],
+        "fluxvla_core.data.statistics": ["make_affine"],
         "fluxvla_core.data.transforms.images": ["split_images", "stack_images"],
         "fluxvla_core.data.transforms.pipeline": ["Pipeline"],
         "fluxvla_core.data.writer": ["LeRobotWriter"],

@@ -30,6 +30,7 @@ class PrivateInferenceDataset(InferenceDataset):
 
     Args:
         img_keys: cameras, as in training; ``observation.images.top`` and ``top`` mean the same.
+            With none the batch has no pictures.
         transforms: tables of ``fluxvla.transforms``, or callables.
         norm_stats: the statistics, or the path of ``dataset_statistics.json``.
         embodiment_id: the robot's number in a model of several.
@@ -73,11 +74,10 @@ class PrivateInferenceDataset(InferenceDataset):
         """
         import torch
 
-        sample: Sample = {
-            "images": [self._image(observation, key) for key in self.img_keys],
-            "img_masks": np.ones(len(self.img_keys), np.bool_),
-            "states": _state(observation),
-        }
+        sample: Sample = {"states": _state(observation)}
+        if self.img_keys:
+            sample["images"] = [self._image(observation, key) for key in self.img_keys]
+            sample["img_masks"] = np.ones(len(self.img_keys), np.bool_)
         if "task_description" in observation:
             sample["task_description"] = observation["task_description"]
         if self.stats is not None:
@@ -85,7 +85,8 @@ class PrivateInferenceDataset(InferenceDataset):
         if self.embodiment_id is not None:
             sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
         sample = self.pipeline(sample)
-        sample["images"] = stack_images(sample["images"])
+        if self.img_keys:
+            sample["images"] = stack_images(sample["images"])
         batch = {key: np.asarray(sample[key])[None] for key in _KEYS if key in sample}
         return {k: torch.from_numpy(np.ascontiguousarray(array)) for k, array in batch.items()}
 

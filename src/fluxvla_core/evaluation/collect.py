@@ -231,7 +231,7 @@ def task_of(episode: int, episodes: int, tasks: Sequence[TaskSpec], together: bo
 
 
 def _checked(chunk: Any, spec: EnvironmentSpec) -> npt.NDArray[np.float64]:
-    """Nothing can be learned from a chunk that is not finite."""
+    """``chunk`` as ``(T, dim)`` float64, checked to be finite."""
     array = shaped(chunk, spec.embodiment.dim)
     problem = not_finite(array, spec.embodiment.joint_names)
     if problem is not None:

@@ -169,7 +169,7 @@ def _by_episode(side: Evaluated) -> dict[tuple[str, int], Mapping[str, Any]]:
 
 
 def _folder(place: Path) -> tuple[Path, Path | None]:
-    """Where the evaluation logs are, and the checkpoint if one was named."""
+    """The folder of the evaluation logs, and the checkpoint if one was named."""
     if (place / "manifest.json").is_file():
         return place.parent.parent / "eval", place
     if place.is_file():

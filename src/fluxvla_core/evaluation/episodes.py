@@ -284,7 +284,7 @@ class EvalLog:
             self.changed += [line for line in changes[key] if line not in self.changed]
         if self.reused and not self._reuse:
             raise UsageError(
-                "episodes of this evaluation are there, and other code ran them: "
+                "there are episodes of this evaluation that were run with other code: "
                 f"{'; '.join(self.changed)}",
                 where=str(path),
                 cause="a library, a plugin or FluxVLA itself was changed since",

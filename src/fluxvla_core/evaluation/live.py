@@ -279,8 +279,8 @@ def run_live(
 
     if not environment.spec.limited:
         raise ConfigError(
-            f"{environment.spec.name} takes no joint targets: the safety of a robot cannot be kept "
-            "for its actions, and live evaluation goes by way of it",
+            f"{environment.spec.name} takes no joint targets, so a robot's limits cannot be "
+            "applied to its actions; live evaluation always applies them",
             next="evaluate it stepped: --set eval.live=false",
         )
     folder = Path(live.folder) / name

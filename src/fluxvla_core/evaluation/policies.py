@@ -217,7 +217,8 @@ def chosen_checkpoint(ckpt_path: str | None, work_dir: Path) -> dict[str, Any]:
     """Find and verify a checkpoint: ``path``, ``step`` and ``sha256`` of its manifest.
 
     Args:
-        ckpt_path: checkpoint or work dir; the newest whole one of ``work_dir`` by default.
+        ckpt_path: a checkpoint's folder, or a work dir, whose newest undamaged one is taken;
+            ``work_dir`` by default.
 
     Raises:
         CheckpointError: there is none, or the one that is named is damaged.

@@ -53,7 +53,7 @@ class _Request:
 
     @property
     def kind(self) -> tuple[str, bool]:
-        """What the requests of one batch have in common: the policy, and whether they continue a
+        """Key of the requests that may share a batch: the policy, and whether they continue a
         chunk."""
         return self.name, self.question.rest is None
 

@@ -90,8 +90,8 @@ def provenance(code: Code) -> dict[str, Any]:
 
 
 def commit(folder: Path) -> str | None:
-    """Of the git checkout that ``folder`` is tracked in, with ``+changes`` where files were
-    changed since; None where there is none, or no git."""
+    """The commit of the git checkout that ``folder`` is tracked in, with ``+changes`` where files
+    were changed since; None where there is none, or no git."""
     if _git(folder, "ls-files", "--error-unmatch", ".") is None:
         return None  # an environment within another repository
     head = _git(folder, "rev-parse", "HEAD")
@@ -193,7 +193,7 @@ def _hash(packages: Iterable[str]) -> str:
 
 
 def _git(folder: Path, *words: str) -> str | None:
-    """What git says; None where it fails."""
+    """The output of a git command; None if it fails."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), *words],

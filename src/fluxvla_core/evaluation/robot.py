@@ -268,7 +268,7 @@ def _named(
 
 
 def _counted(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-    """Of an episode's summary what evaluations count, as JSON values."""
+    """The values of an episode's summary that an evaluation's record holds."""
     kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_beats")
     answers = summary["timings"].get("policy", {"count": 0, "p50_ms": 0.0})
     return {

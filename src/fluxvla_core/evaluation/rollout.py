@@ -1,8 +1,8 @@
 """Rollout of an episode: observe, predict, execute some of the chunk, observe again.
 
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
-commands are formed by the same path as on a robot: keyframes are joined linearly from the last
-command on and kept within the same limits. Other actions pass the limits unchanged.
+commands are formed by the same path as on a robot: a chunk's actions are joined linearly from the
+last command on and kept within the same limits. Other actions pass the limits unchanged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
-from fluxvla_core.robot.control.limits import CommandLimiter, PassThrough
+from fluxvla_core.robot.control.clamps import PassThrough
+from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.sender import CommandFormer
 from fluxvla_core.robot.control.tracking import action_columns, action_values
 from fluxvla_core.spec.embodiment import Camera
@@ -56,7 +57,7 @@ class ChunkCommands:
 
     Args:
         spec: the environment's description.
-        action_rate_hz: keyframes a second; the environment's rate by default.
+        action_rate_hz: actions a second; the environment's rate by default.
     """
 
     def __init__(self, spec: EnvironmentSpec, action_rate_hz: float | None) -> None:

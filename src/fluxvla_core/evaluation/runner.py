@@ -173,7 +173,7 @@ class EvalRunner(Runner):
         self.reuse = reuse
         self.folder = Path(self.context.work_dir) / (FOLDER if self._live is None else LIVE_FOLDER)
         self.task_names = tasks
-        """Of the tasks to evaluate, None for all; a subclass may set it before ``run_setup``."""
+        """The tasks to evaluate, None for all; subclasses may set it before ``run_setup``."""
         for name, value, least in (
             ("episodes", episodes, 1),
             ("workers", self.workers, 1),

@@ -31,6 +31,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     },
     "fluxvla-gymnasium": {"environments": ("GymnasiumEnvironment",)},
     "fluxvla-latency": {"hooks": ("LatencyLog",)},
+    "fluxvla-lerobot": {"policies": ("LeRobotPolicy",)},
     "fluxvla-libero": {
         "environments": ("LiberoEnvironment",),
         "policies": ("LiberoExpert",),
@@ -66,7 +67,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "vlas": ("OpenVLA", "OpenVLAOFT"),
     },
     "fluxvla-pi": {
-        "checkpoint_formats": ("LeRobotPi", "OpenPi"),
+        "checkpoint_formats": ("LeRobotPi", "OpenPi", "TransformersPi0"),
         "vlas": ("PI05FlowMatching", "PI0FlowMatching"),
     },
     "fluxvla-report": {"commands": ("report",)},
@@ -93,6 +94,7 @@ FIRST_PARTY: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "operators": ("UROperator", "URRTDEOperator"),
         "runners": ("URInferenceRunner",),
     },
+    "fluxvla-wandb": {"commands": ("wandb",), "hooks": ("WandbVideos",)},
 }
 
 

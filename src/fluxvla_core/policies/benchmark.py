@@ -7,6 +7,7 @@ repeat a published figure.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import resource
@@ -24,20 +25,25 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import Transform
+from fluxvla_core.data.example import unit_statistics
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.plugins._metadata import version
-from fluxvla_core.policies.local import LocalPolicy
+from fluxvla_core.policies.local import LocalPolicy, Question
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 if TYPE_CHECKING:
     import torch
 
-STAGES = ("preprocess", "inference", "postprocess")
-_PACKAGES = ("fluxvla-core", "torch", "transformers", "numpy")
+    from fluxvla_core.policies.roofline import Work
+
+STAGES = ("preprocess", "transfer", "prefix", "denoise", "forward", "postprocess", "total")
+"""In their order; a model has ``prefix`` and ``denoise``, or ``forward``."""
+_PACKAGES = ("fluxvla-core", "torch", "torchao", "transformers", "numpy")
 _MATRIX = 1024
+_COPIED = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -72,21 +78,26 @@ def measure(
     policy: LocalPolicy, observations: Sequence[Observation], calls: int, warmup: int
 ) -> Latencies:
     """Ask ``policy`` ``warmup + calls`` times, going through ``observations`` again and again."""
+    _forget_memory(policy.device)
     policy.reset(0)
     begun = time.perf_counter()
     policy.predict_action(observations[0])
     first = time.perf_counter() - begun
-    rows: list[list[float]] = []
+    rows: list[dict[str, float]] = []
     for call in range(warmup + calls):
         begun = time.perf_counter()
         policy.predict_action(observations[call % len(observations)])
         total = time.perf_counter() - begun
         if call >= warmup:
-            rows.append([*(policy.stages[stage] for stage in STAGES), total])
-    columns = np.asarray(rows).T
-    return Latencies(
-        dict(zip((*STAGES, "total"), columns, strict=True)), first, _memory_mb(policy.device)
-    )
+            rows.append({**policy.stages, **policy.parts, "total": total})
+    taken = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return Latencies(taken, first, _memory_mb(policy.device))
+
+
+def answers(policy: LocalPolicy, observations: Sequence[Observation]) -> npt.NDArray[np.float64]:
+    """``(N, T, dim)``: the chunks of an episode that begins with seed 0."""
+    policy.reset(0)
+    return np.stack([policy.predict_action(observation) for observation in observations])
 
 
 def random_observations(
@@ -117,6 +128,7 @@ def untrained_policy(
     device: str,
     precision: str,
     seed: int,
+    quantization: str | None = None,
 ) -> LocalPolicy:
     """The policy that a config trains, with random weights and statistics of 0 and 1.
 
@@ -137,7 +149,9 @@ def untrained_policy(
             "is unknown"
         )
     name = dataset.get("statistic_name", "private")
-    statistics = {name: {"proprio": _unit(robot.state_dim), "action": _unit(robot.dim)}}
+    statistics = {
+        name: {"proprio": unit_statistics(robot.state_dim), "action": unit_statistics(robot.dim)}
+    }
     prepare = PrivateInferenceDataset(
         dataset["img_keys"],
         dataset["transforms"],
@@ -152,11 +166,14 @@ def untrained_policy(
         raise ConfigError("no transform of train_dataloader.dataset normalises actions")
     import torch
 
+    from fluxvla_core.policies.inference_weights import check_quantization, ready
+
+    check_quantization(quantization, device)
     torch.manual_seed(seed)
     model = build_vla_from_cfg(config["model"])
     horizon, _ = model.action_shape
     return LocalPolicy(
-        model=model.to(device).eval(),
+        model=ready(model.to(device).eval(), precision, quantization),
         prepare=prepare,
         denormalize=normalizers[0].denormalizer(statistics, name),
         embodiment=robot,
@@ -169,14 +186,46 @@ def untrained_policy(
     )
 
 
-def inference_flops(policy: LocalPolicy, observation: Observation) -> int:
-    """Operations of matrix products, convolutions and attention in one answer, counted in it."""
-    from torch.utils.flop_counter import FlopCounterMode
+def inference_work(policy: LocalPolicy, observation: Observation) -> dict[str, Work]:
+    """What one answer computes, by stage on the device, counted in it; tables are no part of it."""
+    import torch
 
-    policy.reset(0)
-    with FlopCounterMode(display=False) as counter:
-        policy.predict_action(observation)
-    return int(counter.get_total_flops())
+    from fluxvla_core.policies.execution import Eager
+    from fluxvla_core.policies.roofline import work_of
+
+    device = torch.device(policy.device)
+    batch = {
+        key: value.to(device) if isinstance(value, torch.Tensor) else value
+        for key, value in policy.host_batch([Question(observation, 0, 0)]).items()
+    }
+    plain = Eager(policy.model)
+    mixed = torch.autocast(device.type, torch.bfloat16, enabled=policy.precision == "bf16")
+    with torch.inference_mode(), mixed:
+        parts = plain.parts
+        if parts is None:
+            return {"forward": work_of(lambda: policy.model.predict_action(**batch))[1]}
+        seen, prefix = work_of(lambda: policy.model.observe(**parts.observation(batch)))
+        tables = plain.tables()
+        _, steps = work_of(lambda: policy.model.denoise(seen, batch["noise"], tables))
+    return {"prefix": prefix, "denoise": steps}
+
+
+def fixture(observations: Sequence[Observation]) -> dict[str, npt.NDArray[Any]]:
+    """Pictures and states of all ``observations``, stacked: what was asked, to be kept."""
+    cameras = observations[0]["images"]
+    found = {
+        f"images.{name}": np.stack([o["images"][name] for o in observations]) for name in cameras
+    }
+    return {**found, "qpos": np.stack([o["qpos"] for o in observations])}
+
+
+def digest(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+    """SHA-256 of names, shapes, types and numbers."""
+    found = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        found.update(f"{name} {array.shape} {array.dtype.str}\n".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
 
 
 def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float, str]:
@@ -195,8 +244,24 @@ def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float
     return _measured_tflops(device, dtype), f"a product of two {_MATRIX} x {_MATRIX} matrices"
 
 
+def bandwidth_gb_s(device: str) -> tuple[float, str]:
+    """GB/s of the device's memory and where the figure is from: its maker, or measured."""
+    import torch
+
+    from fluxvla_core.policies.roofline import known_bandwidth
+
+    if torch.device(device).type == "cuda":
+        known = known_bandwidth(torch.cuda.get_device_name(device))
+        if known is not None:
+            return known, "its maker's"
+    source = torch.ones(_COPIED, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    seconds = _quickest(lambda: target.copy_(source), device)
+    return 2 * _COPIED / seconds / 1e9, f"a copy of {_COPIED // 2**20} MiB"
+
+
 def machine(device: str) -> dict[str, Any]:
-    """What a figure belongs to: device, threads and versions."""
+    """The device, threads and versions that a measurement belongs to."""
     import torch
 
     gpu = torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else None
@@ -212,16 +277,22 @@ def _measured_tflops(device: str, dtype: torch.dtype) -> float:
     import torch
 
     left, right = (torch.randn(_MATRIX, _MATRIX, device=device, dtype=dtype) for _ in range(2))
-    wait: Callable[[], Any] = (
-        torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
-    )
+    return 2 * _MATRIX**3 / _quickest(lambda: torch.mm(left, right), device) / 1e12
+
+
+def _quickest(work: Callable[[], Any], device: str) -> float:
+    """Seconds of the quickest of ten runs."""
+    import torch
+
+    cuda = torch.device(device).type == "cuda"
     best = float("inf")
     for _ in range(10):
         begun = time.perf_counter()
-        torch.mm(left, right)
-        wait()
+        work()
+        if cuda:
+            torch.cuda.synchronize()
         best = min(best, time.perf_counter() - begun)
-    return float(2 * _MATRIX**3 / best / 1e12)
+    return best
 
 
 def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
@@ -239,9 +310,11 @@ def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
         operator.close()
 
 
-def _unit(width: int) -> dict[str, list[float]]:
-    zeros, ones, below = [0.0] * width, [1.0] * width, [-1.0] * width
-    return {"mean": zeros, "std": ones, "min": below, "max": ones, "q01": below, "q99": ones}
+def _forget_memory(device: str) -> None:
+    import torch
+
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
 
 
 def _memory_mb(device: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 from collections.abc import Mapping
@@ -25,6 +26,8 @@ from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
 from fluxvla_core.policies.local import LocalPolicy
 
+log = logging.getLogger("fluxvla.policies")
+
 
 def load_policy(
     ckpt_path: str | Path,
@@ -32,25 +35,36 @@ def load_policy(
     dataset: Any = None,
     denormalize_action: Any = None,
     mixed_precision_dtype: str = "float32",
+    execution: str = "eager",
+    quantization: str | None = None,
 ) -> LocalPolicy:
     """Build the policy that a checkpoint holds; its config is data and never executed.
 
     Args:
-        ckpt_path: a checkpoint's folder, or a work dir, whose newest one is taken.
+        ckpt_path: a checkpoint's folder, or a work dir, whose newest undamaged one is taken.
         device: a torch device; a plain ``cuda`` is ``own_device``'s.
         dataset: table or object that prepares observations instead of the training dataset's
-            transforms (the specification's ``PrivateInferenceDataset``); what it does not set,
+            transforms (a ``PrivateInferenceDataset``); what it does not set,
             ``norm_stats`` and ``processors``, is the checkpoint's.
         denormalize_action: table or object instead of the inverse of the training's
             normalisation; ``norm_stats`` is the checkpoint's if it is not set.
         mixed_precision_dtype: ``float32`` or ``bf16``.
+        execution: ``eager``, ``compiled`` (each block by ``torch.compile``) or ``graph`` (all
+            denoising steps as one CUDA graph, on a GPU).
+        quantization: ``int8``, ``fp8`` (weights of the blocks) or ``fp8_dynamic`` (their
+            activations, too), by torchao.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another model.
         SpecMismatch: it does not say for which robot, or at which rate, its actions are.
         ConfigError, PluginError: a part that its config names cannot be built here.
     """
-    checkpoint = Checkpoint.open(ckpt_path)
+    from fluxvla_core.policies.execution import check_execution
+    from fluxvla_core.policies.inference_weights import check_quantization, ready
+
+    check_execution(execution)
+    check_quantization(quantization, device)
+    checkpoint = Checkpoint.open(find_checkpoint(ckpt_path, Path(ckpt_path)))
     checkpoint.verify()
     where = str(checkpoint.path)
     config = checkpoint.config()
@@ -78,7 +92,7 @@ def load_policy(
         import torch
 
         device = own_device(os.environ, torch.cuda.device_count())
-    model = _model(config, checkpoint, device)
+    model = ready(_model(config, checkpoint, device), mixed_precision_dtype, quantization)
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     return LocalPolicy(
         model=model,
@@ -91,6 +105,7 @@ def load_policy(
         device=device,
         precision=mixed_precision_dtype,
         source=where,
+        execution=execution,
     )
 
 
@@ -107,15 +122,22 @@ def own_device(environment: Mapping[str, str], count: int) -> str:
 
 
 def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
-    """The checkpoint to load: the one that is named, else the newest whole one of the work dir.
+    """The folder of the checkpoint to load, or of the newest undamaged one of a work dir.
+
+    Args:
+        ckpt_path: a checkpoint's folder, which is only opened here, or a work dir; None for
+            ``work_dir``. A damaged checkpoint of a work dir is passed over with a warning.
 
     Raises:
-        CheckpointError: there is none; what was wrong with damaged ones is said.
+        CheckpointError: there is none; the message says what is wrong with damaged ones.
     """
-    if ckpt_path is not None:
+    if ckpt_path is not None and not folders(ckpt_path):
         return Checkpoint.open(ckpt_path).path
+    work_dir = work_dir if ckpt_path is None else Path(ckpt_path)
     found, refused = newest_whole(work_dir)
     if found is not None:
+        for error in refused:
+            log.warning("not loading a damaged checkpoint: %s: %s", error.where, error.what)
         return found.path
     damaged = "; ".join(error.what for error in refused)
     others = [shlex.quote(str(p)) for p in work_dirs_below(Path()) if folders(p)][:3]
@@ -176,7 +198,7 @@ def _denormalize(given: Any, prepare: Any, checkpoint: Checkpoint) -> Any:
 
 
 def _taken(table: Any, registry: Registry, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Those ``defaults`` that the class which a table names has parameters for."""
+    """The ``defaults`` for which the class that a table names has parameters."""
     if not isinstance(table, Mapping) or not isinstance(table.get("type"), str):
         return {}
     names = parameters(registry.get(table["type"]))

@@ -6,7 +6,7 @@ import inspect
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,9 @@ from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+if TYPE_CHECKING:
+    from fluxvla_core.policies.transfer import Transfer
 
 Array = npt.NDArray[np.float64]
 # float32 statistics and the sizes that joints have: far above rounding, far below a mistake.
@@ -38,7 +41,9 @@ class LocalPolicy(Policy):
 
     The noise of call ``n`` of an episode follows from (seed, n) alone, so that an episode can be
     repeated. ``stages`` holds the seconds that the last call took: ``preprocess``,
-    ``inference``, ``postprocess``. Every forward pass has ``batch_size`` rows (1 unless it is
+    ``inference``, ``postprocess``; ``parts`` those of inference, on the device: ``transfer`` of the
+    batch, then ``forward``, or ``prefix`` and ``denoise`` of a model that divides its answer
+    (``VLA.observe``). Every forward pass has ``batch_size`` rows (1 unless it is
     set), however many questions there are: kernels, and so sums, depend on the size.
 
     Args:
@@ -51,6 +56,10 @@ class LocalPolicy(Policy):
         device: the torch device of the model.
         precision: ``float32`` or ``bf16`` (autocast).
         source: where it came from, for records.
+        execution: ``eager``, ``compiled`` or ``graph``: see ``policies.execution``.
+
+    Raises:
+        ConfigError: a precision or an execution is unknown, or cannot be had here.
     """
 
     embodiment: EmbodimentSpec
@@ -59,6 +68,7 @@ class LocalPolicy(Policy):
     horizon: int
     source: str
     stages: dict[str, float]
+    parts: dict[str, float]
 
     def __init__(
         self,
@@ -72,29 +82,57 @@ class LocalPolicy(Policy):
         device: str = "cpu",
         precision: str = "float32",
         source: str = "",
+        execution: str = "eager",
     ) -> None:
         if precision not in PRECISIONS:
             raise ConfigError(
                 f"mixed_precision_dtype {precision!r} is unknown; choose one of "
                 f"{', '.join(PRECISIONS)}"
             )
-        self.model = model
         self.embodiment = embodiment
         self.cameras = cameras
         self.action_rate_hz = action_rate_hz
         self.horizon = horizon
         self.source = source
         self.batch_size = 1
-        self.stages = {}
+        self.stages, self.parts = {}, {}
         self._prepare = prepare
         self._denormalize = denormalize
         self.device = device
-        self._precision = precision
+        self.precision = precision
         self._seed = 0
         self._calls = 0
+        self._transfer: Transfer | None = None
+        self._compiled: Any = None
+        self.execution = execution
+        self.model = model
+
+    @property
+    def model(self) -> Any:
+        """The model that answers; one that is set is run as ``execution`` says."""
+        return self._model
+
+    @model.setter
+    def model(self, model: Any) -> None:
+        self._model = model
         taken = inspect.signature(model.predict_action).parameters
         self._takes_all = any(p.kind is p.VAR_KEYWORD for p in taken.values())
         self._takes = set(taken)
+        self.execute(self.execution)
+
+    def execute(self, execution: str) -> None:
+        """Answer as ``execution`` says from now on; a model whose blocks are compiled stays so.
+
+        Raises:
+            ConfigError: it is unknown, or cannot be had for this model or on this machine.
+        """
+        from fluxvla_core.policies.execution import execution_of
+
+        compiled = self._compiled is self._model
+        self._execution = execution_of(execution, self._model, compiled)
+        self.execution = execution
+        if execution != "eager":
+            self._compiled = self._model
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""
@@ -128,6 +166,19 @@ class LocalPolicy(Policy):
         """
         return self._predict(observation, rest)
 
+    def host_batch(self, questions: Sequence[Question]) -> dict[str, Any]:
+        """What the model is given for ``questions``, in ``batch_size`` rows, still on the host."""
+        import torch
+
+        rows = [self._row(question) for question in questions]
+        rows += rows[:1] * (self.batch_size - len(rows))
+        return {
+            key: torch.cat([row[key] for row in rows])
+            if isinstance(value, torch.Tensor)
+            else [item for row in rows for item in row[key]]
+            for key, value in rows[0].items()
+        }
+
     def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
         """An answer to each of at most ``batch_size`` questions, in one forward pass.
 
@@ -138,24 +189,26 @@ class LocalPolicy(Policy):
         """
         import torch
 
+        from fluxvla_core.policies.clocks import clock_of
+
         if not 1 <= len(questions) <= self.batch_size:
             raise ValueError(f"{len(questions)} questions, and batch_size is {self.batch_size}")
         start = time.perf_counter()
-        rows = [self._row(question) for question in questions]
-        rows += rows[:1] * (self.batch_size - len(rows))
-        device = torch.device(self.device)
-        batch = {
-            key: torch.cat([row[key] for row in rows]).to(device)
-            if isinstance(value, torch.Tensor)
-            else [item for row in rows for item in row[key]]
-            for key, value in rows[0].items()
-        }
+        host = self.host_batch(questions)
         prepared = time.perf_counter()
-        mixed = self._precision == "bf16"
+        transfer, clock = self._transfers(), clock_of(self.device)
+        mixed = torch.autocast(
+            transfer.device.type,
+            torch.bfloat16,
+            enabled=self.precision == "bf16",
+            cache_enabled=self._execution.caches_casts,
+        )
         # A model that is guided differentiates, which tensors of inference_mode do not allow.
-        mode = torch.no_grad() if "prev_actions" in batch else torch.inference_mode()
-        with mode, torch.autocast(device.type, torch.bfloat16, enabled=mixed):
-            actions = self.model.predict_action(**batch).float().cpu().numpy()
+        mode = torch.no_grad() if "prev_actions" in host else torch.inference_mode()
+        with mode, mixed:
+            batch = transfer.to_device(host)
+            clock.mark("transfer")
+            actions = transfer.fetch(self._execution.answer(batch, clock))
         inferred = time.perf_counter()
         chunks = [
             self._denormalize(
@@ -171,7 +224,15 @@ class LocalPolicy(Policy):
             "inference": inferred - prepared,
             "postprocess": time.perf_counter() - inferred,
         }
+        self.parts = clock.seconds()
         return chunks
+
+    def _transfers(self) -> Transfer:
+        from fluxvla_core.policies.transfer import Transfer
+
+        if self._transfer is None or str(self._transfer.device) != self.device:
+            self._transfer = Transfer(self.device)
+        return self._transfer
 
     def _predict(self, observation: Observation, rest: Continuation | None = None) -> Array:
         chunk = self.predict_batch([Question(observation, self._seed, self._calls, rest)])[0]

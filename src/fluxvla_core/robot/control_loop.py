@@ -24,9 +24,9 @@ import numpy.typing as npt
 from fluxvla_core.robot.control.chunks import Chunk, check_beginning
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyEnded
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
 from fluxvla_core.robot.control.sender import CommandSender
-from fluxvla_core.robot.control.source import Answer, ChunkSource, PolicyEnded
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.supervisor import EpisodeOver, Supervisor
 
@@ -56,28 +56,28 @@ class ControlLoop:
 
     Args:
         robot: the connected robot; its clock counts.
-        source: observes the robot and asks the policy.
+        client: observes the robot and asks the policy.
         joiner: joins the chunks to one motion.
         sender: sends every command; started at the arm's pose.
         supervisor: the episode's supervisor; is notified of every accepted chunk.
         safety: ``starvation_s``, ``first_chunk_s`` and the limits of a chunk's beginning.
         interrupts: signals; checked while waiting, and by the supervisor at every tick.
-        keyframe_hz: keyframes a second in the policy's chunks.
-        keyframes: how many of a chunk's keyframes are played; None plays all.
+        action_rate_hz: actions a second in the policy's chunks.
+        max_actions: how many of a chunk's actions are executed; None for all.
         latency_s: how long, in lockstep, an answer takes.
         holds: send the last command again at every tick while the first answer is awaited: the arm
             was commanded before, and some drivers stop an arm that they hear nothing for.
     """
 
     robot: Robot
-    source: ChunkSource
+    client: PolicyClient
     joiner: ChunkJoiner
     sender: CommandSender
     supervisor: Supervisor
     safety: SafetySettings
     interrupts: Interrupts
-    keyframe_hz: float
-    keyframes: int | None = None
+    action_rate_hz: float
+    max_actions: int | None = None
     latency_s: float = 0.0
     holds: bool = False
 
@@ -144,7 +144,7 @@ class ControlLoop:
             rows.append(row)
         if not rows:
             raise BadChunk(
-                f"a chunk at {self.keyframe_hz:g} Hz holds no command at "
+                f"a chunk at {self.action_rate_hz:g} Hz holds no command at "
                 f"{self.sender.rate.hz:g} Hz: it is too short"
             )
         return np.array(rows)
@@ -153,7 +153,7 @@ class ControlLoop:
         last = self.sender.limiter.last
         due = self.robot.clock.now() + self.latency_s
         until = time.monotonic() + self.safety.first_chunk_s
-        future = self.source.ask(self.joiner.ahead())
+        future = self.client.ask(self.joiner.ahead())
         if self.robot.lockstep and time.monotonic() > until:
             raise self._no_chunk(until)
         return PendingQuery(future, last, due)
@@ -169,7 +169,7 @@ class ControlLoop:
         query = self._ask()
         answer = self._wait_for(query, until)
         for _ in range(0 if self.robot.lockstep else 2):
-            self.source.reset()
+            self.client.reset()
             began = time.monotonic()
             query = self._ask()
             answer = self._wait_for(query, until)
@@ -210,27 +210,25 @@ class ControlLoop:
 
     def _receive(self, answer: Answer, anchor: Array) -> None:
         accepted = self._accepted(answer)
-        chunk = Chunk(accepted, self.keyframe_hz, answer.observed, anchor)
+        chunk = Chunk(accepted, self.action_rate_hz, answer.observed, anchor)
         self.joiner.add(chunk, self.robot.clock.now())
 
     def _accepted(self, answer: Answer) -> Array:
-        """The ``(T, D)`` keyframes of an answer that are played, as it arrives."""
-        keyframes, last = answer.keyframes, self.sender.limiter.last
+        """The ``(T, D)`` actions of an answer that are played, as it arrives."""
+        embodiment, last = self.robot.embodiment, self.sender.limiter.last
         try:
-            if isinstance(keyframes, BadChunk):
-                raise keyframes
-            embodiment = self.robot.embodiment
-            check_beginning(keyframes, embodiment, last, self.keyframe_hz, self.safety)
+            actions = answer.checked()
+            check_beginning(actions, embodiment, last, self.action_rate_hz, self.safety)
         except BadChunk:
-            self.source.refused(answer)
+            self.client.refused(answer)
             raise
         self.supervisor.chunk_accepted()
-        self.source.accepted(answer)
-        return keyframes[: self.keyframes]
+        self.client.accepted(answer)
+        return actions[: self.max_actions]
 
     def _no_chunk(self, until: float) -> Starved:
         most = self.safety.first_chunk_s
-        late, seconds = self.source.late(until - most)
+        late, seconds = self.client.late(until - most)
         return Starved(
             f"there was no chunk within {most:g} s: {late.name} took {seconds:.2f} s of that",
             cause=late.cause,
@@ -239,7 +237,7 @@ class ControlLoop:
 
     def _check_starved(self, seconds: float) -> None:
         if seconds > self.safety.starvation_s:
-            late, share = self.source.late(time.monotonic() - seconds)
+            late, share = self.client.late(time.monotonic() - seconds)
             raise Starved(
                 f"the robot waits for a chunk for {seconds:.2f} s, "
                 f"safety.starvation_s is {self.safety.starvation_s:g}: "

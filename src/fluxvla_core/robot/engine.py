@@ -20,7 +20,7 @@ from fluxvla_core.robot.tasks import Task
 
 @dataclass
 class RunHistory:
-    """What a runner keeps from one ``run()`` to the next.
+    """State that a runner keeps from one ``run()`` to the next.
 
     Args:
         episodes: number of episodes so far.
@@ -32,7 +32,7 @@ class RunHistory:
 
 
 class Engine(ABC):
-    """What commands a robot in a run: in this process, or in one of its own.
+    """Base class of what commands a robot in a run, from this process or through another one.
 
     ``stop_failure`` is what went wrong with the last stop.
     """
@@ -98,7 +98,7 @@ class Engine(ABC):
 
     @abstractmethod
     def episode_facts(self) -> Mapping[str, Any]:
-        """What the operator says of the last episode (``Operator.episode_facts``)."""
+        """Facts about the last episode from the operator (``Operator.episode_facts``)."""
 
     @abstractmethod
     def stop(self) -> str | None:

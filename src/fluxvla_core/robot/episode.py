@@ -21,9 +21,9 @@ from fluxvla_core.robot.control.delays import MACHINE
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.policy_client import PolicyClient
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
 from fluxvla_core.robot.control.sender import CommandSender, Execute, Sent, come_to_rest, ramp
-from fluxvla_core.robot.control.source import ChunkSource
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.control_loop import ControlLoop
 from fluxvla_core.robot.events import (
@@ -49,8 +49,8 @@ _RECENT = 2.0
 _NOT_BRAKED = (Rule.OPERATOR, Rule.EXECUTE)
 
 
-SourceMaker = Callable[[Task, int, TrackingWatch, Callable[[Event], None]], ChunkSource]
-"""Makes the source of an episode's chunks.
+PolicyClientFactory = Callable[[Task, int, TrackingWatch, Callable[[Event], None]], PolicyClient]
+"""Makes the policy client of an episode's chunks.
 
 Arguments: the task, the seed of the policy, the episode's watch, and what takes its events.
 """
@@ -64,28 +64,28 @@ class EpisodeSettings:
         rate_hz: commands a second.
         safety: thresholds of the safety rules.
         start_pose: ``(D,)``, where the arm goes first; None stays.
-        keyframes: how many of a chunk's keyframes are played; None plays all.
+        max_actions: how many of a chunk's actions are executed; None for all.
         latency_s: how long, in a simulation whose time stands still, an answer takes.
         max_steps: commands after which the episode ends.
-        keyframe_hz: keyframes a second in the policy's chunks.
+        action_rate_hz: actions a second in the policy's chunks.
     """
 
     rate_hz: float
     safety: SafetySettings
     start_pose: Sequence[float] | None
-    keyframes: int | None
+    max_actions: int | None
     latency_s: float
     max_steps: int
-    keyframe_hz: float
+    action_rate_hz: float
 
 
 @dataclass(frozen=True)
 class EpisodeParts:
-    """What a run drives a robot with, in all of its episodes.
+    """The objects that all episodes of a run share.
 
     Args:
         robot: connected.
-        source: makes the source of an episode's chunks.
+        make_client: makes the policy client of an episode's chunks.
         filters: the config's ``action_filters``.
         joiner: joins the chunks to one motion.
         execute: sends commands: ``(N, D)`` and the rate.
@@ -96,7 +96,7 @@ class EpisodeParts:
     """
 
     robot: Robot
-    source: SourceMaker
+    make_client: PolicyClientFactory
     filters: Sequence[ActionFilter]
     joiner: ChunkJoiner
     execute: Execute
@@ -154,7 +154,7 @@ class Episode:
             robot, self._tracking, parts.interrupts, settings.max_steps, parts.reporter,
             self._emit,
         )  # fmt: skip
-        self._source = parts.source(task, seed, self._tracking, self._emit)
+        self._client = parts.make_client(task, seed, self._tracking, self._emit)
         self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
         self._trips = len(parts.latch.trips)
         self._executing = False
@@ -199,7 +199,7 @@ class Episode:
             self._end(outcome, problem)
             self._supervisor.phase = Phase.OVER
             # Or every episode would keep all before it.
-            self._held = self._source.meanwhile = None
+            self._held = self._client.meanwhile = None
             interrupts.deferred = False
         interrupts.resume()
 
@@ -221,7 +221,7 @@ class Episode:
             raise
 
     def resend(self) -> None:
-        """As ``hold``, but whoever calls it stops the robot where something goes wrong."""
+        """As ``hold``, but on an error the caller has to stop the robot."""
         ticks = self._rate.ticks
         self._sender.hold()
         if self._rate.ticks == ticks:
@@ -237,9 +237,9 @@ class Episode:
         """Read where the arm is, and bring it to the start pose."""
         settings = self._settings
         self._robot.begin(self._task.instruction, self._number)
-        self._source.meanwhile = None if self._held is None else self._held.resend
-        self._limiter.start(self._where(self._source.first_state()))
-        self._source.reset()
+        self._client.meanwhile = None if self._held is None else self._held.resend
+        self._limiter.start(self._where(self._client.first_state()))
+        self._client.reset()
         if settings.start_pose is not None:
             self._supervisor.phase = Phase.RAMP
             most = settings.safety.ramp_scale
@@ -257,17 +257,17 @@ class Episode:
         parts, settings = self._parts, self._settings
         commanded = settings.start_pose is not None or self._held is not None
         holds = commanded and not self._robot.lockstep
-        self._source.meanwhile = self.resend if holds else None
+        self._client.meanwhile = self.resend if holds else None
         return ControlLoop(
             robot=self._robot,
-            source=self._source,
+            client=self._client,
             joiner=parts.joiner,
             sender=self._sender,
             supervisor=self._supervisor,
             safety=settings.safety,
             interrupts=self._interrupts,
-            keyframe_hz=settings.keyframe_hz,
-            keyframes=settings.keyframes,
+            action_rate_hz=settings.action_rate_hz,
+            max_actions=settings.max_actions,
             latency_s=settings.latency_s,
             holds=holds,
         )
@@ -341,7 +341,7 @@ class Episode:
         self._emit(Stopped(now, rule, problem, now - began, failure))
 
     def _state(self) -> Array | None:
-        """Where the robot is now; None where it does not tell, or only plays a recording."""
+        """The robot's current state; None if it does not tell, or only plays a recording."""
         try:
             measured = self._robot.state() if self._robot.follows else None
         except FluxError:

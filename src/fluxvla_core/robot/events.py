@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Phase(str, Enum):
-    """Where an episode is, as its record has it."""
+    """The phase of an episode, as its record names it."""
 
     __str__ = str.__str__  # its value, also in Python 3.10, which has no StrEnum
 
@@ -109,10 +109,10 @@ class Refused(Event):
 
 @dataclass(frozen=True)
 class ChunkAccepted(Event):
-    """The policy's answer to a reading: ``(T, D)`` keyframes, read-only; and seconds by stage."""
+    """The policy's answer to a reading: ``(T, D)`` actions, read-only; and seconds by stage."""
 
     reading: Reading
-    keyframes: Array
+    actions: Array
     stages: Mapping[str, float]
 
 
@@ -191,7 +191,7 @@ class HookObserver(EpisodeObserver):
         match event:
             case EpisodeStarted(at=at, task=task):
                 self._hooks.call("episode_started", task=task.instruction, stamp=at)
-            case ChunkAccepted(at=at, reading=reading, keyframes=chunk, stages=stages):
+            case ChunkAccepted(at=at, reading=reading, actions=chunk, stages=stages):
                 shown = _frozen(reading.observation)
                 self._hooks.call("observed", observation=shown, stamp=reading.measured)
                 latency = stages["policy"]

@@ -1,4 +1,4 @@
-"""``make_engine``: what commands the robot in a run, in this process or in one of its own."""
+"""``make_engine``: the object that commands a robot, with a control process or without."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.division import Division
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event
-from fluxvla_core.robot.local_source import LocalSource
+from fluxvla_core.robot.local_policy_client import LocalPolicyClient
 from fluxvla_core.robot.observation import ObservationReader, Observe
 from fluxvla_core.robot.policy_calls import PolicyCaller, PolicyThread
 from fluxvla_core.robot.process.remote_engine import RemoteEngine
 from fluxvla_core.robot.process.setup import ControlSetup, registered_here
+from fluxvla_core.robot.process_layout import ProcessLayout
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.tasks import Task
 
 
 @dataclass(frozen=True)
 class RunParts:
-    """What a run drives a robot with.
+    """The objects and settings of a run.
 
     Args:
         robot: not connected; where another process commands it, the part without commands.
@@ -62,13 +62,13 @@ class RunParts:
 
 
 def make_engine(
-    parts: RunParts, division: Division, interrupts: Interrupts, thread: PolicyThread
+    parts: RunParts, layout: ProcessLayout, interrupts: Interrupts, thread: PolicyThread
 ) -> Engine:
-    """What commands the robot in one run.
+    """The engine of one run: ``RemoteEngine`` with a control process, else ``LocalEngine``.
 
     Args:
         parts: what the run drives the robot with.
-        division: whether another process commands the robot.
+        layout: whether another process commands the robot.
         interrupts: signals that ask the run to end.
         thread: the thread in which the policy computes.
     """
@@ -80,21 +80,21 @@ def make_engine(
     )
 
     observe = parts.observe
-    if division.frames is not None and division.runner is not None:
-        observe = division.frames.observe
+    if layout.frames is not None and layout.runner is not None:
+        observe = layout.frames.observe
 
-    def make_source(
+    def make_client(
         task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
-    ) -> LocalSource:
+    ) -> LocalPolicyClient:
         reader = ObservationReader(
             robot, observe, task.instruction, parts.cameras, safety, parts.ready_s,
             tracking, thread, interrupts, emit,
         )  # fmt: skip
         caller = PolicyCaller(policy, robot.embodiment, safety, robot.delays, seed)
-        return LocalSource(robot, reader, caller, thread, emit)
+        return LocalPolicyClient(robot, reader, caller, thread, emit)
 
     reporter, latch, history = parts.context.reporter, parts.latch, parts.history
-    tables, frames = division.tables, division.frames
+    tables, frames = layout.tables, layout.frames
     if tables is not None:
         setup = ControlSetup(
             config=parts.context.config,
@@ -108,13 +108,13 @@ def make_engine(
             settings=settings,
             before=history.commanded,
             python_path=sys.path,
-            registered=registered_here(tables.operator, tables.filters, division.runner),
+            registered=registered_here(tables.operator, tables.filters, layout.runner),
             cameras=None if frames is None else parts.cameras,
-            runner=division.runner,
+            runner=layout.runner,
         )
-        return RemoteEngine(setup, robot, make_source, latch, interrupts, reporter, history, frames)
+        return RemoteEngine(setup, robot, make_client, latch, interrupts, reporter, history, frames)
     joiner, filters = make_joiner(*parts.joining), parts.filters
     episode = EpisodeParts(
-        robot, make_source, filters, joiner, parts.execute, latch, interrupts, reporter
+        robot, make_client, filters, joiner, parts.execute, latch, interrupts, reporter
     )
     return LocalEngine(episode, settings, history)

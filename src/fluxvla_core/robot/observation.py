@@ -143,7 +143,7 @@ class ObservationReader:
         return future.result()
 
     def _frame(self) -> tuple[dict[str, Any], Frame | None]:
-        """What the runner makes of the robot's newest frame.
+        """The runner's observation of the robot's newest frame.
 
         Raises:
             BadFrame: it is no observation, or something was raised that is no error of a robot's.
@@ -196,7 +196,13 @@ def _shown(window: object) -> str:
 
 
 def _check_complete(window: dict[str, Any], cameras: Sequence[str]) -> None:
-    """A stream that has not come yet is None in an operator of the specification's shape."""
+    """Refuse an observation in which something has not arrived yet.
+
+    Operators written for upstream FluxVLA give None for it.
+
+    Raises:
+        NotReady: the state or a camera is missing.
+    """
     if _is_nothing(window.get("qpos")):
         raise NotReady("there are no joint states yet")
     missing = [name for name in cameras if window["images"].get(name) is None]

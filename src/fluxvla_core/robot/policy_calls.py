@@ -18,8 +18,8 @@ from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import check_chunk
 from fluxvla_core.robot.control.delays import POLICY, DelayMonitor
+from fluxvla_core.robot.control.policy_client import Answer, PolicyFailed
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
-from fluxvla_core.robot.control.source import Answer, PolicyFailed
 from fluxvla_core.robot.events import Reading
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -106,24 +106,23 @@ class PolicyCaller:
                 traceback.clear_frames(error.__traceback__)
             raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
         stages = {"policy": time.perf_counter() - began, **policy.stages}
-        # Checked here: for arrays of a chunk's size numpy gives the interpreter up, and the thread
-        # that sends would have to get it again.
-        keyframes: Array | BadChunk
+        # Checked in this thread: for arrays of a chunk's size numpy releases the GIL, and the
+        # thread that sends would have to get it again.
         try:
-            keyframes = self._keyframes(chunk)
-        except BadChunk as problem:
-            keyframes = problem
-        return PolicyAnswer(reading.at, keyframes, reading, chunk, stages)
+            actions = self._actions(chunk)
+        except BadChunk as error:
+            return PolicyAnswer(reading.at, None, error, reading, chunk, stages)
+        return PolicyAnswer(reading.at, actions, None, reading, chunk, stages)
 
-    def _keyframes(self, chunk: Any) -> Array:
+    def _actions(self, chunk: Any) -> Array:
         policy = self.policy
-        keyframes = check_chunk(chunk, self._embodiment, policy.action_rate_hz, self._safety).copy()
-        if len(keyframes) != policy.horizon:
+        actions = check_chunk(chunk, self._embodiment, policy.action_rate_hz, self._safety).copy()
+        if len(actions) != policy.horizon:
             raise BadChunk(
-                f"the policy's chunk has {len(keyframes)} keyframes; it said {policy.horizon}"
+                f"the policy's chunk has {len(actions)} actions; it said {policy.horizon}"
             )
-        keyframes.flags.writeable = False
-        return keyframes
+        actions.flags.writeable = False
+        return actions
 
 
 class PolicyThread:

@@ -1,8 +1,8 @@
 """``Robot``: an operator with its embodiment and clock; checks everything the operator returns.
 
-The specification's operators have ``get_frame`` and commands of their own (``servoj``,
-``movegrip``), no specs, and open their connection in the constructor. One like that is accepted
-when the config gives the ``embodiment`` that it lacks; the runner's ``_execute_actions`` sends.
+Operators written for upstream FluxVLA have ``get_frame`` and commands of their own (``servoj``,
+``movegrip``), no embodiment, and open their connection in the constructor. They are accepted when
+the config gives the ``embodiment``; the runner's ``_execute_actions`` sends the commands.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class Robot:
 
     @property
     def pictures_after(self) -> Callable[..., Any] | None:
-        """What the operator keeps of its pictures (``Operator.pictures_after``), or None."""
+        """The operator's ``pictures_after``, which gives images that it kept, or None."""
         return self._operator.pictures_after if self._has("pictures_after") else None
 
     @property
@@ -203,7 +203,7 @@ class Robot:
         return None if found is None else bool(found)
 
     def facts(self) -> Mapping[str, Any]:
-        """What the operator says of the last episode (``episode_facts``)."""
+        """Facts about the last episode from the operator (``episode_facts``)."""
         return self._operator.episode_facts()
 
     def done(self) -> bool:
@@ -228,8 +228,8 @@ class Robot:
     def can_stop(self) -> bool:
         """Whether the operator itself knows how to stop.
 
-        Only one of the specification's shape may not: its runner sends, and what stops it is that
-        the runner's commands brake, and that the last of them holds it.
+        Only an operator whose runner sends the commands may lack ``stop``: it is stopped by
+        commands that brake, and held by the last of them.
         """
         return implements(self._described, Operator, "stop")
 
@@ -299,7 +299,7 @@ class Robot:
             raise LoadFailed(
                 f"{self.name} has no embodiment: which joints it moves and within which limits is "
                 "not known, so nothing may be sent to it",
-                cause="an operator of the specification's shape describes no robot",
+                cause="the operator was written for upstream FluxVLA, where operators have none",
                 next="give the section embodiment = dict(name=…, joints=[…], cameras=[…], "
                 "rate_hz=…), or the operator an attribute embodiment",
             )

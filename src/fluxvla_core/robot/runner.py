@@ -1,13 +1,12 @@
 """``BaseInferenceRunner``: a policy drives a robot, one task after the other, within limits.
 
-A robot whose operator has the full contract needs no runner of its own. One of the
-specification's shape overrides ``get_ros_observation``, ``update_observation_window`` and
-``_execute_actions``; what the latter is given has passed the safety already.
+A robot whose operator has the full contract needs no runner of its own. Runners written for
+upstream FluxVLA override ``get_ros_observation``, ``update_observation_window`` and
+``_execute_actions``; the commands that the latter gets have passed filters and limits already.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,7 +16,6 @@ import numpy.typing as npt
 
 from fluxvla_core.build import (
     RunContext,
-    build_action_filter_from_cfg,
     build_operator_from_cfg,
     build_policy_from_cfg,
     takes,
@@ -25,28 +23,39 @@ from fluxvla_core.build import (
 from fluxvla_core.contracts.check import check_policy
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.contracts.robot import ActionFilter, Operator
+from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
 from fluxvla_core.robot.control.sender import Execute, check_pose
-from fluxvla_core.robot.division import RunnersOwn, Tables, divide
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
 from fluxvla_core.robot.make_engine import RunParts, make_engine
 from fluxvla_core.robot.observation import fit_cameras
 from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.process_layout import (
+    ControlTables,
+    ProcessLayout,
+    RunnerOverrides,
+    choose_layout,
+)
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.session import RobotSession
+from fluxvla_core.robot.settings import (
+    build_filters,
+    check_latency,
+    check_state_dim,
+    checked_joining,
+    checked_rate,
+)
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -93,6 +102,7 @@ class BaseInferenceRunner(Runner):
         safety: thresholds, see ``SafetySettings``.
         mixed_precision_dtype: ``float32`` or ``bf16``.
         device: the torch device of the policy.
+        execution, quantization: how its model computes, see ``load_policy``.
         record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
             and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
             work dir.
@@ -138,6 +148,8 @@ class BaseInferenceRunner(Runner):
         safety: Mapping[str, Any] | None = None,
         mixed_precision_dtype: str = "float32",
         device: str = "cpu",
+        execution: str = "eager",
+        quantization: str | None = None,
         record: str | None = None,
         record_fps: float | None = 10.0,
         ready_timeout: float = 10.0,
@@ -160,15 +172,43 @@ class BaseInferenceRunner(Runner):
         self.camera_names = None if camera_names is None else tuple(camera_names)
         self.prepare_pose = prepare_pose
         self.async_execution = async_execution
-        self.chunk_joining = self._checked_joining(chunk_joining)
+        self.chunk_joining = checked_joining(chunk_joining, async_execution, self.config_error)
         self.simulated_latency = simulated_latency
         self.gripper_threshold = gripper_threshold
         self.mixed_precision_dtype = mixed_precision_dtype
         self.device = device
+        self.execution, self.quantization = execution, quantization
         self.record = record
         self.record_fps = record_fps
         self.ready_timeout = ready_timeout
         self.safety = SafetySettings.of(safety)
+        self._layout = self._choose_layout(
+            operator, action_filters, embodiment, control_process, context
+        )
+        self.ros_operator, self.robot = self._layout.operator, self._layout.robot
+        self.embodiment = self.robot.embodiment
+        wrong = self.config_error
+        self.publish_rate = checked_rate(publish_rate, self.robot, wrong)
+        check_state_dim(state_dim, self.embodiment, wrong)
+        check_latency(simulated_latency, self.robot, wrong)
+        self.action_filters = build_filters(
+            action_filters, gripper_threshold, self.embodiment, context
+        )
+        self.latch = Latch(self.robot.clock.now)
+        self._frame: Frame | None = None
+        self.recorder: EpisodeRecorder | None = None
+        """The recorder of the last episode."""
+        self._history = RunHistory()
+
+    def _choose_layout(
+        self,
+        operator: Any,
+        action_filters: Sequence[Any],
+        embodiment: EmbodimentSpec | Mapping[str, Any] | None,
+        control_process: bool | None,
+        context: RunContext | None,
+    ) -> ProcessLayout:
+        """Choose which process commands the robot, and build this process's operator."""
         if operator is None:
             raise ConfigError(
                 f"{type(self).__name__} has no operator: which robot is it to drive?",
@@ -181,46 +221,19 @@ class BaseInferenceRunner(Runner):
             if value is not None and value < 1:
                 raise self.config_error(name, f"must be at least 1, got {value}")
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
-        scene = {"seed": seed} if takes(operator, OPERATORS, "seed") else {}
+        scene = {"seed": self.seed} if takes(operator, OPERATORS, "seed") else {}
         table = {**scene, **operator} if isinstance(operator, Mapping) else operator
-        tables = Tables(table, list(action_filters), gripper_threshold)
-        self._division = divide(
+        layout = choose_layout(
             lambda: build_operator_from_cfg(operator, context, **scene),
-            tables,
+            ControlTables(table, list(action_filters), self.gripper_threshold),
             self.context.config,
             embodiment,
-            RunnersOwn.of(type(self), BaseInferenceRunner, self.context),
+            RunnerOverrides.of(type(self), BaseInferenceRunner, self.context),
             "control_process is False" if control_process is False else None,
         )
-        if control_process and self._division.obstacle is not None:
-            raise self.config_error("control_process", f"is True, and {self._division.obstacle}")
-        self.ros_operator, self.robot = self._division.operator, self._division.robot
-        self.embodiment = self.robot.embodiment
-        self.publish_rate = self._checked_rate(publish_rate)
-        if state_dim is not None and state_dim != self.embodiment.state_dim:
-            raise self.config_error(
-                "state_dim",
-                f"is {state_dim}; {self.embodiment.name} has "
-                f"{self.embodiment.state_dim} state values",
-            )
-        if not 0.0 <= simulated_latency < math.inf:
-            wrong = f"must be 0 or more, got {simulated_latency}"
-            raise self.config_error("simulated_latency", wrong)
-        if simulated_latency and not self.robot.lockstep:
-            wrong = "is for simulations; this robot has its own"
-            raise self.config_error("simulated_latency", wrong)
-        built = [build_action_filter_from_cfg(each, context) for each in action_filters]
-        self.action_filters = [ActionFilter.adapt(each) for each in built]
-        if gripper_threshold is not None:
-            # After the config's own filters, right before the limits.
-            self.action_filters.append(SnapGripper(gripper_threshold))
-        for each in self.action_filters:
-            each.bind(self.embodiment)
-        self.latch = Latch(self.robot.clock.now)
-        self._frame: Frame | None = None
-        self.recorder: EpisodeRecorder | None = None
-        """Of the last episode."""
-        self._history = RunHistory()
+        if control_process and layout.why_single_process is not None:
+            raise self.config_error("control_process", f"is True, and {layout.why_single_process}")
+        return layout
 
     def run_setup(self) -> None:
         """Load the policy and check that it, the robot, the poses and the task fit together.
@@ -242,7 +255,7 @@ class BaseInferenceRunner(Runner):
             self.context.reporter.info(f"policy: {place}")
             self.policy = load_policy(
                 place, self.device, self.dataset, self.denormalize_action,
-                self.mixed_precision_dtype,
+                self.mixed_precision_dtype, self.execution, self.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
@@ -281,8 +294,8 @@ class BaseInferenceRunner(Runner):
         with Interrupts() as interrupts, watched:
             self._observers = (HookObserver(hooks),)
             engine = self._engine(interrupts, thread)
-            if self._division.remark is not None:
-                self.context.reporter.info(self._division.remark)
+            if self._layout.notice is not None:
+                self.context.reporter.info(self._layout.notice)
             self._session = session = RobotSession(
                 source, self.task_descriptions, self.free_tasks, self.seed, self._history,
                 engine, self.latch, interrupts, thread,
@@ -311,7 +324,7 @@ class BaseInferenceRunner(Runner):
     @property
     def divided(self) -> bool:
         """Whether a process of its own commands the robot."""
-        return self._division.tables is not None
+        return self._layout.tables is not None
 
     def get_ros_observation(self) -> tuple[Any, ...]:
         """The newest reading: one picture for each of ``camera_names``, then the state.
@@ -323,7 +336,7 @@ class BaseInferenceRunner(Runner):
         return (*(frame.images.get(name) for name in self._cameras), frame.state)
 
     def update_observation_window(self) -> dict[str, Any]:
-        """What the policy is asked with, but for the instruction.
+        """The observation for the policy, without the instruction.
 
         Returns:
             ``qpos``: ``(state_dim,)`` float32, and ``images``: camera -> ``(H, W, 3)`` uint8 RGB. A
@@ -339,10 +352,13 @@ class BaseInferenceRunner(Runner):
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
         self.robot.play(actions, rate)
 
-    def commanding_side(
+    def control_side(
         self, robot: Robot, cameras: Sequence[str]
     ) -> tuple[Execute, Callable[[], tuple[dict[str, Any], Frame | None]]]:
-        """In the control process, where there is no policy: what sends commands, and observes.
+        """The functions of this runner that the control process uses: it sends commands and
+        observes.
+
+        Called there; the runner was built without a policy.
 
         Args:
             robot: takes the place of this runner's.
@@ -365,7 +381,7 @@ class BaseInferenceRunner(Runner):
         return self.recorder.summary
 
     def _engine(self, interrupts: Interrupts, thread: PolicyThread) -> Engine:
-        """What commands the robot in one run."""
+        """The engine of one run."""
         policy = self.policy
         assert policy is not None, "run_setup() comes before run()"
         # Played in motion, a chunk is left when the next is there, not before.
@@ -375,10 +391,10 @@ class BaseInferenceRunner(Runner):
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
-            keyframes=min((n for n in used if n is not None), default=None),
+            max_actions=min((n for n in used if n is not None), default=None),
             latency_s=self.simulated_latency,
             max_steps=self.max_publish_step,
-            keyframe_hz=policy.action_rate_hz,
+            action_rate_hz=policy.action_rate_hz,
         )
         parts = RunParts(
             robot=self.robot,
@@ -394,7 +410,7 @@ class BaseInferenceRunner(Runner):
             context=self.context,
             history=self._history,
         )
-        return make_engine(parts, self._division, interrupts, thread)
+        return make_engine(parts, self._layout, interrupts, thread)
 
     def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
@@ -418,17 +434,6 @@ class BaseInferenceRunner(Runner):
             self.context, self.task_descriptions, self.task_topic, domain_id, self.free_tasks
         )
 
-    def _checked_joining(self, value: Any) -> Any:
-        if value is None:
-            return "latest_only" if self.async_execution else "synchronous"
-        try:
-            joiner = make_joiner(value)
-        except ConfigError as error:
-            raise self.config_error("chunk_joining", error.what) from error
-        if self.async_execution and not joiner.streamed:
-            raise self.config_error("chunk_joining", f"is {value!r}, and async_execution is set")
-        return value
-
     def _joiner(self) -> ChunkJoiner:
         return make_joiner(*self._joining())
 
@@ -437,23 +442,6 @@ class BaseInferenceRunner(Runner):
         assert self.policy is not None, "run_setup() comes before run()"
         least = self.execute_horizon or (1 if self.robot.lockstep else 0)
         return self.chunk_joining, least / self.policy.action_rate_hz
-
-    def _checked_rate(self, publish_rate: float | None) -> float:
-        most = self.embodiment.rate_hz
-        if publish_rate is None:
-            return most
-        if not 0 < publish_rate <= most:
-            raise self.config_error(
-                "publish_rate",
-                f"is {publish_rate:g} Hz; {self.embodiment.name} takes up to "
-                f"{most:g} commands a second",
-            )
-        if self.robot.lockstep and publish_rate != most:
-            raise self.config_error(
-                "publish_rate",
-                f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
-            )
-        return float(publish_rate)
 
     def config_error(self, key: str, what: str) -> ConfigError:
         """An error about a key of this section."""

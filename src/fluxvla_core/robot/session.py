@@ -14,8 +14,8 @@ from typing import Any
 
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.robot.control.interrupt import Interrupts
+from fluxvla_core.robot.control.policy_client import PolicyFailed
 from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.source import PolicyFailed
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.events import EpisodeObserver
 from fluxvla_core.robot.policy_calls import PolicyThread

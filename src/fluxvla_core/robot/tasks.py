@@ -162,7 +162,7 @@ class TaskSource(ABC):
         return
 
     def close(self) -> None:
-        """Give everything back; any number of times."""
+        """Release all resources; may be called several times."""
         return
 
     def ask(self) -> None:
@@ -170,11 +170,11 @@ class TaskSource(ABC):
         return
 
     def announce(self, text: str) -> None:
-        """Something that the person or program that gives the tasks should know."""
+        """Tell the person or program that gives the tasks."""
         return
 
     def report(self, text: str) -> None:
-        """The same for who is elsewhere: the terminal says it by itself."""
+        """Publish an outcome that the terminal shows anyway, for example on the topic's status."""
         return
 
     @abstractmethod

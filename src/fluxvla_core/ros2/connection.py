@@ -236,7 +236,7 @@ class Connection:
 
     def _spin(self) -> None:
         # The thread that sends commands waits for the interpreter lock while this one has it.
-        realtime.just_below_real_time()
+        realtime.raise_priority()
         main = threading.main_thread()
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without

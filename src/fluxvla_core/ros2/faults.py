@@ -27,7 +27,7 @@ _NUMBERS = ("position", "velocity", "effort", "data")
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with one stream; ``MODES`` says what ``amount`` means."""
+    """A fault of one stream; ``MODES`` says what ``amount`` means."""
 
     mode: str
     amount: float = 1.0
@@ -81,7 +81,7 @@ class Faults:
         self._faults.pop(stream, None)
 
     def apply(self, stream: str, message: Any) -> list[tuple[float, Any]]:
-        """What is sent in place of ``message``: delays in seconds, and messages, in this order."""
+        """The messages that are sent in place of ``message``, in order, each with its delay (s)."""
         fault = self._faults.get(stream)
         if fault is None:
             self._last[stream] = message

@@ -149,7 +149,7 @@ def to_depth(
 
 
 def to_millimetres(metres: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-    """What ``16UC1`` holds of ``(height, width)`` metres: 0 for NaN, and beyond its 65.535 m."""
+    """``(height, width)`` metres as ``16UC1`` (mm): 0 for NaN and beyond 65.535 m."""
     far = np.rint(np.nan_to_num(metres, posinf=0.0, neginf=0.0) / _MILLIMETRE)
     return np.where((far > 0) & (far <= np.iinfo(np.uint16).max), far, 0).astype(np.uint16)
 

@@ -38,7 +38,7 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
 # A driver sends the same names with every message; a few streams with a few orders each.
 @functools.lru_cache(maxsize=64)
 def _columns(given: tuple[str, ...], count: int, names: tuple[str, ...], source: str) -> list[int]:
-    """Where in a message that has the names ``given`` and ``count`` positions each joint is."""
+    """Index of each joint in a message that has the names ``given`` and ``count`` positions."""
     if not given:
         raise BadMessage(
             f"{source}: {count} positions without joint names; "

@@ -1,4 +1,4 @@
-"""The base of ROS 2 operators: a subclass says what is read and written, and what it means.
+"""``RosOperator``: base class of ROS 2 operators; a subclass declares streams and commands.
 
 A subclass has ``embodiment``, lists its ``streams()`` and ``commands()``, makes a state vector of
 messages in ``read_state`` and messages of an action in ``publish_action``. Everything else is here:
@@ -245,7 +245,7 @@ class RosOperator(Operator):
     def pictures_after(
         self, camera: str, after: float
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
-        """What a camera sent, for those who record more than is looked at; any thread may ask.
+        """Images that a camera sent after a time, for recordings; any thread may call it.
 
         Args:
             after: receipt time; earlier pictures are left out, and all but the newest few.
@@ -429,7 +429,7 @@ class RosOperator(Operator):
 
     @property
     def _readings(self) -> Readings:
-        """What arrived; raises NotReady without a connection."""
+        """The streams' readings; raises NotReady without a connection."""
         connection = self._connected()
         return Readings(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
 

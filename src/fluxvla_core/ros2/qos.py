@@ -13,7 +13,7 @@ _VENDORS = {b"\x01\x01": "RTI Connext", b"\x01\x10": "Cyclone DDS"}
 
 
 def reliability(offers: Iterable[Any]) -> str:
-    """What to subscribe with: ``reliable`` where every publisher offers it, else ``best_effort``.
+    """The QoS to subscribe with: ``reliable`` if every publisher offers it, else ``best_effort``.
 
     A reliable subscription is never matched with a best-effort publisher, while a best-effort one
     is matched with any; and best effort loses pictures that a reliable one would have repaired.

@@ -15,7 +15,7 @@ POLL_S = 0.002
 
 
 class Readings:
-    """What the streams of one connection received.
+    """The newest messages of the streams of one connection.
 
     Args:
         connection: with all streams subscribed.

@@ -155,7 +155,7 @@ class Startup:
         )
 
     def _problem(self, explain: bool) -> FluxError | None:
-        """What is still wrong, None if all is there.
+        """The first problem with the streams; None if all of them are there.
 
         Args:
             explain: look for the cause of a silent stream, which takes a while.
@@ -212,7 +212,7 @@ def _size(stream: Stream) -> int:
 
 @dataclass(frozen=True)
 class Reception:
-    """What one stream received in a while.
+    """Statistics of what one stream received in some time.
 
     Args:
         label: the stream's name and topic.

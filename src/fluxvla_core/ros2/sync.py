@@ -46,7 +46,7 @@ class Matched:
 
 
 def wall() -> float:
-    """What to add to a receipt for the time of this machine's wall clock."""
+    """The offset from receipt times to this machine's wall clock, in seconds."""
     return time.time() - time.monotonic()
 
 
@@ -117,7 +117,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
     apart = delays[first] - delays[last]
     if apart > max_skew:
         raise Stale(
-            f"{first} is stamped {apart:.3f} s before {last}, with which it arrives; "
+            f"{first} is stamped {apart:.3f} s earlier than {last}, although they arrive together; "
             f"at most {max_skew:g} s is allowed",
             cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall),
             next=f"{_CLOCKS}; max_skew_s sets what is allowed",
@@ -150,7 +150,7 @@ def _delay(items: Sequence[Received]) -> float:
 
 
 def _wrong_clock(delays: Mapping[str, float], wall: float | None) -> str:
-    """Whose clock is off, of two streams whose stamps are."""
+    """Text: which of the streams has a wrong clock."""
     slow, fast = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
     # By this machine's wall clock; a stamp in the future cannot be a message that is late.
     behind = {name: delay + (wall or 0.0) for name, delay in delays.items()}

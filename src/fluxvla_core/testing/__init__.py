@@ -13,11 +13,18 @@ if TYPE_CHECKING:
     )
     from fluxvla_core.testing.dataset import DatasetConformance as DatasetConformance
     from fluxvla_core.testing.environment import EnvironmentConformance as EnvironmentConformance
+    from fluxvla_core.testing.eval_runner import EvalRunnerConformance as EvalRunnerConformance
+    from fluxvla_core.testing.execution import ExecutionConformance as ExecutionConformance
     from fluxvla_core.testing.hook import HookConformance as HookConformance
+    from fluxvla_core.testing.inference_runner import (
+        InferenceRunnerConformance as InferenceRunnerConformance,
+    )
     from fluxvla_core.testing.metric import MetricConformance as MetricConformance
     from fluxvla_core.testing.model import ModelConformance as ModelConformance
     from fluxvla_core.testing.operator import OperatorConformance as OperatorConformance
     from fluxvla_core.testing.policy import PolicyConformance as PolicyConformance
+    from fluxvla_core.testing.stand_ins import StandInPolicy as StandInPolicy
+    from fluxvla_core.testing.stand_ins import StandInRobot as StandInRobot
     from fluxvla_core.testing.train_runner import TrainRunnerConformance as TrainRunnerConformance
     from fluxvla_core.testing.transform import TransformConformance as TransformConformance
 
@@ -25,11 +32,15 @@ _KITS = {
     "fluxvla_core.testing.action_filter": ["ActionFilterConformance"],
     "fluxvla_core.testing.dataset": ["DatasetConformance"],
     "fluxvla_core.testing.environment": ["EnvironmentConformance"],
+    "fluxvla_core.testing.execution": ["ExecutionConformance"],
+    "fluxvla_core.testing.eval_runner": ["EvalRunnerConformance"],
     "fluxvla_core.testing.hook": ["HookConformance"],
+    "fluxvla_core.testing.inference_runner": ["InferenceRunnerConformance"],
     "fluxvla_core.testing.metric": ["MetricConformance"],
     "fluxvla_core.testing.model": ["ModelConformance"],
     "fluxvla_core.testing.operator": ["OperatorConformance"],
     "fluxvla_core.testing.policy": ["PolicyConformance"],
+    "fluxvla_core.testing.stand_ins": ["StandInPolicy", "StandInRobot"],
     "fluxvla_core.testing.train_runner": ["TrainRunnerConformance"],
     "fluxvla_core.testing.transform": ["TransformConformance"],
 }

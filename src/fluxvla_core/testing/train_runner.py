@@ -23,6 +23,7 @@ import torch
 
 from fluxvla_core.checkpoints.checkpoint import MODEL, Checkpoint, folders
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.testing._conformance import Conformance
 from fluxvla_core.testing.training import (
     SCALARS,
     checkpoint_differences,
@@ -39,9 +40,10 @@ LENGTH: dict[str, dict[str, Any]] = {
 }
 
 
-class TrainRunnerConformance:
+class TrainRunnerConformance(Conformance):
     """Inherit, set ``entry_point``, and run pytest."""
 
+    registry = "runners"
     entry_point: ClassVar[str]
     """The runner's ``type`` in a config."""
     ranks: ClassVar[int] = 2
@@ -159,10 +161,15 @@ class TrainRunnerConformance:
         assert not differ, _differ(differ, "stopped and resumed")
 
     def test_it_trains_as_one_process_does_and_goes_on_there(self, tmp_path: Path) -> None:
-        """A checkpoint of many processes is one of any number."""
+        """A checkpoint of many processes is one of any number. A step has two batches."""
         # Both follow from how samples are shared between processes: no two numbers of them agree.
         plain: dict[str, Any] = {"dropout": 0.0, "centred": False}
-        length = {**plain, "max_steps": 9, "save_iter_interval": 4}
+        length = {
+            **plain,
+            "max_steps": 9,
+            "save_iter_interval": 4,
+            "grad_accumulation_steps": 2,
+        }
         many = self.config(batch=2, **length)
         one = self.config(batch=2 * self.ranks, **length, type=self.reference)
         if self.reference != self.entry_point:
@@ -186,6 +193,22 @@ class TrainRunnerConformance:
             f"{changed!r} where the number differs: people must know"
         )
         self._compare(moved, tmp_path / "one", f"one process that goes on from {self.ranks}")
+
+    def test_training_follows_from_its_seed(self, tmp_path: Path) -> None:
+        runs: list[dict[str, Any]] = [
+            {"config": self.config(max_steps=1, seed=seed), "work_dir": str(tmp_path / str(seed))}
+            for seed in (42, 43)
+        ]
+        codes = self.start(*runs)
+        assert codes == [0] * self.ranks, _ended("the runs", codes)
+        weights = [Checkpoint.open(folders(Path(r["work_dir"]))[-1]).tensors(MODEL) for r in runs]
+        learned = [n for n in weights[0] if n.endswith("weight") and weights[0][n].ndim > 1]
+        differ = [name for name in learned if not torch.equal(weights[0][name], weights[1][name])]
+        assert differ, (
+            f"with seed = 42 and seed = 43 the weights are the same in all of {len(learned)} "
+            "matrices, expected others: who trains three times to tell luck from skill would train "
+            "once"
+        )
 
     def _compare(self, run: Path, reference: Path, what: str) -> None:
         """The losses and weights of ``run`` are those of the reference, to rounding."""

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from fluxvla_core.training.base_runner import BaseTrainRunner as BaseTrainRunner
     from fluxvla_core.training.distributed import World as World
     from fluxvla_core.training.distributed import share_buffers as share_buffers
+    from fluxvla_core.training.layout import Layout as Layout
+    from fluxvla_core.training.layout import bare as bare
+    from fluxvla_core.training.layout import nbytes as nbytes
+    from fluxvla_core.training.layout import whole as whole
     from fluxvla_core.training.model import units_of as units_of
+    from fluxvla_core.training.parameters import decay_groups as decay_groups
     from fluxvla_core.training.parameters import refuse_scalars as refuse_scalars
     from fluxvla_core.training.parameters import trainable as trainable
     from fluxvla_core.training.rng import rng_state as rng_state
@@ -48,8 +53,9 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
         "fluxvla_core.training.distributed": ["World", "share_buffers"],
+        "fluxvla_core.training.layout": ["Layout", "bare", "nbytes", "whole"],
         "fluxvla_core.training.model": ["units_of"],
-        "fluxvla_core.training.parameters": ["refuse_scalars", "trainable"],
+        "fluxvla_core.training.parameters": ["decay_groups", "refuse_scalars", "trainable"],
         "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },

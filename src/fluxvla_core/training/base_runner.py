@@ -108,7 +108,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.training.stop import StopRequest, stopped
         from fluxvla_core.training.trainer import Trainer
 
-        self._prepare()
+        self._join()
         self.progress = Progress()
         outcome = "failed"
         try:
@@ -152,11 +152,14 @@ class BaseTrainRunner(Strategy):
         distributed.stop(self.world, failed=outcome == "failed")
 
     def run_setup(self, n_train_examples: int) -> None:
-        """Build and wrap the model, its optimizer and its schedule.
+        """Join the other ranks, choose a checkpoint to resume from, and build what is trained.
+
+        The checkpoint is loaded by ``Trainer``, once the dataset is known.
 
         Args:
             n_train_examples: samples in the dataset; with the batch size, an epoch's steps.
         """
+        self._join()
         self.vla = self._build_vla()
         self.vla = self._wrap_model(self.vla)
         self.optimizer = self._build_optimizer()
@@ -167,10 +170,12 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import flops, lora
         from fluxvla_core.training.model import checkpoint_activations, compile_units
+        from fluxvla_core.training.part_weights import put_parts
         from fluxvla_core.training.rng import seed_all
         from fluxvla_core.training.weights import base_to_note, start_training_from
 
-        self._prepare()
+        # For a ``run_setup`` that calls this method alone.
+        self._join()
         if "model" not in self.cfg:
             raise ConfigError(
                 "the config has no 'model' to train",
@@ -181,6 +186,8 @@ class BaseTrainRunner(Strategy):
         vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self.resume_checkpoint
         init_from = options.init_from or VLA.adapt(vla).pretrained_name_or_path
+        if init_from is None and before is None:
+            put_parts(vla, VLA.adapt(vla).part_weights)
         start_training_from(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = base_to_note(before, init_from)
@@ -234,8 +241,8 @@ class BaseTrainRunner(Strategy):
         every = self.options.save_steps
         return every is not None and self.progress.step % every == 0
 
-    def _prepare(self) -> None:
-        """Join the other ranks, take over the work dir, choose a checkpoint to resume from."""
+    def _join(self) -> None:
+        """Join the other ranks, lock the work dir, choose a checkpoint to resume from; once."""
         from fluxvla_core.training import distributed
         from fluxvla_core.training.resuming import choose_checkpoint, lock_on_first
 

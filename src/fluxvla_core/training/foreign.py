@@ -44,7 +44,8 @@ def import_checkpoint(
     tokenizer: str | None = None,
     embodiment: EmbodimentSpec | None = None,
     action_rate_hz: float | None = None,
-    cameras: Mapping[str, str] | None = None,
+    cameras: Mapping[str, str | None] | None = None,
+    robot: str | None = None,
 ) -> tuple[Path, ForeignCheckpoint]:
     """Make a checkpoint of this project from another project's; weights keep their dtype.
 
@@ -56,7 +57,8 @@ def import_checkpoint(
         embodiment: the robot, where the checkpoint describes none; without one the result can be
             trained on, and drives nothing.
         action_rate_hz: actions a second, where the checkpoint does not say it.
-        cameras: the checkpoint's camera -> the robot's.
+        cameras: the checkpoint's camera -> the robot's; None: the robot does not have it.
+        robot: which one, where the checkpoint knows several, by its name there.
 
     Raises:
         CheckpointError: no installed format reads it; or it is damaged, or not as its format says.
@@ -65,10 +67,12 @@ def import_checkpoint(
     """
     target = Path(target)
     refuse_content(target)
-    found = read_foreign(source, format, tokenizer)
+    named = {theirs: ours for theirs, ours in (cameras or {}).items() if ours is not None}
+    absent = tuple(theirs for theirs in cameras or {} if theirs not in named)
+    found = read_foreign(source, format, tokenizer, robot, absent)
     found = replace(
         found,
-        img_keys=_renamed_cameras(found.img_keys, cameras or {}),
+        img_keys=_renamed_cameras(found.img_keys, named),
         action_rate_hz=action_rate_hz or found.action_rate_hz,
         embodiment=embodiment or found.embodiment,
     )
@@ -207,7 +211,15 @@ def _renamed_cameras(keys: Sequence[str], cameras: Mapping[str, str]) -> tuple[s
         raise UsageError(
             f"--camera {unknown[0]}=…: the checkpoint has no such camera; it has {', '.join(have)}"
         )
-    return tuple(cameras.get(name, name) for name in have)
+    names = tuple(cameras.get(name, name) for name in have)
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        of = [theirs for theirs, ours in zip(have, names, strict=True) if ours == twice]
+        raise UsageError(
+            f"{' and '.join(of)} would both be the robot's camera {twice!r}",
+            next="--camera THEIRS=OURS with a name of its own for each, or THEIRS=none",
+        )
+    return names
 
 
 def _check_robot(found: ForeignCheckpoint, where: str) -> None:
@@ -220,7 +232,8 @@ def _check_robot(found: ForeignCheckpoint, where: str) -> None:
             f"the checkpoint looks at {', '.join(found.img_keys)}; {robot.name} has "
             f"{', '.join(robot.camera_names)}",
             where=where,
-            next=f"--camera {lacking[0]}=NAME, with the robot's name for it",
+            next=f"--camera {lacking[0]}=NAME, with the robot's name for it, or "
+            f"{lacking[0]}=none if it has no such camera",
         )
     for key, joints in (("action", robot.dim), ("proprio", robot.state_dim)):
         width = _width(found.statistics.get("private", {}).get(key, {}))

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.checkpoints.foreign import HUB, foreign_folder
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
+from fluxvla_core.contracts.contract import implements
 from fluxvla_core.errors import CheckpointError, PluginError, UsageError, nearest
 from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS
 
 
 def read_foreign(
-    source: str | Path, format: str | None = None, tokenizer: str | None = None
+    source: str | Path,
+    format: str | None = None,
+    tokenizer: str | None = None,
+    robot: str | None = None,
+    absent: Sequence[str] = (),
 ) -> ForeignCheckpoint:
     """Another project's checkpoint, by the format that recognises it.
 
+    Args:
+        robot, absent: see ``CheckpointFormat.read_for``.
+
     Raises:
         CheckpointError: none does, or it is damaged.
-        UsageError: there is no format of that name.
+        UsageError: there is no format of that name, or ``robot`` or ``absent`` does not fit.
     """
     folder = foreign_folder(source)
     known, failed = formats()
@@ -28,7 +37,7 @@ def read_foreign(
     asked = [f for f in known if format in (None, f.name)]
     able = [f for f in asked if f.recognizes(folder)]
     if len(able) == 1:
-        return able[0].read(folder, tokenizer)
+        return _read(able[0], folder, tokenizer, robot, absent)
     if able:
         listed = ", ".join(sorted(f"{f.name} ({type(f).__name__})" for f in able))
         raise CheckpointError(
@@ -43,6 +52,31 @@ def read_foreign(
         where=str(folder),
         cause=f"formats that were tried: {listed or 'none'}{broken}",
         next="install the plugin of its model family; fluxvla plugins list has what is installed",
+    )
+
+
+def _read(
+    chosen: CheckpointFormat,
+    folder: Path,
+    tokenizer: str | None,
+    robot: str | None,
+    absent: Sequence[str],
+) -> ForeignCheckpoint:
+    if robot is None and not absent:
+        return chosen.read(folder, tokenizer)
+    if implements(chosen, CheckpointFormat, "read_for"):
+        return chosen.read_for(folder, tokenizer, robot, absent)
+    kinds = ", ".join(chosen.model_types)
+    if robot is not None:
+        raise UsageError(
+            f"--robot {robot}: a checkpoint of {kinds} ({chosen.name}) is of one robot, which has "
+            "no name there",
+            next="leave --robot out",
+        )
+    raise UsageError(
+        f"--camera {absent[0]}=none: {kinds} ({chosen.name}) needs the pictures of all cameras "
+        "that it was trained with",
+        next="give it another camera's: --camera THEIRS=OURS",
     )
 
 

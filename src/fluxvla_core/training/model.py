@@ -56,17 +56,22 @@ def checkpoint_activations(model: nn.Module) -> None:
         unit.__dict__["forward"] = _recomputed(unit.forward, checkpoint)
 
 
-def compile_units(model: nn.Module) -> None:
+def compile_units(model: nn.Module, dynamic: bool | None = None, backend: str = "inductor") -> None:
     """Compile each of the model's ``fsdp_units`` by itself; names and state stay as they are.
 
     Only what is inside a unit's ``forward``: what sharding does before and after it, and drawing
     noise and time, stay outside.
 
+    Args:
+        dynamic: as of ``torch.compile``; False compiles for each size, and None for any once a
+            second one is met.
+        backend: as of ``torch.compile``.
+
     Raises:
         ConfigError: the model names no units.
     """
     for unit in _named_blocks(model, "compile_blocks", "blocks to compile"):
-        unit.__dict__["forward"] = torch.compile(unit.forward)
+        unit.__dict__["forward"] = torch.compile(unit.forward, dynamic=dynamic, backend=backend)
 
 
 def _named_blocks(model: nn.Module, option: str, purpose: str) -> list[nn.Module]:
@@ -102,6 +107,23 @@ def autocast(device: torch.device, dtype: torch.dtype | None) -> AbstractContext
     if dtype is None:
         return nullcontext()
     return torch.autocast(device.type, dtype)
+
+
+# -- without memory --------------------------------------------------------------------------
+
+
+def has_values(tensor: Tensor) -> bool:
+    """Whether a tensor has numbers, and not only a shape: for what looks at its inputs."""
+    if type(tensor) is Tensor and not tensor.is_meta:
+        return True
+    from torch._subclasses.fake_tensor import FakeTensor
+
+    return not (tensor.is_meta or isinstance(tensor, FakeTensor))
+
+
+def built_without_memory() -> bool:
+    """Whether models are built on the meta device now: then there are no weights to load."""
+    return torch.get_default_device().type == "meta"
 
 
 # -- from a batch to a loss ------------------------------------------------------------------

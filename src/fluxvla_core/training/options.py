@@ -34,7 +34,8 @@ class TrainOptions:
     max_grad_norm: float | None = 1.0
     """gradients are scaled down to this norm; None leaves them."""
     sampler: str | None = None
-    """None or ``distributed``: both shuffle every epoch and split it over the ranks."""
+    """no effect; accepted because upstream FluxVLA's configs have it. None or ``distributed``: the
+    samples are shuffled every epoch and divided over the ranks anyway."""
     tokenizer: Any = None
     """table of ``fluxvla.tokenizers``, saved with the checkpoints."""
     metric: Any = None
@@ -56,7 +57,7 @@ class TrainOptions:
     lr_schedule: Mapping[Any, float] | None = None
     """for ``step-based``: ``{part of the run: rate}``, with 0."""
     warmup_ratio: float = 0.0
-    """part of the run over which the rate rises."""
+    """part of the run over which the rate rises linearly to ``learning_rate``."""
     grad_accumulation_steps: int = 1
     """batches per optimizer step; gradients are averaged over them."""
     enable_mixed_precision_training: bool = False

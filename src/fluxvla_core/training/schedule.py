@@ -31,7 +31,8 @@ def make_schedule(
             ``step-based`` (the rates of ``lr_schedule``); ``wsd`` (warm-up, stable, decay to 0
             over the last fifth).
         learning_rate: peak rate; ``step-based`` does not use it.
-        warmup_ratio: part of ``total_steps`` over which the rate rises linearly from 0.
+        warmup_ratio: part of ``total_steps`` (``W`` steps) over which the rate rises linearly: step
+            ``k``, counted from 0, has ``learning_rate * (k + 1) / W``.
         lr_schedule: for ``step-based``: part of the run done -> rate from there on; has 0.
 
     Raises:

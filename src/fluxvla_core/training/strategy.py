@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fluxvla_core.training.distributed import World
     from fluxvla_core.training.ema import Ema
     from fluxvla_core.training.flops import Meter
+    from fluxvla_core.training.layout import Layout
     from fluxvla_core.training.model import ForwardArguments
     from fluxvla_core.training.progress import Progress
     from fluxvla_core.training.saving import Saver, Snapshot
@@ -97,6 +98,21 @@ class Strategy(TrainRunner):
                 next="use DDPTrainRunner or FSDPTrainRunner, or override _wrap_model",
             )
         return vla.to(self.world.device)
+
+    def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
+        """What one of so many processes keeps of ``model``: for the estimate of a dry run.
+
+        Here everything, as where ``_wrap_model`` copies the model. A strategy that divides it
+        overrides this. Nothing is allocated, no process group is there.
+
+        Args:
+            model: on the meta device, before ``_wrap_model``.
+            processes: that train, all on one machine.
+            device_type: ``cuda`` or ``cpu``.
+        """
+        from fluxvla_core.training.layout import whole
+
+        return whole(model)
 
     def unwrap_model(self, vla: nn.Module) -> nn.Module:
         """The model inside what ``_wrap_model`` returned, with the names that are saved."""
@@ -348,9 +364,9 @@ class Strategy(TrainRunner):
 
     @property
     def world(self) -> World:
-        """This process among those that train; known from ``_build_vla`` on."""
+        """This process among those that train; known from ``run_setup`` on."""
         if self._world is None:
-            raise RuntimeError("the world is known from _build_vla on")
+            raise RuntimeError("the world is known from run_setup on")
         return self._world
 
     @property

@@ -19,14 +19,14 @@ import os, sys, time
 from fluxvla_core.robot.process.link import Link
 
 link = Link(int(sys.argv[1]), control=True)
-link.send("ready")
+link.try_send("ready")
 main = os.getppid()
 while os.getppid() == main:
-    link.beat()
+    link.mark_alive()
     while (message := link.receive()) is not None:
         if message.kind == "end":
             sys.exit()
-        link.send(message.kind, message.arrays, **message.fields)
+        link.try_send(message.kind, message.arrays, **message.fields)
     time.sleep(0.001)
 """
 
@@ -47,7 +47,7 @@ def other(memory):
         assert next_of(link).kind == "ready"
         yield link, process
         process.send_signal(signal.SIGCONT)
-        link.send("end")
+        link.try_send("end")
         assert process.wait(10) in (0, -signal.SIGKILL)
 
 
@@ -68,7 +68,7 @@ def test_messages_go_there_and_back(other):
     arrays = (np.arange(6.0).reshape(2, 3), np.array([np.nan]))
 
     for number in range(200):
-        assert link.send("echo", arrays, number=number, text="手")
+        assert link.try_send("echo", arrays, number=number, text="手")
         found = next_of(link)
         assert (found.kind, found.fields) == ("echo", {"number": number, "text": "手"})
         for got, wanted in zip(found.arrays, arrays, strict=True):
@@ -82,7 +82,9 @@ def test_many_threads_send_and_nothing_is_mixed_up(other):
 
     def send(thread):
         for number in range(100):
-            link.send("echo", (np.full(thread + 1, float(number)),), thread=thread, number=number)
+            link.try_send(
+                "echo", (np.full(thread + 1, float(number)),), thread=thread, number=number
+            )
 
     threads = [threading.Thread(target=send, args=(n,)) for n in range(4)]
     for each in threads:
@@ -99,7 +101,7 @@ def test_many_threads_send_and_nothing_is_mixed_up(other):
 
 def test_a_process_that_never_ran_is_not_silent(memory):
     link = Link(memory, control=False)
-    link.beat()
+    link.mark_alive()
     time.sleep(0.02)
 
     assert link.silent_s() == 0.0
@@ -113,7 +115,7 @@ def test_a_process_that_is_stopped_is_silent_until_it_goes_on(other):
     began = time.monotonic()
     until(lambda: link.silent_s() > 0.5)
     assert time.monotonic() - began > 0.3
-    assert link.send("echo", number=1)
+    assert link.try_send("echo", number=1)
     assert link.receive() is None
     process.send_signal(signal.SIGCONT)
 
@@ -134,14 +136,14 @@ def test_a_process_that_was_killed_is_silent_for_good(other):
 
 def test_each_end_has_its_own_time(memory):
     main, control = Link(memory, control=False), Link(memory, control=True)
-    control.beat()
+    control.mark_alive()
     time.sleep(0.05)
-    main.beat()
+    main.mark_alive()
 
     assert main.silent_s() >= 0.05
     assert control.silent_s() < main.silent_s()
     # To send something shows it as well.
-    control.send("x")
+    control.try_send("x")
     assert main.silent_s() < 0.05
 
 
@@ -149,13 +151,13 @@ def test_what_finds_no_room_is_lost_and_counted_at_the_other_end(memory):
     main, control = Link(memory, control=False), Link(memory, control=True)
     large = np.zeros(TO_CONTROL_BYTES // 8 // 4)
 
-    sent = [main.send("chunk", (large,), number=n) for n in range(5)]
+    sent = [main.try_send("chunk", (large,), number=n) for n in range(5)]
 
     assert sent == [True, True, True, False, False]
     assert (control.lost, main.lost) == (2, 0)
     assert [control.receive()["number"] for _ in range(3)] == [0, 1, 2]
     assert control.receive() is None
-    assert main.send("chunk", (large,), number=5)
+    assert main.try_send("chunk", (large,), number=5)
     assert control.receive()["number"] == 5
 
 
@@ -164,7 +166,7 @@ def test_what_must_arrive_waits_for_room_and_keeps_its_order(memory):
     large = np.zeros(TO_CONTROL_BYTES // 8 // 4)
 
     for number in range(7):
-        main.post("order", (large,), number=number)
+        main.send("order", (large,), number=number)
     got = []
     for _ in range(10):
         while (message := control.receive()) is not None:

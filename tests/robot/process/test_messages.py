@@ -12,9 +12,10 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from fluxvla_core import errors
 from fluxvla_core.errors import Faulted, FluxError, RunFailed
-from fluxvla_core.robot.control import safety, source
+from fluxvla_core.robot.control import policy_client, safety
 from fluxvla_core.robot.control.safety import RuleStop, rule_of
 from fluxvla_core.robot.process.messages import (
+    Kind,
     Message,
     decode,
     encode,
@@ -22,11 +23,6 @@ from fluxvla_core.robot.process.messages import (
     error_of,
 )
 
-KINDS = (
-    "answer", "reply", "signal", "fault", "play", "connect", "rearm", "release", "stop", "close",
-    "ask", "accepted", "refused", "late", "first state", "reset", "info", "warn", "artifact", "log",
-    "ready", "done", "closed", "released", "failed",
-)  # fmt: skip
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
@@ -43,7 +39,7 @@ ARRAYS = st.lists(
 FLUX_ERRORS = sorted(
     {
         value
-        for module in (errors, safety, source)
+        for module in (errors, safety, policy_client)
         for value in vars(module).values()
         if isinstance(value, type) and issubclass(value, FluxError)
     },
@@ -51,7 +47,7 @@ FLUX_ERRORS = sorted(
 )
 
 
-@given(kind=st.sampled_from(KINDS), fields=st.dictionaries(st.text(), VALUES), given_=ARRAYS)
+@given(kind=st.sampled_from(Kind), fields=st.dictionaries(st.text(), VALUES), given_=ARRAYS)
 def test_whatever_goes_in_comes_out(kind, fields, given_):
     found = decode(encode(Message(kind, fields, given_)))
 
@@ -66,14 +62,14 @@ def test_whatever_goes_in_comes_out(kind, fields, given_):
 @pytest.mark.parametrize("name", ["", "a", "ab", "abc", "Ünïcødé 手 🦾", "\ud800", "\0\n"])
 def test_arrays_can_be_read_as_any_other(name):
     # The header before them has any length; torch and C code take aligned numbers only.
-    keyframes = np.arange(6.0).reshape(2, 3)
+    actions = np.arange(6.0).reshape(2, 3)
 
-    (got,) = decode(encode(Message("answer", {"name": name}, (keyframes,)))).arrays
+    (got,) = decode(encode(Message("answer", {"name": name}, (actions,)))).arrays
 
     assert got.flags.aligned
     assert not got.flags.writeable
     assert got.dtype == np.float64
-    np.testing.assert_array_equal(got, keyframes)
+    np.testing.assert_array_equal(got, actions)
 
 
 def test_arrays_of_other_layouts_and_types_arrive_as_float64():

@@ -36,10 +36,10 @@ SETTINGS = EpisodeSettings(
     rate_hz=50.0,
     safety=SafetySettings(velocity_scale=0.5, silence_s=0.3),
     start_pose=(0.1, 0.2),
-    keyframes=None,
+    max_actions=None,
     latency_s=0.0,
     max_steps=100,
-    keyframe_hz=10.0,
+    action_rate_hz=10.0,
 )
 SETUP = ControlSetup(
     config={"seed": 7, "nested": {"list": [1, None, True, "手"]}},

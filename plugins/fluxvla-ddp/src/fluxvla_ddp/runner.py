@@ -11,6 +11,8 @@ from fluxvla_core.training import BaseTrainRunner
 if TYPE_CHECKING:
     from torch import nn
 
+    from fluxvla_core.training import Layout
+
 
 class DDPTrainRunner(BaseTrainRunner):
     """Data-parallel training; on one process it is ``BaseTrainRunner``.
@@ -65,6 +67,12 @@ class DDPTrainRunner(BaseTrainRunner):
             gradient_as_bucket_view=True,
             static_graph=self.static_graph,
         )
+
+    def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
+        """Everything on every process; the buckets that gradients are exchanged in are theirs."""
+        from fluxvla_core.training import whole
+
+        return whole(model)
 
     def warm_up(self, batch: dict[str, Any]) -> None:
         """Let torch rearrange its buckets, and learn a static graph, before the first step.

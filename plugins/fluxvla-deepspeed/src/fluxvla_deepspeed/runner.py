@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-    from fluxvla_core.training import Stored
+    from fluxvla_core.training import Layout, Stored
 
 
 class DeepSpeedTrainRunner(BaseTrainRunner):
@@ -67,6 +67,11 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         named = dict(vla.named_parameters())
         refuse_scalars(named, type(self).__name__, self.context.where("model"))
         return vla.to(self.world.device)
+
+    def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
+        from fluxvla_deepspeed.layout import partitioned
+
+        return partitioned(model, self.zero_stage, processes)
 
     def unwrap_model(self, vla: nn.Module) -> nn.Module:
         inside: nn.Module = getattr(vla, "module", vla)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import torch
     from torch import nn
 
 
-def kept_fp32(model: nn.Module, device: torch.device) -> set[nn.Module]:
+def kept_fp32(model: nn.Module, device_type: str) -> set[nn.Module]:
     """The trained norms whose weights are gathered in fp32 where others are gathered in bf16.
 
     Batch and instance norms take weights of the dtype of their running statistics, or of an input
@@ -19,7 +18,7 @@ def kept_fp32(model: nn.Module, device: torch.device) -> set[nn.Module]:
     from torch.nn.modules.batchnorm import _NormBase
 
     kinds: tuple[type[nn.Module], ...] = (_NormBase,)
-    if device.type == "cpu":
+    if device_type == "cpu":
         kinds = (*kinds, nn.LayerNorm, nn.GroupNorm)
     return {
         module

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +13,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
     from torch.distributed.device_mesh import DeviceMesh
+
+    from fluxvla_core.training import Layout
 
 STRATEGIES = ("full-shard", "shard-grad-op", "hybrid-shard", "no-shard")
 
@@ -54,8 +55,8 @@ class FSDPTrainRunner(BaseTrainRunner):
         """Split the model's units, then what is left of it, over the mesh."""
         from torch.distributed.fsdp import fully_shard
 
-        from fluxvla_core.training import refuse_scalars, trainable, units_of
-        from fluxvla_fsdp.norms import kept_fp32
+        from fluxvla_core.training import refuse_scalars, trainable
+        from fluxvla_fsdp.groups import groups_of
         from fluxvla_fsdp.ties import check_ties
 
         refuse_scalars(trainable(vla), type(self).__name__, self.context.where("model"))
@@ -66,27 +67,32 @@ class FSDPTrainRunner(BaseTrainRunner):
             "ignored_params": frozen,
         }
         compute, fp32 = self._precision(self.compute_dtype), self._precision(None)
-        norms = kept_fp32(vla, self.world.device) if self.compute_dtype is not None else set()
-
-        def split(modules: Sequence[nn.Module], reshard: bool) -> None:
-            """As one group; those that need their weights in fp32 as another, inside."""
-            apart = [n for m in modules for n in m.modules() if n in norms]
-            norms.difference_update(apart)
-            rest = [m for m in modules if m not in apart]
-            for group, policy in ((apart, fp32), (rest, compute)):
-                if group:
-                    fully_shard(group, mp_policy=policy, reshard_after_forward=reshard, **shared)
-
-        reshard = self.sharding_strategy in ("full-shard", "hybrid-shard")
-        for unit in units_of(vla):
-            modules = [m for m in unit if any(p.requires_grad for p in m.parameters())]
-            split(modules, reshard)
-        # Whatever is in no unit is gathered first and used until the end: no use in letting go.
-        split([vla], False)
+        for group in groups_of(vla, self._reshards, self.compute_dtype, self.world.device.type):
+            fully_shard(
+                list(group.modules),
+                mp_policy=compute if group.lowered else fp32,
+                reshard_after_forward=group.reshards,
+                **shared,
+            )
         # What is split was moved unit by unit: the whole model need not fit one device.
         for parameter in frozen:
             parameter.data = parameter.data.to(self.world.device)
         return vla
+
+    @property
+    def _reshards(self) -> bool:
+        """Whether a unit's weights are let go of between the forward and the backward pass."""
+        return self.sharding_strategy in ("full-shard", "hybrid-shard")
+
+    def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
+        """Shards of what is trained; frozen weights and buffers are whole."""
+        from fluxvla_fsdp.groups import groups_of
+        from fluxvla_fsdp.layout import sharded
+
+        groups = groups_of(model, self._reshards, self.compute_dtype, device_type)
+        parts = 1 if self.sharding_strategy == "no-shard" else processes
+        accumulates = self.options.grad_accumulation_steps > 1
+        return sharded(model, groups, parts, self.compute_dtype, accumulates)
 
     def _mesh(self) -> DeviceMesh:
         """One dimension to split over, or (copies, parts) for the strategies that copy."""

@@ -7,6 +7,7 @@ Foundation Model for Generalist Humanoid Robots" (arXiv 2503.14734).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,8 @@ from fluxvla_gr00t.embodiments import ActionEncoder, EmbodimentMLP
 from fluxvla_gr00t.transformer import ContextBlock, DiT, Kept
 
 _BUCKETS = 1000
+_CHOSEN = {"action_encoder": ("actions", "joined", "out"), "action_decoder": ("hidden", "out")}
+"""Parts with weights for each embodiment that every step needs."""
 
 
 class GR00TActionHead(nn.Module):
@@ -212,6 +215,8 @@ class GR00TActionHead(nn.Module):
 
         With ``guide`` to one that goes on from another; that takes a backward pass for each step.
         """
+        if guide is None:
+            return self.denoise(self.observe(context, states, ids), noise, self.step_tables())
         read = self.read(context)
         state = self.encode_states(states, ids)
         kept = [Kept() for _ in range(len(self.dit.blocks) // 2)]
@@ -220,12 +225,61 @@ class GR00TActionHead(nn.Module):
             share = step / self.num_steps
             steps = torch.full((len(x),), int(share * _BUCKETS), device=x.device)
             at = partial(self.velocity, steps=steps, context=read, state=state, ids=ids, kept=kept)
-            if guide is None:
-                x = x + at(x) / self.num_steps
-                continue
             found, pull = guide.pull(partial(_estimate, at, share), x, share)
             x = x + (found - x) / (self.num_steps - step) + pull / self.num_steps
-        return x if guide is None else guide.freeze(x)
+        return guide.freeze(x)
+
+    def observe(self, context: Context, states: Tensor, ids: Tensor) -> dict[str, Tensor]:
+        """What every integration step needs: the state's token, and those between it and the
+        actions (``before``), the blocks' keys and values of the context, masks, and the weights of
+        the embodiments ``ids`` ``(B,)`` int64.
+        """
+        read = self.read(context)
+        before = self.encode_states(states, ids)
+        if self.future_tokens is not None:
+            future = self.future_tokens.weight.to(before.dtype)
+            before = torch.cat([before, future.expand(len(before), -1, -1)], dim=1)
+        found = {"before": before}
+        for pair, mask in enumerate(self._masks(read)):
+            kept = self.dit.blocks[2 * pair].attention.keep(read.features)
+            assert kept.key is not None
+            assert kept.value is not None
+            found |= {f"key.{pair}": kept.key, f"value.{pair}": kept.value}
+            if mask is not None:
+                free = torch.zeros(mask.shape, dtype=kept.key.dtype, device=mask.device)
+                found[f"mask.{pair}"] = free.masked_fill(~mask, float("-inf"))
+        for part, names in _CHOSEN.items():
+            module = self.get_submodule(part)
+            for name in names:
+                weight, bias = module.get_submodule(name).chosen(ids)
+                found |= {f"{part}.{name}.weight": weight, f"{part}.{name}.bias": bias}
+        return found
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
+        pairs = len(self.dit.blocks) // 2
+        kept = [Kept(seen[f"key.{pair}"], seen[f"value.{pair}"]) for pair in range(pairs)]
+        masks = [seen.get(f"mask.{pair}") for pair in range(pairs)]
+        encode, decode = (
+            {n: (seen[f"{part}.{n}.weight"], seen[f"{part}.{n}.bias"]) for n in _CHOSEN[part]}
+            for part in ("action_encoder", "action_decoder")
+        )
+        x, count = noise, noise.shape[1]
+        for step in range(self.num_steps):
+            actions = self.action_encoder.of(x, tables["waves"][step], encode)
+            actions = actions + self.positions.weight[:count].to(actions.dtype)
+            joined = torch.cat([seen["before"], actions], dim=1)
+            found = self.dit.step(joined, tables, step, kept, masks)
+            x = x + self.action_decoder.of(found[:, -count:], decode) / self.num_steps
+        return x
+
+    def step_tables(self) -> dict[str, Tensor]:
+        """``waves`` ``(K, W)``, and what ``DiT.step_tables`` has: of the times of all steps."""
+        shares = [int(step / self.num_steps * _BUCKETS) for step in range(self.num_steps)]
+        steps = torch.tensor(shares).to(self.positions.weight.device)
+        return {"waves": self.action_encoder.waves(steps), **self.dit.step_tables(steps)}
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""

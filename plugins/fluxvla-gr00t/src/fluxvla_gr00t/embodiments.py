@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+Chosen = tuple[Tensor, Tensor]
+"""Weights and biases of the samples' embodiments."""
 
 
 class EmbodimentLinear(nn.Module):
@@ -19,7 +23,17 @@ class EmbodimentLinear(nn.Module):
 
     def forward(self, x: Tensor, ids: Tensor) -> Tensor:
         """``x`` ``(B, T, in)`` with the weights of ``ids`` ``(B,)`` int64 -> ``(B, T, out)``."""
-        return torch.bmm(x, self.weight[ids]) + self.bias[ids].unsqueeze(1)
+        return applied(x, self.chosen(ids))
+
+    def chosen(self, ids: Tensor) -> Chosen:
+        """The weights ``(B, in, out)`` and biases ``(B, 1, out)`` of ``ids`` ``(B,)``."""
+        return self.weight[ids], self.bias[ids].unsqueeze(1)
+
+
+def applied(x: Tensor, chosen: Chosen) -> Tensor:
+    """``x`` ``(B, T, in)`` -> ``(B, T, out)``."""
+    weight, bias = chosen
+    return torch.bmm(x, weight) + bias
 
 
 class EmbodimentMLP(nn.Module):
@@ -32,7 +46,11 @@ class EmbodimentMLP(nn.Module):
 
     def forward(self, x: Tensor, ids: Tensor) -> Tensor:
         """``x`` ``(B, T, in)``, ``ids`` ``(B,)`` -> ``(B, T, out)``."""
-        return self.out(functional.relu(self.hidden(x, ids)), ids)
+        return self.of(x, {"hidden": self.hidden.chosen(ids), "out": self.out.chosen(ids)})
+
+    def of(self, x: Tensor, chosen: Mapping[str, Chosen]) -> Tensor:
+        """As ``forward``, with weights that were chosen before."""
+        return applied(functional.relu(applied(x, chosen["hidden"])), chosen["out"])
 
 
 class ActionEncoder(nn.Module):
@@ -47,12 +65,17 @@ class ActionEncoder(nn.Module):
 
     def forward(self, actions: Tensor, steps: Tensor, ids: Tensor) -> Tensor:
         """``actions`` ``(B, T, D)``, ``steps`` and ``ids`` ``(B,)`` int64 -> ``(B, T, W)``."""
-        tokens = self.actions(actions, ids)
-        waves = self._waves(steps).to(tokens.dtype)[:, None].expand_as(tokens)
-        hidden = functional.silu(self.joined(torch.cat([tokens, waves], dim=-1), ids))
-        return self.out(hidden, ids)
+        chosen = {name: part.chosen(ids) for name, part in self.named_children()}
+        return self.of(actions, self.waves(steps)[:, None], chosen)
 
-    def _waves(self, steps: Tensor) -> Tensor:
+    def of(self, actions: Tensor, waves: Tensor, chosen: Mapping[str, Chosen]) -> Tensor:
+        """As ``forward``, with weights and ``waves``, broadcast to tokens, from before."""
+        tokens = applied(actions, chosen["actions"])
+        joined = torch.cat([tokens, waves.to(tokens.dtype).expand_as(tokens)], dim=-1)
+        return applied(functional.silu(applied(joined, chosen["joined"])), chosen["out"])
+
+    def waves(self, steps: Tensor) -> Tensor:
+        """What stands for the time steps ``(B,)``: ``(B, W)`` float32."""
         half = self.width // 2
         powers = torch.arange(half, device=steps.device, dtype=torch.float32)
         angles = steps[:, None].float() * torch.exp(-powers * (math.log(10000.0) / half))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_gr00t.robots import n15_robot, n17_robot
+from fluxvla_gr00t.robots import fewer_cameras, n15_robot, n17_robot
 from fluxvla_gr00t.tables import (
     checkpoint,
     model_table,
@@ -54,9 +54,23 @@ class GR00TN15Format(CheckpointFormat):
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.
         """
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same of one robot, or with fewer pictures: NVIDIA's takes as many as there are.
+
+        Args:
+            robot: its embodiment tag.
+        """
         file = folder / "config.json"
         config = read_json(file, dict[str, Any], CheckpointError)
-        robot = n15_robot(folder)
+        chosen = fewer_cameras(n15_robot(folder, robot), absent, str(folder))
         settings = _Settings(config.get("action_head_cfg"), str(file))
         backbone = _Settings(config.get("backbone_cfg"), str(file))
         if backbone.get("project_to_dim") is not None:
@@ -69,9 +83,9 @@ class GR00TN15Format(CheckpointFormat):
             "action_dim": settings.count("action_dim"),
             "future_tokens": settings.count("num_target_vision_tokens"),
         }
-        model = model_table("n1.5", head, robot, backbone.count("select_layer"))
-        transforms = n15_transforms(model, robot, tokenizer)
-        return checkpoint("n1.5", safetensors_in(folder), model, transforms, robot, str(folder))
+        model = model_table("n1.5", head, chosen, backbone.count("select_layer"))
+        transforms = n15_transforms(model, chosen, tokenizer)
+        return checkpoint("n1.5", safetensors_in(folder), model, transforms, chosen, str(folder))
 
 
 class GR00TN17Format(CheckpointFormat):
@@ -94,6 +108,20 @@ class GR00TN17Format(CheckpointFormat):
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.
         """
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same of one robot, or with fewer pictures: NVIDIA's takes as many as there are.
+
+        Args:
+            robot: its embodiment tag.
+        """
         file = folder / "config.json"
         settings = _Settings(read_json(file, dict[str, Any], CheckpointError), str(file))
         processing = folder / "processor_config.json"
@@ -101,7 +129,7 @@ class GR00TN17Format(CheckpointFormat):
         if processing.is_file():
             content = read_json(processing, dict[str, Any], CheckpointError)
             kwargs = _Settings(content.get("processor_kwargs"), str(processing)).values
-        robot = n17_robot(folder, kwargs)
+        chosen = fewer_cameras(n17_robot(folder, kwargs, robot), absent, str(folder))
         alternate = settings.get("use_alternate_vl_dit", True)
         head = {
             **_head(settings),
@@ -112,18 +140,18 @@ class GR00TN17Format(CheckpointFormat):
             else None,
             "state_dropout": float(settings.get("state_dropout_prob", 0.0)),
         }
-        model = model_table("n1.7", head, robot, settings.count("select_layer"))
+        model = model_table("n1.7", head, chosen, settings.count("select_layer"))
         both = {**settings.values, **kwargs}
         _Settings(both, str(processing)).square("image_target_size")
         transforms = n17_transforms(
             model,
-            robot,
+            chosen,
             tokenizer,
             resize_table(both),
             bool(kwargs.get("formalize_language", True)),
             bool(kwargs.get("clip_outliers", True)),
         )
-        return checkpoint("n1.7", safetensors_in(folder), model, transforms, robot, str(folder))
+        return checkpoint("n1.7", safetensors_in(folder), model, transforms, chosen, str(folder))
 
 
 class _Settings:

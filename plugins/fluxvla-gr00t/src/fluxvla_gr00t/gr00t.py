@@ -102,10 +102,39 @@ class GR00T(VLA, nn.Module):
                 see ``fluxvla_models.guidance.Guide``.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        if guide is None:
+            seen = self.observe(images, lang_tokens, lang_masks, states, img_masks, embodiment_ids)
+            return self.denoise(seen, noise, self.step_tables())
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
-        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
         return self.vla_head.sample(context, states, ids, noise, guide)
+
+    def observe(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        img_masks: Tensor | None = None,
+        embodiment_ids: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """What the steps need of an observation, arguments as of ``predict_action``.
+
+        It checks the places of pictures and the embodiments on the host.
+        """
+        context = self._context(images, lang_tokens, lang_masks, img_masks)
+        return self.vla_head.observe(context, states, self._ids(states, embodiment_ids))
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``."""
+        return self.vla_head.denoise(seen, noise, tables)
+
+    def step_tables(self) -> Mapping[str, Tensor]:
+        """See ``GR00TActionHead.step_tables``."""
+        return self.vla_head.step_tables()
 
     @property
     def action_shape(self) -> tuple[int, int]:

@@ -7,7 +7,7 @@ robot in ``policy_preprocessor.json``, and statistics as ``feature.statistic`` i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 from fluxvla_models.lerobot_files import POSTPROCESSOR, PREPROCESSOR, Step, read_steps, whole
 
 from fluxvla_core.errors import CheckpointError, FluxError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, chosen_robot, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_gr00t.robots import GRIPPER, Robot, flat_robot, grouped_robot
+from fluxvla_gr00t.lerobot_write import write
+from fluxvla_gr00t.robots import GRIPPER, Robot, fewer_cameras, flat_robot, grouped_robot
 from fluxvla_gr00t.tables import (
     checkpoint,
     model_table,
@@ -28,6 +29,23 @@ from fluxvla_gr00t.tables import (
 
 PACKS = {"groot_pack_inputs_v3": "n1.5", "groot_n1_7_pack_inputs_v1": "n1.7"}
 """The step that packs inputs -> the version."""
+_BEFORE = {
+    "rename_observations_processor",
+    "to_batch_processor",
+    "relative_actions_processor",
+    *PACKS,
+    "groot_eagle_encode_v3",
+    "groot_eagle_collate_v3",
+    "groot_n1_7_vlm_encode_v1",
+    "device_processor",
+}
+_AFTER = {
+    "groot_action_unpack_unnormalize_v1",
+    "groot_action_unpack_unnormalize_v2",
+    "groot_n1_7_action_decode_v1",
+    "absolute_actions_processor",
+    "device_processor",
+}
 HEADS: dict[str, dict[str, Any]] = {
     "n1.5": {"type": "GR00TActionHead", "horizon": 16},
     "n1.7": {
@@ -67,10 +85,21 @@ class LeRobotGR00TFormat(CheckpointFormat):
         Raises:
             CheckpointError: it is damaged, or has steps that are not LeRobot's for GR00T.
         """
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same with fewer pictures: LeRobot takes as many as there are."""
+        chosen_robot((), robot, str(folder / _PRE))
         config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
         steps, packing, version = _preprocessor(folder)
         pack = packing.config
-        robot = _robot(folder, packing, config)
+        chosen = fewer_cameras(_robot(folder, steps, packing, config), absent, str(folder))
         head = {
             **HEADS[version],
             "action_dim": _count(pack, "max_action_dim", folder / _PRE),
@@ -78,27 +107,41 @@ class LeRobotGR00TFormat(CheckpointFormat):
         }
         if config.get("num_inference_timesteps") is not None:
             head["num_steps"] = _count(config, "num_inference_timesteps", folder / "config.json")
-        model = model_table(version, head, robot)
+        model = model_table(version, head, chosen)
         if version == "n1.5":
-            transforms = n15_transforms(model, robot, tokenizer)
+            if pack.get("formalize_language"):
+                raise CheckpointError(
+                    "formalize_language is True; False is known here for N1.5",
+                    where=str(folder / _PRE),
+                )
+            transforms = n15_transforms(model, chosen, tokenizer)
         else:
             encoding = steps.get("groot_n1_7_vlm_encode_v1")
             encode = {} if encoding is None else encoding.config
             transforms = n17_transforms(
                 model,
-                robot,
+                chosen,
                 tokenizer,
                 resize_table(encode),
                 bool(pack.get("formalize_language", True)),
                 bool(pack.get("clip_outliers", True)),
             )
         stored = {n.removeprefix(_PREFIX): t for n, t in safetensors_in(folder).items()}
-        return checkpoint(version, stored, model, transforms, robot, str(folder))
+        return checkpoint(version, stored, model, transforms, chosen, str(folder))
+
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write it as LeRobot saves it: N1.7 as by its version 0.6, N1.5 as by 0.4.
+
+        Raises:
+            CheckpointError: its sizes are not the published ones, or LeRobot's processors cannot
+                do what its transforms do.
+        """
+        write(checkpoint, folder, HEADS)
 
 
 def _preprocessor(folder: Path) -> tuple[dict[str, Step], Step, str]:
     """All steps by their names, the one that packs inputs, and the version that it is of."""
-    steps = {step.name: step for step in read_steps(folder, PREPROCESSOR)}
+    steps = {step.name: step for step in read_steps(folder, PREPROCESSOR, _BEFORE)}
     found = [name for name in PACKS if name in steps]
     if len(found) != 1:
         raise CheckpointError(
@@ -110,7 +153,9 @@ def _preprocessor(folder: Path) -> tuple[dict[str, Step], Step, str]:
     return steps, steps[found[0]], PACKS[found[0]]
 
 
-def _robot(folder: Path, packing: Step, config: Mapping[str, Any]) -> Robot:
+def _robot(
+    folder: Path, steps: Mapping[str, Step], packing: Step, config: Mapping[str, Any]
+) -> Robot:
     """The robot, without statistics where something is done to its actions that is not here."""
     where = str(folder / _PRE)
     pack = packing.config
@@ -119,7 +164,13 @@ def _robot(folder: Path, packing: Step, config: Mapping[str, Any]) -> Robot:
     number = numbers.get(tag, 0) if isinstance(numbers, dict) else None
     if not isinstance(tag, str) or not isinstance(number, int):
         raise CheckpointError("embodiment_mapping: no number for embodiment_tag", where=where)
-    post = {step.name: step.config for step in read_steps(folder, POSTPROCESSOR)}
+    if not pack.get("normalize_min_max", True):
+        raise CheckpointError(
+            "normalize_min_max is False; states and actions that are not normalised are not known "
+            "here",
+            where=where,
+        )
+    post = {step.name: step.config for step in read_steps(folder, POSTPROCESSOR, _AFTER)}
     grouped = "groot_n1_7_action_decode_v1"
     if grouped in post and pack.get("raw_stats") and pack.get("modality_config"):
         settings = {
@@ -133,11 +184,15 @@ def _robot(folder: Path, packing: Step, config: Mapping[str, Any]) -> Robot:
         robot = flat_robot(tag, number, found, where)
     trained = pack.get("valid_action_horizon")
     horizon = trained if isinstance(trained, int) else robot.horizon
-    robot = replace(robot, img_keys=_cameras(config, pack), horizon=horizon)
+    seen = _policy_names(steps, where)
+    cameras = tuple(seen.get(name, name) for name in _cameras(config, pack))
+    robot = replace(robot, img_keys=cameras, horizon=horizon)
     changed = ("libero_gripper_action", "action_decode_transform")
     if any(step.get(name) for step in post.values() for name in changed):
         return replace(robot, statistics={}, notes=(GRIPPER,))
-    if "absolute_actions_processor" in post:
+    before = {name: step.config for name, step in steps.items()}
+    relative = ("relative_actions_processor", before), ("absolute_actions_processor", post)
+    if any(name in found and found[name].get("enabled", True) for name, found in relative):
         return replace(robot, statistics={}, notes=(*robot.notes, _RELATIVE))
     return robot
 
@@ -146,6 +201,18 @@ _RELATIVE = (
     "LeRobot counts its actions from the state by a step of its own, which is not done here: it "
     "can be trained on, and drives no robot"
 )
+
+
+def _policy_names(steps: Mapping[str, Step], where: str) -> dict[str, str]:
+    """The policy's name of a camera -> the robot's, where LeRobot renames it."""
+    step = steps.get("rename_observations_processor")
+    renamed = {} if step is None else step.config.get("rename_map") or {}
+    if not isinstance(renamed, dict) or not all(isinstance(n, str) for n in renamed.values()):
+        raise CheckpointError(f"rename_map is {renamed!r}, no table of names", where=where)
+    return {
+        policy.removeprefix(_IMAGES): robot.removeprefix(_IMAGES)
+        for robot, policy in renamed.items()
+    }
 
 
 def _cameras(config: Mapping[str, Any], pack: Mapping[str, Any]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from transformers import Qwen3VLConfig, Qwen3VLModel
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import has_values
 from fluxvla_gr00t.context import Context
 from fluxvla_gr00t.places import check_tokens, seen_places
 
@@ -132,6 +133,10 @@ class Qwen3VLBackbone(nn.Module):
         where, mask = seen_places(
             lang_tokens, lang_masks, img_masks, self.picture_token, count, places
         )
+        if not has_values(images) and not any(p.requires_grad for p in self.parameters()):
+            # transformers places pictures by the values of tokens; of what is frozen the shape will
+            # do where there are none.
+            return Context(images.new_empty((*lang_tokens.shape, self.out_dim)), mask, where)
         pictures = images.unflatten(1, (count, 3)).flatten(0, 1)
         patches = pictures_to_patches(pictures, self.patch_size, self.merge)
         grid = torch.tensor([[1, height // self.patch_size, width // self.patch_size]])

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import chosen_robot, without_cameras
 from fluxvla_core.results import read_json
 
 N15_EMBODIMENTS = {
@@ -59,17 +60,19 @@ class Robot:
     notes: tuple[str, ...] = ()
 
 
-def n15_robot(folder: Path) -> Robot:
-    """The robot of a checkpoint of N1.5.
+def n15_robot(folder: Path, wanted: str | None = None) -> Robot:
+    """The robot of a checkpoint of N1.5: the one with the tag ``wanted``, or the only one.
 
     Raises:
         CheckpointError: a file is damaged, or its robot has no number.
+        UsageError: there is no robot ``wanted``.
     """
     file = folder / "experiment_cfg" / "metadata.json"
     if not file.is_file():
+        chosen_robot((), wanted, str(file))
         return Robot(notes=(_NO_STATISTICS,))
     tags = read_json(file, dict[str, Any], CheckpointError)
-    tag = _chosen(tags)
+    tag = _chosen(tags, wanted, str(file))
     if tag is None:
         return Robot(notes=(_several(tags),))
     where = str(file)
@@ -100,19 +103,24 @@ def n15_robot(folder: Path) -> Robot:
     )
 
 
-def n17_robot(folder: Path, settings: Mapping[str, Any]) -> Robot:
-    """The robot of a checkpoint of N1.7, whose ``processor_kwargs`` are ``settings``.
+def n17_robot(folder: Path, settings: Mapping[str, Any], wanted: str | None = None) -> Robot:
+    """The robot of a checkpoint of N1.7: the one with the tag ``wanted``, or the only one.
+
+    Args:
+        settings: its ``processor_kwargs``.
 
     Raises:
         CheckpointError: a file is damaged, or its robot has no number or no statistics.
+        UsageError: there is no robot ``wanted``.
     """
     where = str(folder / "processor_config.json")
     configs = _table(settings, "modality_configs", where)
     file = folder / "statistics.json"
     if not file.is_file() or not configs:
+        chosen_robot((), wanted, where)
         return Robot(notes=(_NO_STATISTICS,))
     known = read_json(file, dict[str, Any], CheckpointError)
-    tag = _chosen(configs)
+    tag = _chosen(configs, wanted, where)
     if tag is None:
         return Robot(notes=(_several(configs),))
     ids = read_json(folder / "embodiment_id.json", dict[str, Any], CheckpointError)
@@ -202,6 +210,17 @@ def flat_robot(tag: str, number: int, values: Mapping[str, Any], where: str) -> 
     return replace(robot, statistics=widened)
 
 
+def fewer_cameras(robot: Robot, absent: Sequence[str], where: str) -> Robot:
+    """``robot`` without the cameras ``absent``.
+
+    Raises:
+        UsageError: there are no such cameras, or none is left.
+    """
+    return replace(
+        robot, img_keys=without_cameras(robot.img_keys, absent, where) if absent else robot.img_keys
+    )
+
+
 GRIPPER = (
     "its gripper's actions are 0 to 1, and those of LIBERO's simulator 1 to -1, to which they are "
     "not converted here: it can be trained on, and drives no robot"
@@ -211,16 +230,15 @@ _NO_STATISTICS = "it has no statistics of a robot: it can be trained on, and dri
 
 def _several(tags: Mapping[str, Any]) -> str:
     return (
-        f"it knows several robots ({', '.join(sorted(tags))}), of which none is chosen: it can be "
-        "trained on, and drives none"
+        f"it knows several robots ({', '.join(sorted(tags))}): choose one by --robot NAME; as it "
+        "is, it can be trained on, and drives none"
     )
 
 
-def _chosen(tags: Mapping[str, Any]) -> str | None:
-    """The only robot, or the one that somebody has fine-tuned for."""
-    if len(tags) == 1:
-        return next(iter(tags))
-    return _OWN if _OWN in tags else None
+def _chosen(tags: Mapping[str, Any], wanted: str | None, where: str) -> str | None:
+    """The robot ``wanted``, the only one, or the one that somebody has fine-tuned for."""
+    chosen = chosen_robot(tags, wanted, where)
+    return _OWN if chosen is None and _OWN in tags else chosen
 
 
 def _refusal(

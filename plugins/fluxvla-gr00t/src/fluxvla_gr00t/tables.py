@@ -170,4 +170,5 @@ def _normalize(model: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
         "state_dim": model["vla_head"]["state_dim"],
         "action_dim": model["vla_head"]["action_dim"],
         "norm_type": robot.norm_type,
+        "epsilon_if_zero": True,
     }

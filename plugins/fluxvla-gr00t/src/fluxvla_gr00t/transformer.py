@@ -9,6 +9,7 @@ models, whose weights are of use with these alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +45,8 @@ class Attention(nn.Module):
     def forward(
         self, x: Tensor, context: Tensor, mask: Tensor | None = None, kept: Kept | None = None
     ) -> Tensor:
-        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it.
+        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it. Numbers are
+        added to the scores.
 
         ``kept``: keys and values of this same context from before; it is filled if it is empty.
         """
@@ -58,6 +60,10 @@ class Attention(nn.Module):
         seen = None if mask is None else mask[:, None, None, :]
         mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=seen)
         return self.out(mixed.transpose(1, 2).flatten(2))
+
+    def keep(self, context: Tensor) -> Kept:
+        """Keys and values of ``context`` ``(B, L, C)``."""
+        return Kept(self._heads(self.key(context)), self._heads(self.value(context)))
 
     def _heads(self, made: Tensor) -> Tensor:
         return made.unflatten(-1, (self.heads, -1)).transpose(1, 2)
@@ -98,17 +104,29 @@ class DiTBlock(nn.Module):
     def forward(
         self,
         x: Tensor,
-        time: Tensor,
+        time: Tensor | None,
         context: Tensor | None = None,
         mask: Tensor | None = None,
         kept: Kept | None = None,
+        modulation: Tensor | None = None,
     ) -> Tensor:
-        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``."""
-        scale, shift = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
+        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``.
+
+        ``modulation`` ``(2 * W,)``: scale and shift, instead of ``time``, where all samples share
+        it.
+        """
+        if modulation is None:
+            assert time is not None
+            modulation = self.modulation(time)[:, None]
+        scale, shift = modulation.chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
         attended = self.attention(normal, normal if context is None else context, mask, kept)
         x = x + self.dropout(self.dropout(attended))
         return x + self.feed_forward(functional.layer_norm(x, x.shape[-1:], eps=1e-5))
+
+    def modulation(self, time: Tensor) -> Tensor:
+        """``(B, W)`` -> scale and shift ``(B, 2 * W)``."""
+        return self.modulate(functional.silu(time))
 
 
 class ContextBlock(nn.Module):
@@ -191,6 +209,43 @@ class DiT(nn.Module):
             else:
                 pair = layer // 2
                 x = block(x, time, context, masks[pair], None if kept is None else kept[pair])
-        shift, scale = self.modulate(functional.silu(time))[:, None].chunk(2, dim=-1)
+        return self._out(x, self.modulate(functional.silu(time))[:, None])
+
+    def step_tables(self, steps: Tensor) -> dict[str, Tensor]:
+        """What follows from the times ``steps`` ``(K,)`` of all integration steps.
+
+        ``blocks`` ``(layers, K, 2 * W)``: scale and shift of each block; ``last`` ``(K, 2 * W)``.
+        """
+        time = self.time(steps)
+        return {
+            "blocks": torch.stack([block.modulation(time) for block in self.blocks]),
+            "last": self.modulate(functional.silu(time)),
+        }
+
+    def step(
+        self,
+        x: Tensor,
+        tables: Mapping[str, Tensor],
+        number: int,
+        kept: list[Kept],
+        masks: list[Tensor | None],
+    ) -> Tensor:
+        """As ``forward`` in integration step ``number`` of those that ``tables`` is for.
+
+        Args:
+            kept: for each even block its keys and values of the context.
+            masks: for each even block ``(B, L)``, what is added to its scores; None: nothing.
+        """
+        for layer, block in enumerate(self.blocks):
+            modulation = tables["blocks"][layer, number]
+            if layer % 2:
+                x = block(x, None, modulation=modulation)
+            else:
+                pair = layer // 2
+                x = block(x, None, None, masks[pair], kept[pair], modulation)
+        return self._out(x, tables["last"][number])
+
+    def _out(self, x: Tensor, modulation: Tensor) -> Tensor:
+        shift, scale = modulation.chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-6)
         return self.out(normal * (1 + scale) + shift)

@@ -63,7 +63,7 @@ def is_picture(array: npt.NDArray[Any]) -> bool:
 
 
 def pictures(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
-    """Those parts that are pictures."""
+    """The parts that are images."""
     return {name: array for name, array in found.items() if is_picture(array)}
 
 

@@ -255,7 +255,7 @@ class LiberoEnvironment(MujocoEnvironment):
         }
 
     def state_hash(self) -> str:
-        """Of positions and velocities; equal for equal episodes."""
+        """Hash of positions and velocities; equal for equal episodes."""
         return self.scene.state_hash()
 
     def close(self) -> None:

@@ -32,7 +32,8 @@ class LiberoEvalRunner(EvalRunner):
         context: what the run knows (injected): work dir, reporter.
         seed: of the policy; trial ``n`` uses ``seed + n``.
         ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
-        model_family: for the record only.
+        model_family: no effect; upstream FluxVLA's configs have it, and it is written to
+            ``results.json``.
         task_suite_name: libero_spatial, _object, _goal, _10, _90, or one of LIBERO-PRO's.
         tasks: which of the suite's, by index or name; all by default.
         dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.

@@ -36,7 +36,7 @@ _SMOOTH = 0.8  # how much of the noise stays from one step to the next
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where the gripper should be.
+    """Target pose of the gripper.
 
     Args:
         position: ``(3,)`` m, in the world.

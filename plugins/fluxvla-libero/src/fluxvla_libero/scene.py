@@ -88,7 +88,7 @@ class LiberoScene:
 
     @functools.cached_property
     def _built(self) -> dict[str, Array]:
-        """Where everything stands by the model's file, before anything was placed: there each of
+        """Positions from the model's file, before anything was placed: there each of
         LIBERO's own resets begins, because it builds the model again."""
         with quiet():
             from robosuite.utils.binding_utils import MjSim
@@ -162,7 +162,7 @@ class LiberoScene:
         return np.ascontiguousarray(upright[:, ::-1])
 
     def state_hash(self) -> str:
-        """Of positions and velocities; equal for equal episodes."""
+        """Hash of positions and velocities; equal for equal episodes."""
         data = self.data
         return hashlib.sha256(data.qpos.tobytes() + data.qvel.tobytes()).hexdigest()[:16]
 

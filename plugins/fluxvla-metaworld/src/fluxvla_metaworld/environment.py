@@ -157,7 +157,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
         }
 
     def state_hash(self) -> str:
-        """Of positions and velocities; equal for equal episodes."""
+        """Hash of positions and velocities; equal for equal episodes."""
         data = self._env.data
         return hashlib.sha256(data.qpos.tobytes() + data.qvel.tobytes()).hexdigest()[:16]
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA
-from fluxvla_models.resnet import ResNet
+from fluxvla_core.models import VLA, PartWeights
+from fluxvla_models.resnet import ResNet, published
 from fluxvla_models.transformer import Decoder, Encoder, positions_1d, positions_2d
 
 
@@ -29,6 +29,8 @@ class ACT(VLA, nn.Module):
         num_cameras: pictures per sample, all seen by the same network.
         backbone, backbone_norm, backbone_width: see ``ResNet``. ``frozen_batch`` is meant for
             weights trained on ImageNet; ``group`` for training from nothing.
+        backbone_weights: a file with torchvision's weights of ``backbone``, that a training starts
+            from; nothing is fetched.
         dim_model, n_heads, dim_feedforward, feedforward_activation, pre_norm, dropout,
         n_encoder_layers, n_decoder_layers: of the transformer. The authors' code uses one decoder
             layer, whatever it is asked for.
@@ -50,6 +52,7 @@ class ACT(VLA, nn.Module):
         backbone: str = "resnet18",
         backbone_norm: str = "frozen_batch",
         backbone_width: int = 64,
+        backbone_weights: str | None = None,
         dim_model: int = 512,
         n_heads: int = 8,
         dim_feedforward: int = 3200,
@@ -88,6 +91,9 @@ class ACT(VLA, nn.Module):
             self.vae_encoder_action_input_proj = nn.Linear(action_dim, dim_model)
             self.vae_encoder_latent_output_proj = nn.Linear(dim_model, 2 * latent_dim)
         self.backbone = ResNet(backbone, backbone_norm, backbone_width)
+        self.part_weights: tuple[PartWeights, ...] = ()
+        if backbone_weights is not None:
+            self.part_weights = (published(backbone_weights, ["backbone."], backbone_norm),)
         self.encoder = Encoder(n_encoder_layers, *size, **more)
         self.decoder = Decoder(n_decoder_layers, *size, **more)
         self.encoder_robot_state_input_proj = nn.Linear(state_dim, dim_model)

@@ -98,9 +98,21 @@ class CompactVLA(VLA, nn.Module):
                 see ``guidance.Guide``.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
-        context = self._context(images, lang_tokens, lang_masks, states)
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
+        context = self._context(images, lang_tokens, lang_masks, states)
         return self.vla_head.sample(context, noise, guide)
+
+    def observe(
+        self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor, states: Tensor
+    ) -> dict[str, Tensor]:
+        """What the steps need of an observation: ``context`` ``(B, C)``."""
+        return {"context": self._context(images, lang_tokens, lang_masks, states)}
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps of the head: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``."""
+        return self.vla_head.sample(seen["context"], noise, None)
 
     @property
     def action_shape(self) -> tuple[int, int]:

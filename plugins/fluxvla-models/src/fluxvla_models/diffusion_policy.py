@@ -14,10 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA
+from fluxvla_core.models import VLA, PartWeights
 from fluxvla_models.conditional_unet import ConditionalUNet
 from fluxvla_models.diffusion_schedule import DiffusionSchedule
 from fluxvla_models.keypoint_encoder import KeypointEncoder
+from fluxvla_models.resnet import published
 
 
 class DiffusionPolicy(VLA, nn.Module):
@@ -35,6 +36,8 @@ class DiffusionPolicy(VLA, nn.Module):
             nor runners of FluxVLA give a model observations of earlier moments.
         backbone, backbone_norm, backbone_width: see ``ResNet``. ``batch`` is for checkpoints that
             were trained so; their statistics stay as they are.
+        backbone_weights: a file with torchvision's weights of ``backbone``, that every encoder of a
+            training starts from; nothing is fetched.
         separate_encoders: each camera has its own encoder.
         keypoints: of each encoder. resize_shape, crop_shape: see ``KeypointEncoder``.
         down_dims, kernel_size, n_groups, diffusion_step_embed_dim, use_film_scale_modulation: see
@@ -59,6 +62,7 @@ class DiffusionPolicy(VLA, nn.Module):
         backbone: str = "resnet18",
         backbone_norm: str = "group",
         backbone_width: int = 64,
+        backbone_weights: str | None = None,
         separate_encoders: bool = False,
         keypoints: int = 32,
         resize_shape: Sequence[int] | None = None,
@@ -106,6 +110,10 @@ class DiffusionPolicy(VLA, nn.Module):
             )
             for _ in range(num_cameras if separate_encoders else 1)
         )
+        self.part_weights: tuple[PartWeights, ...] = ()
+        if backbone_weights is not None:
+            inside = [f"rgb_encoders.{i}.backbone." for i in range(len(self.rgb_encoders))]
+            self.part_weights = (published(backbone_weights, inside, backbone_norm),)
         seen = state_dim + 2 * keypoints * num_cameras
         self.unet = ConditionalUNet(
             action_dim,

@@ -2,7 +2,7 @@
 
 Black, Galliker and Levine 2025 (arXiv 2506.07339, equations 2 to 4), after Pokle et al. 2023
 (pseudoinverse guidance, PiGDM): with ``A1`` the estimate of the clean chunk at time ``t``, ``Y``
-the old chunk and ``W`` how much each of its keyframes counts, the velocity gets besides
+the old chunk and ``W`` how much each of its actions counts, the velocity gets besides
 
     min(beta, (1 - t) / (t r^2)) * (Y - A1)^T diag(W) dA1/dA,    r^2 = (1 - t)^2 / (t^2 + (1 - t)^2)
 

@@ -7,12 +7,14 @@ of steps, each with its settings; a step's tensors are in a safetensors file nex
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
+from safetensors.torch import save_file
 from torch import Tensor
 
 from fluxvla_core.errors import CheckpointError
@@ -70,6 +72,23 @@ def read_steps(folder: Path, stem: str, known: Collection[str] | None = None) ->
             raise CheckpointError(f"{name}: config is no table", where=where)
         steps.append(Step(name, config, _state(folder, step.get("state_file"), where)))
     return steps
+
+
+def write_steps(
+    folder: Path,
+    stem: str,
+    steps: Iterable[tuple[str, Mapping[str, Any], Mapping[str, Tensor]]],
+) -> None:
+    """Write a processor into ``folder``: of each step its name, its settings and its state."""
+    listed = []
+    for number, (name, config, tensors) in enumerate(steps):
+        step: dict[str, Any] = {"registry_name": name, "config": dict(config)}
+        if tensors:
+            step["state_file"] = f"{stem}_step_{number}_{name}{_SUFFIX}"
+            save_file(dict(tensors), folder / step["state_file"])
+        listed.append(step)
+    text = json.dumps({"name": stem, "steps": listed}, indent=2)
+    (folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
 
 
 def whole(stored: Stored | Tensor) -> Tensor:

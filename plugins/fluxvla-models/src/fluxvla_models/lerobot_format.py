@@ -13,6 +13,7 @@ from fluxvla_core.results import read_json
 from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from fluxvla_models.lerobot_statistics import read_normalization, tables
+from fluxvla_models.lerobot_write import write_act, write_diffusion
 
 
 class _LeRobotFormat(CheckpointFormat):
@@ -74,6 +75,14 @@ class LeRobotACT(_LeRobotFormat):
     model_types = ("ACT",)
     our_name = staticmethod(act_name)
 
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write it as LeRobot 0.6 saves a policy with its processors.
+
+        Raises:
+            CheckpointError: LeRobot's ACT or its processors cannot do what it does.
+        """
+        write_act(checkpoint, folder)
+
     def horizon(self, config: Mapping[str, Any]) -> int:
         return _count(config, "chunk_size")
 
@@ -119,6 +128,14 @@ class LeRobotDiffusion(_LeRobotFormat):
     model_types = ("DiffusionPolicy",)
     our_name = staticmethod(diffusion_name)
 
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write it as LeRobot 0.6 saves a policy with its processors.
+
+        Raises:
+            CheckpointError: LeRobot's policy or its processors cannot do what it does.
+        """
+        write_diffusion(checkpoint, folder)
+
     def horizon(self, config: Mapping[str, Any]) -> int:
         return _count(config, "horizon")
 
@@ -132,7 +149,8 @@ class LeRobotDiffusion(_LeRobotFormat):
                 where=where,
                 cause="a policy here is asked with the present observation alone, and so are "
                 "models trained",
-                next="train one with n_obs_steps=1",
+                next="train one with n_obs_steps=1, or let it act in LeRobot's own code: "
+                "policy = dict(type='LeRobotPolicy', path=FOLDER), of fluxvla-lerobot",
             )
         return super().read(folder, tokenizer)
 

@@ -19,7 +19,9 @@ _NETWORK = {
     "7": "layer4",
 }
 """Places in LeRobot's sequence of a residual network's parts (2 and 3 have no weights)."""
+_PLACES = {part: place for place, part in _NETWORK.items()}
 _BACKBONE = re.compile(r"^(rgb_encoders\.\d+\.backbone\.)(\d+)\.")
+_OWN_BACKBONE = re.compile(r"^(rgb_encoders\.\d+\.backbone\.)(\w+)\.")
 
 
 def act_name(name: str) -> str | None:
@@ -42,3 +44,18 @@ def diffusion_name(name: str) -> str | None:
     if place is None or place[2] not in _NETWORK:
         return ours
     return f"{place[1]}{_NETWORK[place[2]]}.{ours[place.end() :]}"
+
+
+def published_act_name(name: str) -> str:
+    """``encoder.…`` -> ``model.encoder.…``: of our ``name`` LeRobot's."""
+    return f"model.{name}"
+
+
+def published_diffusion_name(name: str, separate: bool) -> str:
+    """Of our ``name`` LeRobot's; ``separate``: each camera has its own encoder."""
+    part = _OWN_BACKBONE.match(name)
+    if part is not None and part[2] in _PLACES:
+        name = f"{part[1]}{_PLACES[part[2]]}.{name[part.end() :]}"
+    if not separate:
+        name = re.sub(r"^rgb_encoders\.0\.", "rgb_encoder.", name)
+    return f"diffusion.{re.sub(r'^rgb_encoders', 'rgb_encoder', name)}"

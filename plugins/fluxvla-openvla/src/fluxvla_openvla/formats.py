@@ -12,8 +12,14 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, Stored, safetensors_in
+from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    Stored,
+    chosen_robot,
+    safetensors_in,
+)
 from fluxvla_openvla.folder import (
     BACKBONE,
     NATIVE,
@@ -64,11 +70,35 @@ class OpenVLAFormat(CheckpointFormat):
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         """The checkpoint in ``folder``; nothing is read of safetensors before it is used."""
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same by the statistics of the dataset ``robot``, which OpenVLA calls unnorm_key.
+
+        Raises:
+            UsageError: there are none of it, or cameras are said to be absent: the authors' code
+                knows no such model.
+        """
+        if absent:
+            raise UsageError(
+                f"--camera {absent[0]}=none: OpenVLA needs the pictures of all cameras that it was "
+                "trained with",
+                next="give it another camera's: --camera THEIRS=OURS",
+            )
         config, sidecar = read_config(folder) or {}, read_sidecar(folder)
         native = is_native(folder, config)
         check_config(config, folder)
         statistics = read_statistics(folder, config)
-        dataset, chosen = choose_statistics(statistics, sidecar.get("unnorm_key"), folder)
+        chosen_robot(statistics, robot, str(folder))
+        dataset, chosen = choose_statistics(
+            statistics, sidecar.get("unnorm_key") if robot is None else robot, folder
+        )
         parts = read_parts(folder)
         base = _native(folder / NATIVE) if native else _hugging_face(folder, _VISION in parts)
         tensors: dict[str, Any] = dict(base)
@@ -268,8 +298,7 @@ def _notes(
     if dataset is None:
         notes.append(
             f"there are statistics of {len(statistics)} datasets: {', '.join(sorted(statistics))}; "
-            f'choose one by {{"unnorm_key": NAME}} in {SIDECAR} of the source, or where the policy '
-            "acts by statistic_name"
+            "choose one by --robot NAME, or where the policy acts by statistic_name"
         )
     else:
         notes.append(f"actions are scaled by the statistics of {dataset!r}")

@@ -28,6 +28,8 @@ class OpenVLA(Prismatic):
         image_size: pixels of a picture's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         predict_stop_token: learn the token after the actions too, as OpenVLA does.
+        freeze_vision_backbone: do not train the towers that see.
+        freeze_llm_backbone: do not train the language model.
         pretrained_name_or_path: a folder that a training starts from, as published or of FluxVLA.
 
     Raises:
@@ -42,11 +44,14 @@ class OpenVLA(Prismatic):
         siglip: Mapping[str, Any] | TowerSize | None = None,
         language: Mapping[str, Any] | LanguageSize | None = None,
         predict_stop_token: bool = True,
+        freeze_vision_backbone: bool = False,
+        freeze_llm_backbone: bool = False,
         pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__(1, action_dim, 1, image_size, dino, siglip, language, use_film=False)
         self.pretrained_name_or_path = pretrained_name_or_path
         self.predict_stop_token = predict_stop_token
+        self.freeze(freeze_vision_backbone, freeze_llm_backbone)
         self.action_tokens = ActionTokens(self.size.text_vocab_size)
 
     def forward(

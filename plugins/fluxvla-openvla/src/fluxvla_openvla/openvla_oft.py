@@ -24,9 +24,7 @@ from fluxvla_openvla.heads import (
 )
 from fluxvla_openvla.language import Prompt, hidden_states
 from fluxvla_openvla.prismatic import Prismatic
-from fluxvla_openvla.sizes import LanguageSize, TowerSize
-
-HEADS = ("l1", "diffusion")
+from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize
 
 
 class OpenVLAOFT(Prismatic):
@@ -44,6 +42,8 @@ class OpenVLAOFT(Prismatic):
         image_size: pixels of a picture's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         num_train_steps, num_inference_steps: of the diffusion, in training and acting.
+        freeze_vision_backbone: do not train the towers that see.
+        freeze_llm_backbone: do not train the language model.
         pretrained_name_or_path: a folder that a training starts from, as published or of FluxVLA;
             ``fluxvla openvla-oft`` makes one of OpenVLA's.
 
@@ -65,6 +65,8 @@ class OpenVLAOFT(Prismatic):
         language: Mapping[str, Any] | LanguageSize | None = None,
         num_train_steps: int = 50,
         num_inference_steps: int = 50,
+        freeze_vision_backbone: bool = False,
+        freeze_llm_backbone: bool = False,
         pretrained_name_or_path: str | None = None,
     ) -> None:
         if head not in HEADS:
@@ -88,6 +90,7 @@ class OpenVLAOFT(Prismatic):
         else:
             self.action_head = DiffusionHead(width, action_dim)
             self.noisy_action_projector = StateProjector(1, width)
+        self.freeze(freeze_vision_backbone, freeze_llm_backbone)
         # Tokens are not predicted; the weights stay so that published files have a place.
         self.language_model.lm_head.requires_grad_(False)
 

@@ -69,6 +69,13 @@ class Prismatic(VLA, nn.Module):
         self.projector = Projector(self.vision_backbone.width, width)
         self.language_model = make_llama(self.size)
 
+    def freeze(self, vision: bool, language: bool) -> None:
+        """Do not train the two towers, or the language model; the projector is trained."""
+        if vision:
+            self.vision_backbone.requires_grad_(False)
+        if language:
+            self.language_model.requires_grad_(False)
+
     @property
     def action_shape(self) -> tuple[int, int]:
         """``(T, D)`` of a chunk."""

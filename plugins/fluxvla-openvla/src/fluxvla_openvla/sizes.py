@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 from fluxvla_core.errors import ConfigError
 
 Size = TypeVar("Size")
+HEADS = ("l1", "diffusion")
+"""The action heads of OpenVLA-OFT."""
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,18 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor, nn
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core import build_vla_from_cfg
 from fluxvla_core.errors import UsageError
-from fluxvla_core.models import ForeignCheckpoint
 from fluxvla_openvla.folder import PLATFORMS, Platform
-from fluxvla_openvla.formats import OpenVLAFormat, transforms
-from fluxvla_openvla.openvla_oft import HEADS
+from fluxvla_openvla.sizes import HEADS
+
+if TYPE_CHECKING:  # fluxvla openvla-oft --help needs no torch
+    import torch
+    from torch import Tensor, nn
+
+    from fluxvla_core.models import ForeignCheckpoint
 
 _FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
 _FRESH = ("action_head", "proprio_projector", "noisy_action_projector")
@@ -48,6 +49,8 @@ class StartOFT:
 
     def run(self, args: argparse.Namespace) -> int:
         """Make the folder."""
+        from fluxvla_openvla.formats import OpenVLAFormat
+
         origin, target = Path(args.source), Path(args.folder)
         if target.exists():
             raise UsageError(f"there is something at {target} already")
@@ -80,6 +83,8 @@ class StartOFT:
 
 def _write(started: ForeignCheckpoint, origin: Path, target: Path) -> None:
     """Write aside and rename, so that there is all of ``target`` or nothing."""
+    from fluxvla_openvla.formats import OpenVLAFormat
+
     aside = target.with_name(f"{target.name}.partial")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
@@ -113,6 +118,12 @@ def with_new_parts(
     Raises:
         UsageError: ``source`` is not OpenVLA.
     """
+    import torch
+    from torch import nn
+
+    from fluxvla_core.models import ForeignCheckpoint
+    from fluxvla_openvla.formats import transforms
+
     if source.model["type"] != "OpenVLA":
         raise UsageError(f"the source is {source.model['type']} already; train on from it directly")
     kept = {key: source.model[key] for key in _SIZES if key in source.model}
@@ -155,6 +166,9 @@ def _is_fresh(name: str) -> bool:
 
 def _drawn(module: nn.Linear | nn.LayerNorm, generator: torch.Generator) -> dict[str, Tensor]:
     """torch's own first weights: uniform up to 1/sqrt(inputs) for layers, 1 and 0 for norms."""
+    import torch
+    from torch import nn
+
     shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
     if isinstance(module, nn.LayerNorm):
         made = {"weight": torch.ones(shapes["weight"]), "bias": torch.zeros(shapes["bias"])}

@@ -14,12 +14,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
+from fluxvla_models.folded_attention import folded_mask
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA
+from fluxvla_pi.acting import Seen, expert_step, seen_of
 from fluxvla_pi.gemma import GemmaDecoder, Rope, rope_of
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, siglip_size
@@ -263,11 +265,14 @@ class PiFlowMatching(VLA, nn.Module):
                 it out. With ``prefix_conditioning`` ``prefix_len`` rows are held, the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
+        own = None if self.prefix_conditioning else self.ori_action_dim
+        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
+        if guide is None:
+            seen = self.observe(images, lang_tokens, lang_masks, states, img_masks)
+            return self.denoise(seen, noise, self.step_tables())
         self._check(noise, "noise")
         prefix = self.embed_prefix(images, img_masks, lang_tokens, lang_masks)
         known = self._keys_and_values(prefix)
-        own = None if self.prefix_conditioning else self.ori_action_dim
-        guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         held = guide if self.prefix_conditioning else None
 
         def velocity(x: Tensor, tau: Tensor) -> Tensor:
@@ -279,6 +284,61 @@ class PiFlowMatching(VLA, nn.Module):
         if held is not None:
             return held.freeze(sample(velocity, noise, self.num_steps))
         return sample(velocity, noise, self.num_steps, guide)
+
+    def observe(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+        img_masks: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """What the steps need of an observation, arguments as of ``predict_action``: ``Seen``."""
+        prefix = self.embed_prefix(images, img_masks, lang_tokens, lang_masks)
+        known = self._keys_and_values(prefix, folded=True)
+        own = self.attended(states.device)
+        places = torch.arange(own.shape[1], device=states.device)
+        rope = self._rope(prefix.real.long().sum(1, keepdim=True) + places)
+        groups = self.llm_expert.layers[0].groups
+        state = self.state_tokens(states)
+        return seen_of(known, prefix.real, own, rope, groups, state).to_tensors()
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
+        self._check(noise, "noise")
+        shared, x = Seen.of(seen, len(self.llm_expert.layers)), noise
+        for step in range(self.num_steps):
+            hidden = self.tokens_at(x, shared, tables, step)
+            normed = expert_step(self.llm_expert, hidden, shared, tables, step)
+            x = x - self._out(normed) / self.num_steps
+        return x
+
+    @property
+    def observe_is_capturable(self) -> bool:
+        """It reads nothing back to the host."""
+        return True
+
+    def exact_modules(self) -> list[nn.Module]:
+        """The velocity is not rounded to bf16."""
+        return [self.action_out_proj]
+
+    @abstractmethod
+    def step_tables(self) -> dict[str, Tensor]:
+        """What follows from the times of the steps and the weights."""
+
+    @abstractmethod
+    def tokens_at(self, x: Tensor, seen: Seen, tables: Mapping[str, Tensor], step: int) -> Tensor:
+        """The expert's tokens ``(B, S, W)`` for noisy actions ``x`` ``(B, T, D)`` in a step."""
+
+    @abstractmethod
+    def attended(self, device: torch.device) -> Tensor:
+        """``(R, S)`` bool: which of the expert's tokens each attends to; one row if all alike."""
+
+    def state_tokens(self, states: Tensor) -> Tensor | None:
+        """``(B, S)`` -> ``(B, 1, W)``; None where the state stands in the prompt."""
+        return None
 
     def embed_prefix(
         self,
@@ -312,11 +372,13 @@ class PiFlowMatching(VLA, nn.Module):
             x, _, _ = expert(x, own_rope, own_mask, keys, values, suffix.condition)
         return self._project(x, suffix)
 
-    def _keys_and_values(self, prefix: Prefix) -> list[tuple[Tensor, Tensor]]:
-        """Those of every layer of the language model."""
+    def _keys_and_values(self, prefix: Prefix, folded: bool = False) -> list[tuple[Tensor, Tensor]]:
+        """Those of every layer of the language model; ``folded``: see ``GemmaLayer``."""
         seen, rope, known = prefix.hidden, self._rope(prefix.rope_positions), []
+        groups = self.llm_backbone.layers[0].groups
+        mask = folded_mask(prefix.mask, groups, seen.dtype) if folded else prefix.mask
         for layer in self.llm_backbone.layers:
-            seen, keys, values = layer(seen, rope, prefix.mask)
+            seen, keys, values = layer(seen, rope, mask, folded=folded)
             known.append((keys, values))
         return known
 
@@ -338,6 +400,9 @@ class PiFlowMatching(VLA, nn.Module):
 
     def _project(self, hidden: Tensor, suffix: Suffix) -> Tensor:
         hidden, _ = self.llm_expert.norm(hidden, suffix.condition)
+        return self._out(hidden)
+
+    def _out(self, hidden: Tensor) -> Tensor:
         # The velocity is summed up over the steps, so it is not rounded to bf16 but where sharding
         # gathers the weights so.
         last = hidden[:, -self.n_action_steps :].to(self.action_out_proj.weight.dtype)

@@ -9,6 +9,7 @@ with no need to compute the first again for each denoising step.
 from __future__ import annotations
 
 import torch
+from fluxvla_models.folded_attention import folded_attention
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -27,7 +28,9 @@ class RMSNorm(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(width))
 
-    def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+    def forward(
+        self, x: Tensor, condition: Tensor | None = None, modulation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         """``x`` normalised, and no gate."""
         return (_unit(x) * (1.0 + self.weight.float())).to(x.dtype), None
 
@@ -44,12 +47,26 @@ class AdaRMSNorm(nn.Module):
         nn.init.zeros_(self.dense.weight)
         nn.init.zeros_(self.dense.bias)
 
-    def forward(self, x: Tensor, condition: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """``x`` ``(B, L, W)`` by ``condition`` ``(B, W)`` or ``(B, L, W)``, and the gate."""
-        assert condition is not None
-        scale, shift, gate = self.dense(condition).float().chunk(3, dim=-1)
-        if condition.ndim == 2:
-            scale, shift, gate = (part[:, None] for part in (scale, shift, gate))
+    def modulation(self, condition: Tensor) -> Tensor:
+        """``(..., W)`` -> ``(..., 3 * W)`` float32: scale, shift and gate."""
+        return self.dense(condition).float()
+
+    def forward(
+        self, x: Tensor, condition: Tensor | None = None, modulation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """``x`` ``(B, L, W)`` normalised, and the gate.
+
+        Args:
+            condition: ``(B, W)`` or ``(B, L, W)``.
+            modulation: ``(3 * W,)``, what :meth:`modulation` gave of a condition that all tokens
+                share, instead of it.
+        """
+        if modulation is None:
+            assert condition is not None
+            modulation = self.modulation(condition)
+            if condition.ndim == 2:
+                modulation = modulation[:, None]
+        scale, shift, gate = modulation.chunk(3, dim=-1)
         return (_unit(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
 
@@ -112,6 +129,8 @@ class GemmaLayer(nn.Module):
         keys: Tensor | None = None,
         values: Tensor | None = None,
         condition: Tensor | None = None,
+        modulations: tuple[Tensor, Tensor] | None = None,
+        folded: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The layer's answer ``(B, L, W)``, and its keys ``(B, kv_heads, L, D)`` and values.
 
@@ -124,8 +143,12 @@ class GemmaLayer(nn.Module):
             mask: ``(B, 1, L or 1, M + L)`` bool: what is attended to, ``keys`` first.
             keys, values: another layer's, of M tokens.
             condition: ``(B, W)`` or ``(B, L, W)`` for adaptive normalisation.
+            modulations: of both normalisations, instead of ``condition``: see ``AdaRMSNorm``.
+            folded: without copies of keys and values; ``mask`` is then one of
+                ``fluxvla_models.folded_attention``.
         """
-        normed, gate = self.input_layernorm(x, condition)
+        first, second = (None, None) if modulations is None else modulations
+        normed, gate = self.input_layernorm(x, condition, first)
         attention = self.self_attn
         own_keys = rotate(self._heads(attention.k_proj(normed)), rope)
         own_values = attention.v_proj(normed)
@@ -134,14 +157,18 @@ class GemmaLayer(nn.Module):
         query = rotate(self._heads(attention.q_proj(normed)), rope)
         every_key = own_keys if keys is None else torch.cat([keys, own_keys], dim=2)
         every_value = own_values if values is None else torch.cat([values, own_values], dim=1)
-        attended = functional.scaled_dot_product_attention(
-            query,
-            every_key.repeat_interleave(self.groups, dim=1),
-            self._heads(every_value).repeat_interleave(self.groups, dim=1),
-            attn_mask=mask,
-        )
+        heads = self._heads(every_value)
+        if folded:
+            attended = folded_attention(query, every_key, heads, mask)
+        else:
+            attended = functional.scaled_dot_product_attention(
+                query,
+                every_key.repeat_interleave(self.groups, dim=1),
+                heads.repeat_interleave(self.groups, dim=1),
+                attn_mask=mask,
+            )
         x = _add(x, attention.o_proj(attended.transpose(1, 2).flatten(2)), gate)
-        normed, gate = self.post_attention_layernorm(x, condition)
+        normed, gate = self.post_attention_layernorm(x, condition, second)
         return _add(x, self.mlp(normed), gate), own_keys, own_values
 
     def _heads(self, x: Tensor) -> Tensor:

@@ -14,7 +14,13 @@ from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, 
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    chosen_robot,
+    safetensors_in,
+    without_cameras,
+)
 from fluxvla_core.results import read_json
 from fluxvla_pi.lerobot_processors import (
     KEYS,
@@ -51,7 +57,18 @@ class LeRobotPiFormat(CheckpointFormat):
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         """The checkpoint in ``folder``; see ``CheckpointFormat``."""
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same without some of its cameras: LeRobot masks those that are missing."""
         where = str(folder / CONFIG)
+        chosen_robot((), robot, where)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
         for key, value in _FIXED.items():
             if config.get(key, value) != value:
@@ -89,7 +106,7 @@ class LeRobotPiFormat(CheckpointFormat):
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=_cameras(inputs, where),
+            img_keys=without_cameras(_cameras(inputs, where), absent, where),
             transforms=_transforms(model, preparation, size, tokenizer),
             statistics={"private": _statistics(preparation, widths)},
             horizon=horizon,

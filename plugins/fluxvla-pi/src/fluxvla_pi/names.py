@@ -1,7 +1,8 @@
 """Names of tensors in published files, and ours.
 
-Three layouts of the same weights are in use: openpi's PyTorch files, LeRobot's, which puts
-``model.`` in front, and transformers' ``PI0ForConditionalGeneration``. Their differences:
+Layouts of the same weights are in use: openpi's PyTorch files, LeRobot's, which puts ``model.`` in
+front, and those of transformers' ``PI0ForConditionalGeneration``, which has other names when it is
+saved. Their differences:
 
 * the embedding of words is ``embed_tokens`` (transformers), or ``lm_head`` (openpi, whose tied
   weights are saved once), or both (LeRobot, which unties them; ``embed_tokens`` is what it uses);
@@ -86,7 +87,19 @@ TRANSFORMERS = Layout(
     },
     unused=("model.dit.embed_tokens.weight", "lm_head.weight"),
 )
+TRANSFORMERS_SAVED = Layout(
+    {
+        **_tower(f"{_PALIGEMMA}model.vision_tower.vision_model."),
+        "projector.": f"{_PALIGEMMA}model.multi_modal_projector.linear.",
+        "llm_backbone.": f"{_PALIGEMMA}model.language_model.model.",
+        "llm_expert.": f"{_EXPERT}model.",
+    },
+    unused=(f"{_EXPERT}lm_head.weight",),
+    tower="vision_model.",
+)
+"""What transformers 5.23 makes of its names when it saves: nearly openpi's."""
 _BEGINNINGS = {
+    f"{_PALIGEMMA}model.language_model.model.": TRANSFORMERS_SAVED,
     "model.paligemma_with_expert.": LEROBOT,
     "paligemma_with_expert.": OPENPI,
     "model.vlm.": TRANSFORMERS,

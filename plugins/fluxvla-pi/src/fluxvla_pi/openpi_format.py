@@ -17,7 +17,12 @@ import numpy as np
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    chosen_robot,
+    without_cameras,
+)
 from fluxvla_core.results import read_json
 from fluxvla_pi.names import OPENPI
 from fluxvla_pi.published import FAMILIES, weights_in
@@ -46,16 +51,24 @@ class OpenPiFormat(CheckpointFormat):
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         """The checkpoint in ``folder``; see ``CheckpointFormat``."""
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same of one robot, or without some of its cameras: openpi masks missing ones."""
+        assets = folder / "assets"
+        files = {f.parent.relative_to(assets).as_posix(): f for f in _statistics_files(folder)}
+        chosen = chosen_robot(files, robot, str(assets))
+        cameras = without_cameras(CAMERAS, absent, str(folder))
         weights = weights_in(folder)
-        files = _statistics_files(folder)
-        if len(files) > 1:
-            listed = ", ".join(file.parent.name for file in files)
-            raise CheckpointError(
-                f"there are statistics of several robots: {listed}",
-                where=str(folder / "assets"),
-                next="keep the folder of yours only",
-            )
-        statistics, cut = _statistics(files[0], weights.family)
+        statistics, cut = {}, False
+        if chosen is not None:
+            statistics, cut = _statistics(files[chosen], weights.family)
         horizon, known = _horizon(folder)
         model = {**weights.model, "n_action_steps": horizon}
         notes = [
@@ -64,6 +77,11 @@ class OpenPiFormat(CheckpointFormat):
             "PI0.5 is made with the state (discrete_state_input)",
             f"cameras are openpi's: --camera {CAMERAS[0]}=NAME",
         ]
+        if chosen is None:
+            notes.append(
+                f"there are statistics of several robots ({', '.join(files)}): choose one by "
+                "--robot NAME; as it is, it can be trained on, and drives none"
+            )
         if not known:
             notes.append(f"config.json tells no action_horizon: chunks of {HORIZON} are assumed")
         if cut:
@@ -73,8 +91,10 @@ class OpenPiFormat(CheckpointFormat):
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=CAMERAS,
-            transforms=_transforms(weights.family, model, tokenizer or TOKENIZER),
+            img_keys=cameras,
+            transforms=()
+            if chosen is None
+            else _transforms(weights.family, model, tokenizer or TOKENIZER),
             statistics={"private": statistics},
             horizon=horizon,
             notes=notes,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fluxvla_pi.acting import Seen, times_of
 from fluxvla_pi.flow_matching import PiFlowMatching, Suffix, time_features
 
 
@@ -56,10 +57,33 @@ class PI0FlowMatching(PiFlowMatching):
         actions = self.action_in_proj(x)
         times = time_features(tau, actions.shape[-1])
         if tau.ndim == 1:
-            times = times[:, None].expand_as(actions)
-        joined = torch.cat([actions, times.to(actions.dtype)], dim=-1)
-        actions = self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))
-        hidden = torch.cat([self.state_proj(states)[:, None], actions], dim=1)
+            times = times[:, None]
+        hidden = torch.cat([self.state_tokens(states), self._told(actions, times)], dim=1)
         blocks = torch.ones(hidden.shape[1], dtype=torch.long, device=x.device)
         blocks[0] = 0
         return Suffix(hidden, None, blocks)
+
+    def step_tables(self) -> dict[str, Tensor]:
+        """``times`` ``(K, W)``: what stands for the time in every step."""
+        taus = times_of(self.num_steps, self.action_time_mlp_in.weight.device)
+        return {"times": time_features(taus, self.llm_expert.size.width)}
+
+    def tokens_at(self, x: Tensor, seen: Seen, tables: Mapping[str, Tensor], step: int) -> Tensor:
+        """The state's token, and actions that know the time."""
+        assert seen.state is not None
+        actions = self._told(self.action_in_proj(x), tables["times"][step])
+        return torch.cat([seen.state, actions], dim=1)
+
+    def attended(self, device: torch.device) -> Tensor:
+        """A row a token: the state does not attend to the actions."""
+        places = torch.arange(self.n_action_steps + 1, device=device)
+        return (places[:, None] > 0) | (places == 0)
+
+    def state_tokens(self, states: Tensor) -> Tensor:
+        """``(B, S)`` -> ``(B, 1, W)``."""
+        return self.state_proj(states)[:, None]
+
+    def _told(self, actions: Tensor, times: Tensor) -> Tensor:
+        """``(B, T, W)`` told the time, ``times`` being broadcast to them."""
+        joined = torch.cat([actions, times.to(actions.dtype).expand_as(actions)], dim=-1)
+        return self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))

@@ -79,7 +79,7 @@ def clamp_css(episode: Episode) -> str:
 
 
 def clamp_note(episode: Episode) -> str:
-    """Whose commands a limit changed, and what that means."""
+    """Text: which joints' commands a limit changed, and what that means."""
     counts = {joint.name: len(joint.clamped) for joint in episode.joints if joint.clamped}
     if not counts:
         return ""
@@ -233,7 +233,7 @@ def _ticks(times: Sequence[float], along: Axis, css: str) -> str:
 
 
 def budget_chart(rows: Sequence[StageTime], *, title: str) -> str:
-    """For each stage three bars over one another: median, 95 % and 99 %, in ms."""
+    """Latency by stage as HTML: bars of the median, 95 % and 99 %, in ms."""
     most = max((row.p99 for row in rows if math.isfinite(row.p99)), default=0.0) or 1.0
     drawn = [Row("", "", ("median", "95 %", "99 %"))]
     for row in rows:

@@ -274,7 +274,7 @@ def _evaluation(evaluation: Evaluation, sources: VideoSources) -> dict[str, Any]
 
 
 def compared(evaluation: Evaluation) -> list[list[Video]]:
-    """For each task one video of each group, in the groups' order, where there are several."""
+    """Videos side by side: for each task one of each group, if there are several groups."""
     rows = []
     for task in dict.fromkeys(v.task for v in evaluation.videos if v.group):
         here = [v for v in evaluation.videos if v.task == task]

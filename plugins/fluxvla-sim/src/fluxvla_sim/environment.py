@@ -122,7 +122,7 @@ class SimEnvironment(MujocoEnvironment):
         }
 
     def state_hash(self) -> str:
-        """Of all positions; equal for equal episodes."""
+        """Hash of all positions; equal for equal episodes."""
         positions: Any = self.scene.data.qpos
         return hashlib.sha256(positions.tobytes()).hexdigest()[:16]
 

@@ -21,7 +21,7 @@ class SimEvalRunner(EvalRunner):
         seed: of each task's first episode; the others count up from it.
         swap_seed: of the first episode with the other task's instruction; by default these repeat
             the policy's own seeds, so that right and wrong instructions are compared pair by pair.
-        replan_every: how many keyframes of a chunk are used before the policy is queried again.
+        replan_every: how many actions of a chunk are executed before the policy is queried again.
         max_steps: control steps (20 ms) after which an episode ends, if later than by itself.
         render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
         video_height, video_width, video_fps: of the videos.

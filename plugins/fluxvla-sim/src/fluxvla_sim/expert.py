@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Place(Protocol):
-    """Where an expert acts: a ``SimEnvironment``, or a ``SimOperator`` that is connected."""
+    """The simulation an expert acts in: a ``SimEnvironment``, or a connected ``SimOperator``."""
 
     robot: SimRobot
     world: SimWorld
@@ -66,7 +66,7 @@ class SimExpert(Policy):
 
     @property
     def embodiment(self) -> EmbodimentSpec | None:
-        """Of the robot that it acts with; None before ``enter``."""
+        """The embodiment of the robot that it acts with; None before ``enter``."""
         return None if self._place is None else self._place.robot.embodiment(())
 
     def enter(self, environment: Any) -> None:

@@ -81,7 +81,7 @@ class Renderer:
     def render_with_depth(
         self, data: Any, camera: str, height: int, width: int
     ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-        """As ``render``, and ``(height, width)`` float32 metres of the same drawing.
+        """The image of ``render`` and its depth, ``(height, width)`` float32 metres.
 
         They are along the camera's axis, as depth cameras measure, and NaN where nothing is.
         """

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+from fluxvla_models.folded_attention import folded_mask
 from fluxvla_models.velocity import sinusoids
 from torch import Tensor, nn
 from torch.nn import functional
@@ -42,17 +45,53 @@ class Expert(nn.Module):
 
     def forward(self, x: Tensor, memory: Memory) -> Tensor:
         """Action tokens ``(B, T, width)`` -> the same shape."""
-        count = x.shape[1]
-        places = torch.arange(count, device=x.device)[None]
-        suffix = Suffix(
-            causal=torch.ones(count, count, dtype=torch.bool, device=x.device).tril()[None, None],
-            behind=Rotation.at(memory.length[:, None] + places, self.head_dim),
-            alone=Rotation.at(places, self.head_dim),
-        )
+        suffix = self._suffix(memory, x.shape[1])
         for number, layer in enumerate(self.layers):
             place = number * self.stride
             x = layer(x, memory.keys[place], memory.values[place], memory.seen, suffix)
         return self.norm(x)
+
+    def observe(self, memory: Memory, count: int) -> dict[str, Tensor]:
+        """What does not depend on the ``count`` action tokens, for :meth:`step`: keys and values of
+        every layer, masks and rotations."""
+        suffix = self._suffix(memory, count)
+        groups, dtype = self.layers[0].self_attn.groups, memory.values[0].dtype
+        rows = memory.seen.expand(-1, -1, count, -1)
+        whole = torch.cat([rows, suffix.causal.expand(len(rows), -1, -1, -1)], dim=3)
+        found = {
+            "crossed": folded_mask(memory.seen, groups, dtype),
+            "joined": folded_mask(whole, groups, dtype),
+            "behind.cos": suffix.behind.cos,
+            "behind.sin": suffix.behind.sin,
+            "alone.cos": suffix.alone.cos,
+            "alone.sin": suffix.alone.sin,
+        }
+        for number, layer in enumerate(self.layers):
+            place = number * self.stride
+            keys, values = layer.project(memory.keys[place], memory.values[place])
+            found |= {f"key.{number}": keys, f"value.{number}": values}
+        return found
+
+    def step(self, x: Tensor, seen: Mapping[str, Tensor]) -> Tensor:
+        """As ``forward``, with what :meth:`observe` found."""
+        behind, alone = (
+            Rotation(seen[f"{name}.cos"], seen[f"{name}.sin"]) for name in ("behind", "alone")
+        )
+        suffix = Suffix(seen["joined"], behind, alone)
+        for number, layer in enumerate(self.layers):
+            mask = seen["crossed" if layer.crosses else "joined"]
+            keys, values = seen[f"key.{number}"], seen[f"value.{number}"]
+            x = layer(x, keys, values, mask, suffix, known=True)
+        return self.norm(x)
+
+    def _suffix(self, memory: Memory, count: int) -> Suffix:
+        device = memory.length.device
+        places = torch.arange(count, device=device)[None]
+        return Suffix(
+            causal=torch.ones(count, count, dtype=torch.bool, device=device).tril()[None, None],
+            behind=Rotation.at(memory.length[:, None] + places, self.head_dim),
+            alone=Rotation.at(places, self.head_dim),
+        )
 
 
 class ActionTimeMLP(nn.Module):
@@ -71,9 +110,17 @@ class ActionTimeMLP(nn.Module):
         self.action_time_mlp_out = nn.Linear(width, width)
 
     def forward(self, noisy: Tensor, time: Tensor) -> Tensor:
+        return self.told(noisy, self.waves(time)[:, None])
+
+    def waves(self, time: Tensor) -> Tensor:
+        """What stands for times ``(B,)``: ``(B, width)`` float64."""
+        width = self.action_in_proj.out_features
+        return sinusoids(time, width, self.shortest, self.longest)
+
+    def told(self, noisy: Tensor, waves: Tensor) -> Tensor:
+        """Action tokens of ``noisy``, ``waves`` being broadcast to them."""
         actions = self.action_in_proj(noisy)
-        waves = sinusoids(time, actions.shape[-1], self.shortest, self.longest)
-        joined = torch.cat([actions, waves.to(actions.dtype)[:, None].expand_as(actions)], dim=2)
+        joined = torch.cat([actions, waves.to(actions.dtype).expand_as(actions)], dim=2)
         return self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))
 
 

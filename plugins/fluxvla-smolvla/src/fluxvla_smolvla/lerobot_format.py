@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,7 +11,15 @@ from typing import Any, ClassVar
 from fluxvla_models.lerobot_files import ACTION, BUFFERS, STATE
 
 from fluxvla_core.errors import CheckpointError, FluxError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, Stored, renamed, safetensors_in
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    Stored,
+    chosen_robot,
+    renamed,
+    safetensors_in,
+    without_cameras,
+)
 from fluxvla_core.results import read_json
 from fluxvla_smolvla.keys import published, published_names
 from fluxvla_smolvla.lerobot_processors import (
@@ -65,7 +73,18 @@ class LeRobotSmolVLA(CheckpointFormat):
         Raises:
             CheckpointError: it is damaged, or does something that SmolVLA here does not.
         """
+        return self.read_for(folder, tokenizer)
+
+    def read_for(
+        self,
+        folder: Path,
+        tokenizer: str | None = None,
+        robot: str | None = None,
+        absent: Sequence[str] = (),
+    ) -> ForeignCheckpoint:
+        """The same without some of its cameras: LeRobot leaves out those that are missing."""
         where = str(folder / "config.json")
+        chosen_robot((), robot, where)
         config = Settings(read_json(folder / "config.json", dict[str, Any], CheckpointError), where)
         config.refuse_unsupported()
         stored = safetensors_in(folder)
@@ -87,7 +106,8 @@ class LeRobotSmolVLA(CheckpointFormat):
         steps, executed = config.count("chunk_size", 50), config.count("n_action_steps", 50)
         if executed < steps:
             notes.append(f"LeRobot executes {executed} of its {steps} actions: execute_horizon")
-        cameras, empty = config.cameras(processors.renamed)
+        every, empty = config.cameras(processors.renamed)
+        cameras = without_cameras(every, absent, where)
         model = config.model(vision, text)
         names = published_names(_names(model))
         return ForeignCheckpoint(

@@ -9,6 +9,7 @@ is computed once, however many draws of noise or integration steps follow.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -219,14 +220,58 @@ class SmolVLA(VLA, nn.Module):
             DataError: an input of a width that the model does not have.
         """
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
         own = self.ori_action_dim
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
+        if guide is None:
+            seen = self.observe(images, img_masks, lang_tokens, lang_masks, states)
+            return self.denoise(seen, noise, self.step_tables())
+        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
             return self._velocity(x, t, memory).to(x.dtype)
 
         return sample(velocity, noise, self.num_steps, guide)
+
+    def observe(
+        self,
+        images: Tensor,
+        img_masks: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor,
+    ) -> dict[str, Tensor]:
+        """What the steps need of an observation, arguments as of ``forward``: ``Expert.observe``.
+
+        Raises:
+            DataError: an input of a width that the model does not have.
+        """
+        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
+        return self.expert.observe(memory, self.n_action_steps)
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
+        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        x = noise
+        for step in range(self.num_steps):
+            tokens = self.embed_actions.told(x, tables["times"][step])
+            x = x - self._out(self.expert.step(tokens, seen)).to(x.dtype) / self.num_steps
+        return x
+
+    def step_tables(self) -> dict[str, Tensor]:
+        """``times`` ``(K, W)``: what stands for the time in every step."""
+        times = torch.tensor([1.0 - step / self.num_steps for step in range(self.num_steps)])
+        return {"times": self.embed_actions.waves(times.to(self.state_proj.weight.device))}
+
+    @property
+    def observe_is_capturable(self) -> bool:
+        """It reads nothing back to the host."""
+        return True
+
+    def exact_modules(self) -> list[nn.Module]:
+        """The velocity is computed in fp32."""
+        return [self.action_out_proj]
 
     @property
     def action_shape(self) -> tuple[int, int]:
@@ -263,10 +308,13 @@ class SmolVLA(VLA, nn.Module):
         return self.connector(self.vision(whole))
 
     def _velocity(self, noisy: Tensor, t: Tensor, memory: Memory) -> Tensor:
-        hidden = self.expert(self.embed_actions(noisy, t), memory)
+        return self._out(self.expert(self.embed_actions(noisy, t), memory))
+
+    def _out(self, hidden: Tensor) -> Tensor:
         out = self.action_out_proj
         # The velocity is summed over the steps: it is computed in fp32 whatever the weights are in.
-        with torch.autocast(hidden.device.type, enabled=False):
+        kind = hidden.device.type
+        with nullcontext() if kind == "meta" else torch.autocast(kind, enabled=False):
             return nn.functional.linear(hidden.float(), out.weight.float(), out.bias.float())
 
     def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:

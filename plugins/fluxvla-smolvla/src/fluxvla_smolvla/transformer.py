@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from fluxvla_models.folded_attention import folded_attention
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -94,16 +95,22 @@ class Attention(nn.Module):
         """Two ``(B, L, source)`` -> two ``(B, kv_heads, L, head_dim)``."""
         return self._heads(self.k_proj(key)), self._heads(self.v_proj(value))
 
-    def attend(self, query: Tensor, key: Tensor, value: Tensor, mask: Tensor) -> Tensor:
+    def attend(
+        self, query: Tensor, key: Tensor, value: Tensor, mask: Tensor, folded: bool = False
+    ) -> Tensor:
         """``(B, L, width)``: the answer to each query.
 
         Args:
             query: ``(B, heads, L, head_dim)``.
             key, value: ``(B, kv_heads, S, head_dim)``.
             mask: bool, broadcast to ``(B, heads, L, S)``; True where a query sees a key.
+            folded: ``mask`` is one of ``fluxvla_models.folded_attention``, which is used.
         """
-        key, value = (part.repeat_interleave(self.groups, 1) for part in (key, value))
-        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        if folded:
+            mixed = folded_attention(query, key, value, mask)
+        else:
+            key, value = (part.repeat_interleave(self.groups, 1) for part in (key, value))
+            mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return self.o_proj(mixed.transpose(1, 2).flatten(2))
 
     def _heads(self, x: Tensor) -> Tensor:
@@ -231,21 +238,45 @@ class ExpertLayer(Layer):
         self.crosses = crosses
 
     def forward(
-        self, x: Tensor, keys: Tensor, values: Tensor, seen: Tensor, suffix: Suffix
+        self,
+        x: Tensor,
+        keys: Tensor,
+        values: Tensor,
+        seen: Tensor,
+        suffix: Suffix,
+        known: bool = False,
     ) -> Tensor:
-        """``(B, T, width)`` -> the same shape; the others are one layer of ``Memory``."""
+        """``(B, T, width)`` -> the same shape.
+
+        Args:
+            keys, values, seen: one layer of ``Memory``.
+            suffix: places of the action tokens.
+            known: keys and values are what :meth:`project` made of them, and ``seen`` the whole
+                mask of this kind of layer as ``fluxvla_models.folded_attention`` has it.
+        """
         attention = self.self_attn
         normed = self.input_layernorm(x)
         asked = attention.query(normed)
         if self.crosses:
-            keys, values = attention.key_value(
-                *(part.transpose(1, 2).flatten(2) for part in (keys, values))
-            )
-            answer = attention.attend(suffix.alone.turn(asked), keys, values, seen)
+            if not known:
+                keys, values = self.project(keys, values)
+            answer = attention.attend(suffix.alone.turn(asked), keys, values, seen, known)
             return self._after(x, answer)
         own_keys, own_values = attention.key_value(normed, normed)
         keys = torch.cat([keys, suffix.behind.turn(own_keys)], dim=2)
         values = torch.cat([values, own_values], dim=2)
-        rows = seen.expand(-1, -1, x.shape[1], -1)
-        mask = torch.cat([rows, suffix.causal.expand(len(x), -1, -1, -1)], dim=3)
-        return self._after(x, attention.attend(suffix.behind.turn(asked), keys, values, mask))
+        mask = seen
+        if not known:
+            rows = seen.expand(-1, -1, x.shape[1], -1)
+            mask = torch.cat([rows, suffix.causal.expand(len(x), -1, -1, -1)], dim=3)
+        answer = attention.attend(suffix.behind.turn(asked), keys, values, mask, known)
+        return self._after(x, answer)
+
+    def project(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """The language model's keys and values as this layer attends to them; the same in every
+        denoising step."""
+        if not self.crosses:
+            return keys, values
+        return self.self_attn.key_value(
+            *(part.transpose(1, 2).flatten(2) for part in (keys, values))
+        )

@@ -57,7 +57,7 @@ _STOP_S, _DISCONNECT_S, _SILENT_S = 2.0, 4.0, 0.3
 
 @dataclass(frozen=True)
 class _Reading:
-    """What the controller said last, and when that arrived (monotonic, s)."""
+    """The controller's last message, and when it arrived (monotonic, s)."""
 
     receipt: float
     joints: Array

@@ -1,8 +1,9 @@
-"""A policy's action chunks: checking them, and reading them off at any time.
+"""A policy's action chunks: checking them, and interpolating them at any time.
 
-A chunk holds targets at ``rate_hz`` (10 Hz is common), a robot takes commands at ``control_hz`` (50
-Hz for ALOHA): between two keyframes the motion is linear. Keyframe ``j`` is to be reached
-``(j + 1) / rate_hz`` seconds after the observation; before it, the arm is where ``previous`` says.
+A chunk's actions are targets at ``rate_hz`` (10 Hz is common), a robot takes commands at
+``control_hz`` (50 Hz for ALOHA): between two actions the motion is linear. Action ``j`` is to be
+reached ``(j + 1) / rate_hz`` seconds after the observation; before it, the arm is where
+``previous`` says.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ class Chunk:
     """A policy's answer and what it was an answer to.
 
     Args:
-        keyframes: ``(T, D)`` targets; those that shall be played.
-        rate_hz: keyframes a second.
+        actions: ``(T, D)`` targets; those that shall be played.
+        rate_hz: actions a second.
         observed: when the observation was made, on the loop's clock.
         anchor: ``(D,)`` the command that the arm had then.
     """
 
-    keyframes: Array
+    actions: Array
     rate_hz: float
     observed: float
     anchor: Array
@@ -40,25 +41,25 @@ class Chunk:
     @property
     def seconds(self) -> float:
         """How long it lasts."""
-        return len(self.keyframes) / self.rate_hz
+        return len(self.actions) / self.rate_hz
 
     def reaches(self, elapsed: float) -> bool:
         """Whether it lasts until ``elapsed`` seconds after its beginning."""
-        # One part in a million of a keyframe's time is rounding, not an end.
+        # One part in a million of an action's time is rounding, not an end.
         return elapsed <= self.seconds + 1e-6 / self.rate_hz
 
     def at(self, elapsed: float) -> Array:
         """``(D,)`` where it is after ``elapsed`` seconds; its first or last point outside it.
 
-        As ``keyframes.sample`` has it. That works on the whole chunk, and numpy gives the
-        interpreter up for arrays of that size: a thread that sends would have to get it again.
+        The same as :func:`sample` for one moment. That works on the whole chunk, and numpy releases
+        the GIL for arrays of that size: a thread that sends would have to get it again.
         """
-        count = len(self.keyframes)
+        count = len(self.actions)
         position = min(max(elapsed * self.rate_hz, 0.0), float(count))
         before = min(int(position), max(count - 1, 0))
         share = position - before
-        start = self.keyframes[before - 1] if before else self.anchor
-        end = self.keyframes[before] if before < count else start
+        start = self.actions[before - 1] if before else self.anchor
+        end = self.actions[before] if before < count else start
         point: Array = start * (1.0 - share) + end * share
         return point
 
@@ -66,12 +67,12 @@ class Chunk:
 def interpolate(
     previous: npt.ArrayLike, chunk: npt.ArrayLike, rate_hz: float, control_hz: float
 ) -> Array:
-    """Commands at ``control_hz`` along straight lines from ``previous`` through all keyframes.
+    """Commands at ``control_hz`` along straight lines from ``previous`` through all actions.
 
     Args:
         previous: ``(D,)`` where the arm is commanded to be at the observation.
         chunk: ``(T, D)`` targets, one every ``1 / rate_hz`` seconds.
-        rate_hz: keyframes a second.
+        rate_hz: actions a second.
         control_hz: commands a second.
 
     Returns:
@@ -81,28 +82,28 @@ def interpolate(
     Raises:
         ValueError: shapes do not fit, or a rate is not positive.
     """
-    keyframes = np.asarray(chunk, dtype=np.float64)
+    actions = np.asarray(chunk, dtype=np.float64)
     if rate_hz <= 0 or control_hz <= 0:
         raise ValueError(f"rates must be positive, got {rate_hz} Hz and {control_hz} Hz")
-    if keyframes.ndim != 2:
-        raise ValueError(f"a chunk has shape (T, D), got {keyframes.shape}")
-    # The small term keeps 3 keyframes at 10 Hz from becoming 14 commands at 50 Hz.
-    count = int(np.floor(len(keyframes) * control_hz / rate_hz + 1e-6))
-    count = max(count, min(len(keyframes), 1))
-    return sample(previous, keyframes, rate_hz, (np.arange(count) + 1.0) / control_hz)
+    if actions.ndim != 2:
+        raise ValueError(f"a chunk has shape (T, D), got {actions.shape}")
+    # The small term keeps 3 actions at 10 Hz from becoming 14 commands at 50 Hz.
+    count = int(np.floor(len(actions) * control_hz / rate_hz + 1e-6))
+    count = max(count, min(len(actions), 1))
+    return sample(previous, actions, rate_hz, (np.arange(count) + 1.0) / control_hz)
 
 
 def sample(
     previous: npt.ArrayLike, chunk: npt.ArrayLike, rate_hz: float, elapsed: npt.ArrayLike
 ) -> Array:
-    """Where the lines through ``previous`` and the keyframes are after ``elapsed`` seconds.
+    """Where the lines through ``previous`` and the actions are after ``elapsed`` seconds.
 
-    Before 0 it is ``previous``, after the last keyframe the last keyframe.
+    Before 0 it is ``previous``, after the last action the last action.
 
     Args:
         previous: ``(D,)``.
         chunk: ``(T, D)``.
-        rate_hz: keyframes a second.
+        rate_hz: actions a second.
         elapsed: ``(N,)`` seconds since the observation.
 
     Returns:
@@ -112,17 +113,17 @@ def sample(
         ValueError: shapes do not fit.
     """
     start = np.asarray(previous, dtype=np.float64)
-    keyframes = np.asarray(chunk, dtype=np.float64)
-    if start.ndim != 1 or keyframes.ndim != 2 or keyframes.shape[1] != start.shape[0]:
+    actions = np.asarray(chunk, dtype=np.float64)
+    if start.ndim != 1 or actions.ndim != 2 or actions.shape[1] != start.shape[0]:
         raise ValueError(
             f"previous of shape (D,) and chunk of shape (T, D) are needed, "
-            f"got {start.shape} and {keyframes.shape}"
+            f"got {start.shape} and {actions.shape}"
         )
-    knots = np.concatenate([start[None], keyframes])
-    position = np.clip(np.asarray(elapsed, dtype=np.float64) * rate_hz, 0.0, len(keyframes))
-    before = np.minimum(position.astype(np.int64), max(len(keyframes) - 1, 0))
+    knots = np.concatenate([start[None], actions])
+    position = np.clip(np.asarray(elapsed, dtype=np.float64) * rate_hz, 0.0, len(actions))
+    before = np.minimum(position.astype(np.int64), max(len(actions) - 1, 0))
     share = (position - before)[:, None]
-    after = np.minimum(before + 1, len(keyframes))
+    after = np.minimum(before + 1, len(actions))
     points: Array = knots[before] * (1.0 - share) + knots[after] * share
     return points
 
@@ -138,9 +139,9 @@ def check_chunk(
     Whether the arm gets to its beginning is for ``check_beginning``.
 
     Args:
-        chunk: ``(T, dim)`` keyframes from a policy.
-        embodiment: describes the joints of the keyframes.
-        rate_hz: keyframes a second.
+        chunk: ``(T, dim)`` actions from a policy.
+        embodiment: describes the joints of the actions.
+        rate_hz: actions a second.
         settings: ``jump_s`` and ``excess``.
 
     Returns:
@@ -154,16 +155,16 @@ def check_chunk(
         found = np.asarray(chunk)
         if found.dtype.kind not in "fiu":
             raise TypeError(f"it is a {type(chunk).__name__} of {found.dtype}")
-        keyframes = found.astype(np.float64, copy=False)
+        actions = found.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise BadChunk(f"the policy's chunk is no array of numbers: {error}") from error
     dim = embodiment.dim
-    if keyframes.ndim != 2 or keyframes.shape[1] != dim or len(keyframes) == 0:
+    if actions.ndim != 2 or actions.shape[1] != dim or len(actions) == 0:
         raise BadChunk(
-            f"the policy's chunk has shape {keyframes.shape}; {embodiment.name} takes (T, {dim})"
+            f"the policy's chunk has shape {actions.shape}; {embodiment.name} takes (T, {dim})"
         )
     names = embodiment.joint_names
-    problem = not_finite(keyframes, names)
+    problem = not_finite(actions, names)
     if problem is not None:
         raise BadChunk(
             problem,
@@ -174,55 +175,55 @@ def check_chunk(
     allowed = np.array(
         [settings.excess * (GRIPPER_EXCESS if j.kind == "gripper" else 1.0) for j in joints]
     )
-    excess = np.maximum(lower - keyframes, keyframes - upper) / (upper - lower) / allowed
+    excess = np.maximum(lower - actions, actions - upper) / (upper - lower) / allowed
     row, column = np.unravel_index(np.argmax(excess), excess.shape)
     if excess[row, column] > 1.0:
         joint = joints[column]
         raise BadChunk(
-            f"keyframe {row} wants {joint.name} at {keyframes[row, column]:.4g}, far beyond its "
+            f"action {row} wants {joint.name} at {actions[row, column]:.4g}, far beyond its "
             f"limits [{joint.lower:.4g}, {joint.upper:.4g}] {joint.unit}",
             cause="the policy's units or statistics are not this robot's",
         )
-    _check_jumps(np.clip(keyframes, lower, upper), 1, embodiment, rate_hz, settings)
-    return keyframes
+    _check_jumps(np.clip(actions, lower, upper), 1, embodiment, rate_hz, settings)
+    return actions
 
 
 def check_beginning(
-    keyframes: Array,
+    actions: Array,
     embodiment: EmbodimentSpec,
     last: Array,
     rate_hz: float,
     settings: SafetySettings,
 ) -> None:
-    """Refuse a chunk whose first keyframe is too far from where the arm is commanded to be.
+    """Refuse a chunk whose first action is too far from where the arm is commanded to be.
 
     Args:
-        keyframes: ``(T, dim)`` that ``check_chunk`` let through.
-        embodiment: describes the joints of the keyframes.
+        actions: ``(T, dim)`` that ``check_chunk`` let through.
+        embodiment: describes the joints of the actions.
         last: ``(dim,)`` the command that the arm has now.
-        rate_hz: keyframes a second.
+        rate_hz: actions a second.
         settings: ``jump_s``.
 
     Raises:
         BadChunk: no motion explains the jump.
     """
     lower, upper = np.array([(j.lower, j.upper) for j in embodiment.joints]).T
-    points = np.array([last, np.clip(keyframes[0], lower, upper)])
+    points = np.array([last, np.clip(actions[0], lower, upper)])
     _check_jumps(points, 0, embodiment, rate_hz, settings)
 
 
 def _check_jumps(
     points: Array, first: int, embodiment: EmbodimentSpec, rate_hz: float, settings: SafetySettings
 ) -> None:
-    """Refuse jumps between points ``(N, dim)``; the second one is keyframe ``first``."""
+    """Refuse jumps between points ``(N, dim)``; the second one is action ``first``."""
     moves = np.diff(points, axis=0)
-    # Each keyframe has its own period to move in; jump_s comes on top.
+    # Each action has its own period to move in; jump_s comes on top.
     seconds = np.abs(moves) / np.array([j.slew_rate for j in embodiment.joints]) - 1.0 / rate_hz
     if not (seconds > settings.jump_s).any():
         return
     row, column = np.unravel_index(np.argmax(seconds), seconds.shape)
     raise BadChunk(
-        f"keyframe {row + first} wants {embodiment.joint_names[column]} to jump by "
+        f"action {row + first} wants {embodiment.joint_names[column]} to jump by "
         f"{moves[row, column]:.4g}; at full speed that takes {seconds[row, column]:.2f} s more "
         "than there are",
         cause="the policy is not for the pose that the arm is in, or it diverged",
@@ -237,4 +238,4 @@ def not_finite(chunk: Array, joints: Sequence[str]) -> str | None:
         return None
     row, column = bad[0]
     value = chunk[row, column]
-    return f"the policy's chunk is not finite: keyframe {row}, {joints[column]} is {value}"
+    return f"the policy's chunk is not finite: action {row}, {joints[column]} is {value}"

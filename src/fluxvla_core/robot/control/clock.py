@@ -72,8 +72,8 @@ class Rate:
     the arm for a jump. Two ticks are at least half a period apart, however late the first one was.
 
     Making a command takes a varying time. So ``sleep`` may return ``lead_s`` early; the caller
-    makes the command, then calls ``wait()`` for the deadline itself. In real time no other thread
-    of the interpreter runs during that wait.
+    makes the command, then calls ``wait()`` for the deadline itself. In real time the GIL is held
+    during that wait.
 
     In a lockstep simulation both return at once.
 
@@ -142,10 +142,10 @@ class Rate:
         self.skipped += missed
         deadline += missed * self.period
         if self._keeps:
-            realtime.share_interpreter()
+            realtime.share_gil()
         self.clock.sleep_until(deadline)
         if self._keeps:
-            realtime.keep_interpreter()
+            realtime.hold_gil()
         self._woke = self.clock.now()
         late = max(0.0, self._woke - deadline)
         if not self._waits:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 _LEAST_S = 0.005
 _POLL_S = 0.05
 # A look that comes this much too late shows that the process stood still, if it computed for less
-# than this share of that. While native code computes without giving up the interpreter, looks come
+# than this share of that. While native code computes without releasing the GIL, looks come
 # late as well, but the process is busy: that is not the machine's doing.
 _STALL_S, _BUSY_SHARE = 0.2, 0.25
 
@@ -39,8 +39,8 @@ POLICY = DelaySource(
 )
 MACHINE = DelaySource(
     "this machine",
-    "the process was paused, other programs took the processors, or native code blocked the "
-    "interpreter: neither the robot nor the policy had a chance",
+    "the process was paused, other programs took the processors, or native code held the GIL: "
+    "neither the robot nor the policy had a chance",
     "lighten the load of this machine, or give this process a higher priority",
 )
 
@@ -102,7 +102,7 @@ class DelayMonitor:
         return source, spent[source]
 
     def stood_still(self, since: float) -> float:
-        """For how many seconds since then this process did not run."""
+        """How many seconds since then this process did not run."""
         now = time.monotonic()
         return sum(_overlap(b, e, since, now) for b, e in self._stalls_until(now))
 

@@ -210,7 +210,7 @@ class WorkspaceBox(ActionFilter):
 
 
 def joint_columns(who: str, names: Sequence[str], known: dict[str, int]) -> Columns:
-    """Where in an action the joints called ``names`` are: ``(len(names),)`` indices.
+    """Indices ``(len(names),)`` of the joints called ``names`` in an action.
 
     Raises:
         ConfigError: ``known`` has no such joint; names the nearest.

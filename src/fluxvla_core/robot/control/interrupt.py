@@ -22,11 +22,11 @@ class Interrupted(BaseException):
 
     @property
     def name(self) -> str:
-        """For example ``SIGINT``."""
+        """The signal's name, for example ``SIGINT``."""
         return signal.Signals(self.number).name
 
     def final(self) -> BaseException:
-        """What the command ends with: interrupted (130) by Ctrl-C, else failed (1)."""
+        """The error that ends the command: interrupted (130) after Ctrl-C, else failed (1)."""
         if self.number == signal.SIGINT:
             return KeyboardInterrupt("stopped by Ctrl-C; the robot was stopped")
         return RunFailed(f"stopped by {self.name}; the robot was stopped", reason="stopped")
@@ -84,7 +84,7 @@ class Interrupts:
             raise Interrupted(number)
 
     def resume(self) -> None:
-        """What ``stopping`` was set for is over and the run continues: signals count again.
+        """Handle signals again, after ``stopping`` was set; the run continues.
 
         Raises:
             Interrupted: one came meanwhile.

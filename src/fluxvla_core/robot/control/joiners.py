@@ -31,13 +31,18 @@ SAME_S = 5e-7
 
 
 class Ahead(ABC):
-    """What is known about the motion under way when a policy is asked; it does not change."""
+    """The chunk that is being executed when a policy is asked; immutable."""
 
     @abstractmethod
     def seen_at(self, observed: float, horizon: int) -> Continuation | None:
-        """For a chunk of ``horizon`` keyframes that answers an observation of time ``observed``.
+        """The rest of the current chunk at the times of the next chunk's actions.
 
-        None if what is known ends before the first of them.
+        Args:
+            observed: time of the observation that the next chunk answers.
+            horizon: how many actions the next chunk has.
+
+        Returns:
+            None if the current chunk ends before the next one's first action.
         """
 
 
@@ -149,8 +154,9 @@ class TemporalEnsemble(StreamedJoiner):
 
     Zhao et al. 2023 (ACT, arXiv 2304.13705, section IV-B) ask the policy at every step and give
     the ``i``-th oldest of the predictions for a moment the weight ``exp(-m i)``: the oldest counts
-    most. Here ``i`` is the time between the two observations in keyframes, which is the same number
-    when the policy is asked once a keyframe, and stays right when it is asked less regularly.
+    most. Here ``i`` is the time between the two observations in action periods, which is the same
+    number when the policy is asked once an action period, and stays right when it is asked less
+    regularly.
 
     Args:
         every_s: see ``StreamedJoiner``.
@@ -233,9 +239,9 @@ class Overlap(StreamedJoiner):
 
 
 def soft_mask(horizon: int, frozen: int, known: int, schedule: str = "exp") -> Array:
-    """How much each keyframe of a new chunk has to agree with the old one: ``W``.
+    """How much each action of a new chunk has to agree with the old one: ``W``.
 
-    With ``d`` frozen keyframes and ``k`` that the old chunk reaches (the paper's ``H - s``),
+    With ``d`` frozen actions and ``k`` that the old chunk reaches (the paper's ``H - s``),
     ``c_i = (k - i) / (k - d + 1)`` (the paper's equation 5):
 
         W_i = 1                                 for i < d
@@ -243,7 +249,7 @@ def soft_mask(horizon: int, frozen: int, known: int, schedule: str = "exp") -> A
         W_i = 0                                 for i >= k
 
     Args:
-        horizon: keyframes of the new chunk.
+        horizon: actions of the new chunk.
         frozen: ``d``, at most ``known``.
         known: ``k``, at most ``horizon``.
         schedule: ``exp``, ``linear``, ``ones`` (all that is known) or ``zeros`` (only the frozen).
@@ -278,10 +284,10 @@ class RestOfChunk(Ahead):
         known = sum(chunk.reaches(float(seconds)) for seconds in elapsed)
         if known == 0:
             return None
-        # A command between two keyframes is made of both, so both must be the old chunk's.
+        # A command between two actions is made of both, so both must be the old chunk's.
         frozen = min(max(math.ceil(self.latency_s * chunk.rate_hz - 1e-6), 0), known)
         return Continuation(
-            actions=sample(chunk.anchor, chunk.keyframes, chunk.rate_hz, elapsed),
+            actions=sample(chunk.anchor, chunk.actions, chunk.rate_hz, elapsed),
             weights=soft_mask(horizon, frozen, known, self.schedule),
             frozen=frozen,
             max_guidance_weight=self.max_guidance_weight,
@@ -293,7 +299,7 @@ class RealTime(StreamedJoiner):
 
     Black, Galliker and Levine 2025, "Real-Time Execution of Action Chunking Flow Policies" (arXiv
     2506.07339). While a policy thinks, the arm continues along the old chunk. The first ``d``
-    keyframes of the new one are over when it arrives, so they are fixed to what will have been
+    actions of the new one are over when it arrives, so they are fixed to what will have been
     executed; later ones are drawn to the old chunk the less the later they are; those that the old
     chunk does not reach are free. ``soft_mask`` has the weights, and the policy does the rest
     (``continue_action``).
@@ -303,7 +309,7 @@ class RealTime(StreamedJoiner):
     latencies that were measured, from the observation to the arrival of its chunk in the loop that
     sends. A latency that is longer than any before costs a step at the join, which the limiter
     takes up; it never shifts the motion, because a chunk is played on the time of its observation.
-    The old chunk is played up to the first keyframe of the new one that is not over, where both are
+    The old chunk is played up to the first action of the new one that is not over, where both are
     the same: so the corners of the old one that lie between two times of the new one are not cut.
 
     Args:

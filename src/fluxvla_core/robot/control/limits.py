@@ -53,12 +53,11 @@ it, and that such an arm comes to rest within all limits too. A motion that keep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.robot.control.clamps import Clamp
 from fluxvla_core.robot.control.safety import BadCommand
 from fluxvla_core.robot.control.smoothing import Smoothing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -74,21 +73,6 @@ START_SHARE = 0.05
 START_SLACK = 0.05
 # A command that rounding alone keeps from what was wanted, in the joint's unit, is what was wanted.
 SAME = 1e-13
-
-
-@dataclass(frozen=True)
-class Clamp:
-    """One joint of one command that was not sent as wanted.
-
-    ``reason`` is the first rule that the wanted value breaks: ``position`` (it lies beyond a
-    limit), ``velocity`` (it is too far for one period), ``braking`` (going there, the arm could not
-    stop before a limit), ``acceleration``, or ``jerk``. Values are in the joint's unit.
-    """
-
-    joint: str
-    wanted: float
-    given: float
-    reason: str
 
 
 class CommandLimiter:
@@ -269,7 +253,7 @@ class CommandLimiter:
         return given.copy(), self._clamps(before, target, reachable, raw, given, braked)
 
     def snapshot(self) -> tuple[Array, ...]:
-        """What the next command depends on; for ``restore``."""
+        """The state that the next command depends on; for ``restore``."""
         smoothing = self._smoothing.snapshot()
         return self.last, self._raw.copy(), self._speed.copy(), self._target.copy(), smoothing
 
@@ -406,33 +390,6 @@ class CommandLimiter:
         if bad:
             raise BadCommand(f"{what} is not finite for {', '.join(bad)}")
         return array
-
-
-class PassThrough:
-    """No limits, for actions that are no joint targets: commands are the targets.
-
-    What such an environment does with a value beyond its limits is up to it; it is recorded.
-
-    Args:
-        embodiment: gives the limits that the values are compared with.
-    """
-
-    def __init__(self, embodiment: EmbodimentSpec) -> None:
-        self.embodiment = embodiment
-        self._lower: Array = np.array([joint.lower for joint in embodiment.joints])
-        self._upper: Array = np.array([joint.upper for joint in embodiment.joints])
-
-    def run(self, wanted: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[list[Clamp]]]:
-        """``(N, D)`` targets as they are, and a ``Clamp`` for each value beyond its limits."""
-        rows = np.asarray(wanted, dtype=np.float64)
-        slack = 1e-6 * (self._upper - self._lower)
-        beyond = (rows > self._upper + slack) | (rows < self._lower - slack)
-        return rows, [self._noted(row, found) for row, found in zip(rows, beyond, strict=True)]
-
-    def _noted(self, row: Array, beyond: npt.NDArray[np.bool_]) -> list[Clamp]:
-        names = self.embodiment.joint_names
-        values = [(names[index], float(row[index])) for index in np.flatnonzero(beyond)]
-        return [Clamp(name, value, value, "position") for name, value in values]
 
 
 def braking_speed(room: Array, step: Array, period: float) -> Array:

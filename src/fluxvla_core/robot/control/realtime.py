@@ -2,15 +2,15 @@
 
 Three things keep a Python thread from its deadline, and each has a means of its own:
 
-* other threads of the interpreter, which keep it for 5 ms unless they are asked to give it up
-  earlier (``sys.setswitchinterval``), and have it just when a deadline comes unless it was taken
-  from them before (``keep_interpreter``, ``wait_until``);
+* other Python threads, which hold the GIL for 5 ms unless they are asked to release it earlier
+  (``sys.setswitchinterval``), and may hold it just when a deadline comes unless it was taken from
+  them before (``hold_gil``, ``wait_until``);
 * a full garbage collection, which stops all threads for as long as it takes to look at every
   object of every imported library (``gc.freeze`` takes those out);
-* other processes, which may also stop a thread that has the interpreter just then. Where the system
+* other processes, which may also preempt a thread that holds the GIL just then. Where the system
   allows it (``RLIMIT_RTPRIO``, or root), the thread gets a real-time priority, as ros2_control's
-  controller manager takes one, and those that take the interpreter often for an instant come next
-  (``just_below_real_time``); elsewhere nothing is changed. The kernel's own limit on
+  controller manager takes one, and threads that often take the GIL for an instant come next
+  (``raise_priority``); elsewhere nothing is changed. The kernel's own limit on
   real-time threads (``sched_rt_runtime_us``) stays in force.
 """
 
@@ -25,10 +25,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
-SHARED_S = 0.0005
-KEPT_S = 0.01
-"""After which others demand the interpreter: longer than a command is made ready ahead, or the
-thread that keeps it would have to give it up just when its deadline is there."""
+GIL_SHARED_S = 0.0005
+GIL_HELD_S = 0.01
+"""After which other threads demand the GIL: longer than a command is made ready ahead, or the
+thread that holds it would have to release it just at its deadline."""
 PRIORITY = 50
 """Above the kernel's ordinary work, as ros2_control; threads of interrupts have the same."""
 _TIMER_ABSTIME = 1  # of <time.h>
@@ -40,26 +40,26 @@ class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-def keep_interpreter() -> None:
-    """Keep the interpreter until ``share_interpreter`` or a sleep; only within ``real_time``."""
+def hold_gil() -> None:
+    """Hold the GIL until ``share_gil`` or a sleep; only within ``real_time``."""
     if _entered:
-        sys.setswitchinterval(KEPT_S)
+        sys.setswitchinterval(GIL_HELD_S)
 
 
-def share_interpreter() -> None:
-    """Let other threads have it, for short slices; only within ``real_time``."""
+def share_gil() -> None:
+    """Let other threads have the GIL, for short slices; only within ``real_time``."""
     if _entered:
-        sys.setswitchinterval(SHARED_S)
+        sys.setswitchinterval(GIL_SHARED_S)
 
 
 @contextmanager
-def shared_interpreter() -> Iterator[None]:
-    """Let other threads have it while the calling one waits for one of them; as it was afterwards.
+def shared_gil() -> Iterator[None]:
+    """Context manager: as :func:`share_gil`, while the calling thread waits for another one.
 
-    One that computes for long then gives it back in time.
+    A thread that computes for long then gives the GIL back in time.
     """
     interval = sys.getswitchinterval()
-    share_interpreter()
+    share_gil()
     try:
         yield
     finally:
@@ -67,13 +67,13 @@ def shared_interpreter() -> Iterator[None]:
 
 
 @contextmanager
-def short_slices() -> Iterator[None]:
-    """Let every thread of this process have the interpreter for short slices until the block ends.
+def short_gil_slices() -> Iterator[None]:
+    """Context manager: every thread of this process holds the GIL for short slices only.
 
     For a process that commands nothing itself, and has to show in time that it runs.
     """
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(SHARED_S)
+    sys.setswitchinterval(GIL_SHARED_S)
     try:
         yield
     finally:
@@ -81,18 +81,18 @@ def short_slices() -> Iterator[None]:
 
 
 def wait_until(deadline: float) -> None:
-    """Sleep until ``deadline`` (monotonic, in seconds) with the interpreter; for milliseconds.
+    """Sleep until ``deadline`` (monotonic, in seconds) without releasing the GIL; for milliseconds.
 
-    A thread that wakes has to get the interpreter first, and who has it may be stopped by other
-    processes just then. This one has it by then; meanwhile others only compute outside of it, as
-    torch's do. Off Linux it is given up as in any sleep.
+    A thread that wakes has to get the GIL first, and the thread that holds it may be preempted by
+    other processes just then. Here the calling thread holds it throughout; other threads only run
+    where they do not need it, as torch's do. Off Linux it is released as in any sleep.
     """
-    sleep = _keeping_sleep()
+    sleep = _sleep_with_gil()
     if sleep is not None and time.monotonic() < deadline:
         seconds = int(deadline)
         until = _Timespec(seconds, int((deadline - seconds) * 1e9))
         sleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
-    share_interpreter()
+    share_gil()
     # What is left where a signal ended it.
     left = deadline - time.monotonic()
     if left > 0.0:
@@ -100,12 +100,12 @@ def wait_until(deadline: float) -> None:
 
 
 @cache
-def _keeping_sleep() -> Callable[..., int] | None:
+def _sleep_with_gil() -> Callable[..., int] | None:
     """``clock_nanosleep`` of a Linux C library."""
     if sys.platform != "linux":
         return None
     try:
-        # PyDLL, unlike CDLL and time.sleep, does not give the interpreter up around a call.
+        # PyDLL, unlike CDLL and time.sleep, does not release the GIL around a call.
         found: Callable[..., int] = ctypes.PyDLL(None).clock_nanosleep
     except (OSError, AttributeError):
         return None
@@ -121,8 +121,8 @@ def real_time() -> Iterator[bool]:
     global _entered
     interval = sys.getswitchinterval()
     _entered += 1
-    share_interpreter()
-    _keeping_sleep()  # found now, not while an arm moves
+    share_gil()
+    _sleep_with_gil()  # found now, not while an arm moves
     gc.collect()
     gc.freeze()
     before = _raise(PRIORITY)
@@ -153,17 +153,17 @@ def lock_memory() -> bool:
     return (unlimited or os.geteuid() == 0) and locks(_LOCK_ALL_IN_USE) == 0
 
 
-def just_below_real_time() -> bool:
-    """Give the calling thread the priority below ``real_time``, for good; whether it may.
+def raise_priority() -> bool:
+    """Give the calling thread the priority just below ``real_time``'s, for good; whether it may.
 
-    For one that never computes for long, such as one that only stores what arrives.
+    For a thread that never computes for long, such as one that only stores what arrives.
     """
     return _raise(PRIORITY - 1) is not None
 
 
 @contextmanager
-def normal() -> Iterator[None]:
-    """Give up ``just_below_real_time`` while the calling thread computes for long."""
+def normal_priority() -> Iterator[None]:
+    """Context manager: undo ``raise_priority`` while the calling thread computes for long."""
     if sys.platform != "linux":
         yield
         return

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.robot.control.clamps import Clamp, PassThrough
 from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.limits import Clamp, CommandLimiter, PassThrough
+from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import BadCommand, Latch
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint

@@ -99,7 +99,7 @@ class Smoothing:
         return not (self._weights * (self._rows - self._rows[0])).any()
 
     def snapshot(self) -> Array:
-        """For ``restore``."""
+        """The state that the next command depends on; for ``restore``."""
         return self._rows.copy()
 
     def restore(self, rows: Array) -> None:

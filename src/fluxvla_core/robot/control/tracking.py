@@ -102,7 +102,7 @@ class TrackingWatch:
 
 
 def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
-    """Where in the state vector each action joint is; ``(dim,)`` indices.
+    """Indices ``(dim,)`` of the action joints in the state vector.
 
     A joint that is commanded by its speed need not be in the state; its index is -1 then.
 

@@ -12,7 +12,7 @@ import sys
 from fluxvla_core.robot.process.control import serve
 from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import error_fields
+from fluxvla_core.robot.process.messages import Kind, error_fields
 from fluxvla_core.robot.process.setup import ControlSetup
 
 
@@ -26,7 +26,7 @@ def main() -> None:
         channel = FrameChannel(FrameMemory(*frames)) if frames else None
         serve(link, ControlSetup.from_json(text), channel)
     except Exception as error:  # noqa: BLE001 - raised in the main process
-        link.post("failed", **error_fields(error))
+        link.send(Kind.FAILED, **error_fields(error))
 
 
 if __name__ == "__main__":

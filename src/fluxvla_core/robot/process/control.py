@@ -43,11 +43,11 @@ from fluxvla_core.robot.process.event_messages import event_message
 from fluxvla_core.robot.process.frames import FrameChannel
 from fluxvla_core.robot.process.inbox import Inbox
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Message, error_fields
-from fluxvla_core.robot.process.remote_source import RemoteSource
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields
+from fluxvla_core.robot.process.remote_policy_client import RemotePolicyClient
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.process.timed_filters import timed_filters
-from fluxvla_core.robot.process.whole_robot import WholeRobot
+from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.recording.logged import logged
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.tasks import Task
@@ -72,13 +72,13 @@ class LinkReporter(Reporter):
         self._link = link
 
     def info(self, text: str) -> None:
-        self._link.post("info", text=text)
+        self._link.send(Kind.INFO, text=text)
 
     def warn(self, text: str) -> None:
-        self._link.post("warn", text=text)
+        self._link.send(Kind.WARN, text=text)
 
     def artifact(self, kind: str, path: Path) -> None:
-        self._link.post("artifact", artifact=kind, path=str(path))
+        self._link.send(Kind.ARTIFACT, artifact=kind, path=str(path))
 
 
 class LinkLog(logging.Handler):
@@ -90,7 +90,7 @@ class LinkLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
-        self._link.post("log", logger=record.name, level=record.levelno, text=text)
+        self._link.send(Kind.LOG, logger=record.name, level=record.levelno, text=text)
 
 
 class LinkObserver(EpisodeObserver):
@@ -114,7 +114,7 @@ class LinkObserver(EpisodeObserver):
         message = event_message(event)
         if message is not None:
             # Of commands there are many: those that find no room are counted.
-            send = self._link.send if isinstance(event, CommandSent) else self._link.post
+            send = self._link.try_send if isinstance(event, CommandSent) else self._link.send
             send(message.kind, message.arrays, **message.fields)
 
     def write_rest(self, folder: Path) -> None:
@@ -146,8 +146,8 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
     inbox = Inbox(link, setup.settings.safety)
     _take_signals(inbox)
     logging.getLogger().addHandler(LinkLog(link))
-    robot, execute = setup.make_side(reporter)
-    if isinstance(robot, WholeRobot):
+    robot, execute = setup.build_control_side(reporter)
+    if isinstance(robot, UndividedRobot):
         assert frames is not None, "the main process shares memory for its pictures"
         robot.serve(frames, setup.cameras or (), setup.settings.safety.max_age_s)
         inbox.watch = robot.check_reading
@@ -155,7 +155,7 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
     parts = _parts(link, setup, robot, execute, inbox, reporter, observer)
     history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
     engine = LocalEngine(parts, setup.settings, history)
-    link.post("ready")
+    link.send(Kind.READY)
     try:
         with (
             robot.delays.watched(reporter.warn, setup.settings.safety.starvation_s),
@@ -168,13 +168,13 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
                 order = inbox.order()
                 if order is None:
                     _wait(link, inbox, engine)
-                elif order.kind == "close":
+                elif order.kind == Kind.CLOSE:
                     return
                 else:
                     _execute(link, inbox, engine, observer, order)
     finally:
         failures = [engine.stop(), engine.close()]
-        link.post("closed", failures=failures)
+        link.send(Kind.CLOSED, failures=failures)
         if inbox.orphaned:
             _report_orphaned(engine, failures)
 
@@ -200,18 +200,18 @@ def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
         engine.hold()
     except (FluxError, Interrupted) as error:
         engine.release()
-        link.post("released", **error_fields(error))
+        link.send(Kind.RELEASED, **error_fields(error))
 
 
 def _execute(
     link: Link, inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message
 ) -> None:
     orders: Mapping[str, Callable[[], object]] = {
-        "connect": engine.connect,
-        "rearm": engine.rearm,
-        "release": engine.release,
-        "stop": engine.stop,
-        "play": lambda: _play(inbox, engine, observer, order),
+        Kind.CONNECT: lambda: _connect(engine),
+        Kind.REARM: engine.rearm,
+        Kind.RELEASE: engine.release,
+        Kind.STOP: engine.stop,
+        Kind.PLAY: lambda: _play(inbox, engine, observer, order),
     }
     fields: dict[str, Any]
     try:
@@ -220,11 +220,18 @@ def _execute(
         fields = {"signal": signal_.number}
     except BaseException as error:  # noqa: BLE001 - raised in the main process
         fields = error_fields(error)
-    if order.kind == "play":
+    if order.kind == Kind.PLAY:
         facts = dict(engine.episode_facts())
         failure, holding = engine.stop_failure, engine.holding
         fields |= {"facts": facts, "stop_failure": failure, "holding": holding}
-    link.post("done", order=order.kind, **fields)
+    link.send(Kind.DONE, order=order.kind, **fields)
+
+
+def _connect(engine: Engine) -> None:
+    engine.connect()
+    # The libraries that it imported are not to be looked through between two commands.
+    gc.collect()
+    gc.freeze()
 
 
 def _play(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
@@ -250,10 +257,10 @@ def _parts(
 ) -> EpisodeParts:
     patience_s = setup.settings.safety.first_chunk_s
 
-    def make_source(
+    def make_client(
         task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
-    ) -> RemoteSource:
-        return RemoteSource(link, inbox, robot, patience_s)
+    ) -> RemotePolicyClient:
+        return RemotePolicyClient(link, inbox, robot, patience_s)
 
     def left_out(name: str) -> None:
         observer.on_event(FilterLeftOut(robot.clock.now(), name))
@@ -261,7 +268,7 @@ def _parts(
     made = setup.make_filters(reporter)
     return EpisodeParts(
         robot=robot,
-        source=make_source,
+        make_client=make_client,
         filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
         joiner=make_joiner(*setup.joining),
         execute=execute,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from fluxvla_core.robot.control.limits import Clamp
+from fluxvla_core.robot.control.clamps import Clamp
 from fluxvla_core.robot.control.safety import Trip
 from fluxvla_core.robot.control.sender import Sent
 from fluxvla_core.robot.events import (
@@ -16,10 +16,7 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.process.messages import Message
-
-_COMMAND, _STOPPED, _STOPPED_HELD, _ENDED = "command", "stopped", "stopped while held", "ended"
-_LEFT_OUT = "filter left out"
+from fluxvla_core.robot.process.messages import Kind, Message
 
 
 def event_message(event: Event) -> Message | None:
@@ -35,15 +32,16 @@ def event_message(event: Event) -> Message | None:
                 "late_s": late_s,
             }
             arrays = (sent.target, sent.command)
-            return Message(_COMMAND, fields, arrays if state is None else (*arrays, state))
+            return Message(Kind.COMMAND, fields, arrays if state is None else (*arrays, state))
         case FilterLeftOut():
-            return Message(_LEFT_OUT, vars(event))
+            return Message(Kind.FILTER_LEFT_OUT, vars(event))
         case Stopped():
-            return Message(_STOPPED, vars(event))
+            return Message(Kind.STOPPED, vars(event))
         case StoppedWhileHeld(at, trip, failure):
-            return Message(_STOPPED_HELD, {"at": at, "trip": asdict(trip), "failure": failure})
+            held = {"at": at, "trip": asdict(trip), "failure": failure}
+            return Message(Kind.STOPPED_WHILE_HELD, held)
         case EpisodeEnded():
-            return Message(_ENDED, {**vars(event), "trips": [asdict(t) for t in event.trips]})
+            return Message(Kind.ENDED, {**vars(event), "trips": [asdict(t) for t in event.trips]})
     return None
 
 
@@ -51,7 +49,7 @@ def event_of(message: Message) -> Event | None:
     """The event of ``event_message``; None for a message of another kind."""
     fields = dict(message.fields)
     match message.kind:
-        case "command":
+        case Kind.COMMAND:
             target, command, *state = message.arrays
             clamps = tuple(Clamp(**clamp) for clamp in fields["clamps"])
             sent = Sent(target, command, clamps, fields["held"])
@@ -63,13 +61,13 @@ def event_of(message: Message) -> Event | None:
                 fields["send_s"],
                 fields["late_s"],
             )
-        case "filter left out":
+        case Kind.FILTER_LEFT_OUT:
             return FilterLeftOut(**fields)
-        case "stopped":
+        case Kind.STOPPED:
             return Stopped(**fields)
-        case "stopped while held":
+        case Kind.STOPPED_WHILE_HELD:
             return StoppedWhileHeld(fields["at"], Trip(**fields["trip"]), fields["failure"])
-        case "ended":
+        case Kind.ENDED:
             trips = tuple(Trip(**trip) for trip in fields.pop("trips"))
             return EpisodeEnded(trips=trips, **fields)
     return None

@@ -71,7 +71,7 @@ def make_frame_memory(size: int) -> FrameMemory:
 
 @dataclass(frozen=True)
 class Look:
-    """What one look at a robot gave.
+    """One reading of a robot, as it is sent to the main process.
 
     Args:
         fields: JSON values.
@@ -148,7 +148,7 @@ class FrameChannel:
         at = _aligned(len(text))
         for array in look.arrays.values():
             room = self._data[at : at + array.nbytes]
-            # numpy lets other threads have the interpreter while it copies a picture.
+            # numpy releases the GIL while it copies a picture.
             np.copyto(room.view(array.dtype).reshape(array.shape), array)
             at += _aligned(array.nbytes)
         self._numbers[_ANSWERED] = self._numbers[_ASKED]

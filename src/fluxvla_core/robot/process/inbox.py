@@ -1,4 +1,4 @@
-"""``Inbox``: what the main process sends to the control process, and whether it still runs."""
+"""``Inbox``: receives the main process's messages in the control process, and sees that it runs."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from types import FrameType
 
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.interrupt import Interrupts
+from fluxvla_core.robot.control.policy_client import Answer
 from fluxvla_core.robot.control.safety import BadChunk, Rule, RuleStop, SafetySettings
-from fluxvla_core.robot.control.source import Answer
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Array, Message, error_of
+from fluxvla_core.robot.process.messages import Kind, Message, error_of
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,18 @@ class RemoteAnswer(Answer):
 
 
 class MainSilent(RuleStop):
-    """The main process does not run: it was killed or stopped, or one of its threads keeps the
-    interpreter."""
+    """The main process does not run: it was killed or stopped, or one of its threads holds the
+    GIL."""
 
     rule = Rule.MAIN_PROCESS
 
 
 class Inbox(Interrupts):
-    """What the main process sends, and whether it still runs; checked at every tick.
+    """The control process's end of the link: takes what the main process sends, at every tick.
 
-    Signals are the main process's: it passes them on as orders.
+    It is the ``interrupts`` of the control process's episodes: the main process gets the signals
+    and sends them on, and ``check`` raises them here. It also raises where the main process fell
+    silent or reports a fault.
 
     Args:
         link: the control process's end.
@@ -82,7 +84,7 @@ class Inbox(Interrupts):
 
     def poll(self) -> None:
         """Take what came, and let the main process know that this one runs."""
-        self._link.beat()
+        self._link.mark_alive()
         self._link.flush()
         while (message := self._link.receive()) is not None:
             self._take(message)
@@ -102,18 +104,18 @@ class Inbox(Interrupts):
 
     def _take(self, message: Message) -> None:
         match message.kind:
-            case "answer":
+            case Kind.ANSWER:
                 future = self.answers.pop(message["number"], None)
                 if future is not None:
                     _resolve(future, message)
-            case "reply":
+            case Kind.REPLY:
                 self.replies[message["to"]] = message
-            case "signal":
+            case Kind.SIGNAL:
                 self.on_signal(message["number"], None)
-            case "fault":
+            case Kind.FAULT:
                 self._fault = error_of(message.fields)
             case kind:
-                if kind == "play":
+                if kind == Kind.PLAY:
                     # Here, not when it is carried out: what comes after it is for this episode.
                     self.forget()
                 self.orders.append(message)
@@ -127,14 +129,17 @@ class Inbox(Interrupts):
         if self.orphaned:
             raise MainSilent("the main process was killed", cause="look for it in the system log")
         # An arm that rests is held until the policy has warmed up, however that takes its time.
-        name = "silence_s" if self.phase.moving else "first_chunk_s"
-        most, silent = getattr(self._safety, name), self._link.silent_s()
+        if self.phase.moving:
+            name, most = "silence_s", self._safety.silence_s
+        else:
+            name, most = "first_chunk_s", self._safety.first_chunk_s
+        silent = self._link.silent_s()
         if silent > most:
             raise MainSilent(
                 f"the main process did not run for {silent:.2f} s, safety.{name} is {most:g}",
-                cause="it was stopped, the policy or a hook kept the interpreter's lock, or this "
+                cause="it was stopped, the policy or a hook held the GIL, or this "
                 "machine has no processor to spare",
-                next="look at what the policy computes in one piece of native code",
+                next="look for a native call that holds the GIL too long",
             )
 
 
@@ -143,10 +148,10 @@ def _resolve(future: Future[Answer], message: Message) -> None:
     if "error" in fields:
         future.set_exception(error_of(fields))
         return
-    keyframes: Array | BadChunk
+    observed, number = fields["observed"], fields["number"]
     if message.arrays:
-        keyframes = message.arrays[0]
-    else:
-        refused = error_of(fields["refused"])
-        keyframes = refused if isinstance(refused, BadChunk) else BadChunk(refused.what)
-    future.set_result(RemoteAnswer(fields["observed"], keyframes, fields["number"]))
+        future.set_result(RemoteAnswer(observed, message.arrays[0], None, number))
+        return
+    refused = error_of(fields["refused"])
+    error = refused if isinstance(refused, BadChunk) else BadChunk(refused.what)
+    future.set_result(RemoteAnswer(observed, None, error, number))

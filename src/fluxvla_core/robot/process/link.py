@@ -58,22 +58,25 @@ class Link:
         self._lock = threading.Lock()
         self._waiting: deque[bytes] = deque()
 
-    def send(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> bool:
-        """Send a message; False if there was no room for it, which never keeps the sender."""
-        self.beat()
+    def try_send(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> bool:
+        """Send a message, or drop it if there is no room for it; whether it was sent."""
+        self.mark_alive()
         data = encode(Message(kind, fields, arrays))
         with self._lock:
             return self._out.write(data)
 
-    def post(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> None:
-        """Send a message that must arrive: one that finds no room is sent again by ``flush``."""
-        self.beat()
+    def send(self, kind: str, arrays: Sequence[Array] = (), **fields: Any) -> None:
+        """Send a message that must arrive; if there is no room for it, ``flush`` sends it later.
+
+        Returns at once in either case. Messages of ``send`` arrive in their order.
+        """
+        self.mark_alive()
         with self._lock:
             self._waiting.append(encode(Message(kind, fields, arrays)))
         self.flush()
 
     def flush(self) -> None:
-        """Send what waits for room."""
+        """Send the messages that wait for room, as far as there is room now."""
         with self._lock:
             while self._waiting and self._out.fits(self._waiting[0]):
                 self._out.write(self._waiting.popleft())
@@ -85,14 +88,14 @@ class Link:
 
     @property
     def lost(self) -> int:
-        """How many messages of the other end found no room, of those that need not arrive."""
+        """How many messages of the other end's ``try_send`` were dropped."""
         return self._in.dropped
 
-    def beat(self) -> None:
-        """Store that this process runs."""
+    def mark_alive(self) -> None:
+        """Store the time: this process runs."""
         self._times[self._own] = time.monotonic_ns()
 
     def silent_s(self) -> float:
-        """For how many seconds the other process has not run; 0 before it ever did."""
+        """How many seconds the other process has not run; 0 before it ever did."""
         last = self._times[self._other]
         return (time.monotonic_ns() - last) * 1e-9 if last else 0.0

@@ -9,6 +9,7 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from fluxvla_core import errors
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import safety, source
+from fluxvla_core.robot.control import policy_client, safety
 
 Array = npt.NDArray[np.float64]
 _HEADER = struct.Struct("<I")
@@ -25,12 +26,86 @@ _ALIGNED = 8
 _JSON = json.JSONEncoder(separators=(",", ":"))
 
 
+class Kind(str, Enum):
+    """The kinds of messages; below each are its fields and arrays.
+
+    An error is sent as the fields of ``error_fields``.
+    """
+
+    __str__ = str.__str__  # its value, also in Python 3.10, which has no StrEnum
+
+    # Main process -> control process: orders, carried out one after the other. Each is answered by
+    # DONE, CLOSE by CLOSED.
+    CONNECT = "connect"
+    PLAY = "play"
+    """Run an episode: ``task``, ``instruction``, ``free``, ``number``, ``seed``, ``folder``."""
+    REARM = "rearm"
+    RELEASE = "release"
+    """Stop holding the arm."""
+    STOP = "stop"
+    CLOSE = "close"
+
+    # Main process -> control process: taken at every tick, also while an order is carried out.
+    ANSWER = "answer"
+    """To ASK: ``number``, and ``observed`` with the actions or with ``refused``, or an error."""
+    REPLY = "reply"
+    """To FIRST_STATE, RESET or LATE, which ``to`` names."""
+    SIGNAL = "signal"
+    """The main process got a signal: ``number``."""
+    FAULT = "fault"
+    """Something went wrong in the main process, and the robot is to be stopped: an error."""
+
+    # Control process -> main process: its own state.
+    READY = "ready"
+    """The operator is built; orders are awaited."""
+    FAILED = "failed"
+    """The control process ends: an error."""
+    DONE = "done"
+    """``order``, with ``result``, ``signal`` (a number) or an error; after PLAY also ``facts``,
+    ``stop_failure`` and ``holding``."""
+    CLOSED = "closed"
+    """The robot was stopped and disconnected: ``failures``, texts or None."""
+    RELEASED = "released"
+    """The hold between two episodes ended: an error."""
+
+    # Control process -> main process: questions of an episode.
+    FIRST_STATE = "first state"
+    """Wait for the first reading; REPLY has its state."""
+    RESET = "reset"
+    """Reset the policy; REPLY follows."""
+    ASK = "ask"
+    """Observe, and ask the policy: ``number``, and what is left of the chunk; ANSWER follows."""
+    ACCEPTED = "accepted"
+    """The chunk of ANSWER ``number`` is executed."""
+    REFUSED = "refused"
+    """The chunk of ANSWER ``number`` is no motion for this arm."""
+    LATE = "late"
+    """What took longest ``since`` a time; REPLY has ``name``, ``cause``, ``next``, ``seconds``."""
+
+    # Control process -> main process: for people.
+    INFO = "info"
+    """``text``."""
+    WARN = "warn"
+    """``text``."""
+    ARTIFACT = "artifact"
+    """A file: ``artifact`` (its kind), ``path``."""
+    LOG = "log"
+    """A record of ``logging``: ``logger``, ``level``, ``text``."""
+
+    # Control process -> main process: events of the episode, see ``event_messages``.
+    COMMAND = "command"
+    FILTER_LEFT_OUT = "filter left out"
+    STOPPED = "stopped"
+    STOPPED_WHILE_HELD = "stopped while held"
+    ENDED = "ended"
+
+
 @dataclass(frozen=True)
 class Message:
     """One message.
 
     Args:
-        kind: what it says.
+        kind: one of ``Kind``.
         fields: JSON values.
         arrays: float64, of any shape.
     """
@@ -91,4 +166,4 @@ def _classes(*modules: Any) -> dict[str, type[FluxError]]:
     return {c.__name__: c for c in found if isinstance(c, type) and issubclass(c, FluxError)}
 
 
-_KNOWN = _classes(errors, safety, source)
+_KNOWN = _classes(errors, safety, policy_client)

@@ -16,11 +16,11 @@ from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.robot.control.policy_client import PolicyClient
 from fluxvla_core.robot.control.safety import Latch, Rule
-from fluxvla_core.robot.control.source import ChunkSource
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, RunHistory
-from fluxvla_core.robot.episode import SourceMaker
+from fluxvla_core.robot.episode import PolicyClientFactory
 from fluxvla_core.robot.events import (
     CommandSent,
     EpisodeEnded,
@@ -36,7 +36,7 @@ from fluxvla_core.robot.process import launch
 from fluxvla_core.robot.process.event_messages import event_of
 from fluxvla_core.robot.process.launch import ControlProcessGone
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Message, error_fields, error_of
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.server import LinkServer
 from fluxvla_core.robot.process.setup import ControlSetup
@@ -57,7 +57,7 @@ class RemoteEngine(Engine):
     Args:
         setup: what the control process is built from.
         robot: reads the cameras in this process; not connected.
-        make_source: makes the source of an episode's chunks.
+        make_client: makes the policy client of an episode's chunks.
         latch: follows the control process's.
         interrupts: signals; passed on.
         reporter: shows progress and warnings.
@@ -69,7 +69,7 @@ class RemoteEngine(Engine):
         self,
         setup: ControlSetup,
         robot: Robot,
-        make_source: SourceMaker,
+        make_client: PolicyClientFactory,
         latch: Latch,
         interrupts: Interrupts,
         reporter: Reporter,
@@ -78,7 +78,7 @@ class RemoteEngine(Engine):
     ) -> None:
         self._setup, self._robot, self._settings = setup, robot, setup.settings
         self._frames = frames
-        self._make_source = make_source
+        self._make_client = make_client
         self._latch, self._interrupts, self._reporter = latch, interrupts, reporter
         self._history = history
         self._link: Link
@@ -98,8 +98,8 @@ class RemoteEngine(Engine):
         self._robot.connect()
 
     def commanding(self) -> AbstractContextManager[object]:
-        # So that a policy's threads give the interpreter to the one that shows that it runs.
-        return realtime.short_slices()
+        # So that a policy's threads release the GIL for the one that shows that this process runs.
+        return realtime.short_gil_slices()
 
     def play(
         self,
@@ -121,7 +121,7 @@ class RemoteEngine(Engine):
             self._emit(EpisodeStarted(now(), task))
             # Compared with commands in the control process.
             tracking = TrackingWatch(self._robot.embodiment, settings.safety)
-            self._server.begin(self._make_source(task, seed, tracking, self._emit))
+            self._server.begin(self._make_client(task, seed, tracking, self._emit))
             self._play(task, number, seed, folder)
         except ControlProcessGone as gone:
             self._note_gone(gone)
@@ -148,19 +148,19 @@ class RemoteEngine(Engine):
     def release(self) -> None:
         self._holding = False
         if self._process is not None:
-            self._order("release", STOP_S)
+            self._order(Kind.RELEASE, STOP_S)
 
     def rearm(self) -> None:
         self._latch.rearm()
         if self._process is not None:
-            self._order("rearm", STOP_S)
+            self._order(Kind.REARM, STOP_S)
 
     def episode_facts(self) -> Mapping[str, Any]:
         return self._facts
 
     def stop(self) -> str | None:
         self._holding = False
-        return None if self._process is None else self._ordered_stop("stop")
+        return None if self._process is None else self._ordered_stop(Kind.STOP)
 
     def close(self) -> str | None:
         failure = self._end(_END_S) if self._process is not None else None
@@ -187,8 +187,8 @@ class RemoteEngine(Engine):
         self._lost = 0
         self._server = LinkServer(self._link, self._robot, self._interrupts)
         try:
-            self._await("ready", _START_S)
-            self._order("connect", None)
+            self._await(Kind.READY, _START_S)
+            self._order(Kind.CONNECT, None)
         except BaseException:
             # Nothing was commanded yet.
             if self._process is not None:
@@ -197,8 +197,8 @@ class RemoteEngine(Engine):
 
     def _play(self, task: Task, number: int, seed: int, folder: Path) -> None:
         problem: BaseException | None = None
-        self._link.post(
-            "play",
+        self._link.send(
+            Kind.PLAY,
             task=task.name,
             instruction=task.instruction,
             free=task.free,
@@ -213,7 +213,7 @@ class RemoteEngine(Engine):
             except Interrupted as interrupted:
                 problem = problem or interrupted
                 self._interrupts.stopping = True
-                self._link.post("signal", number=interrupted.number)
+                self._link.send(Kind.SIGNAL, number=interrupted.number)
                 continue
             except ControlProcessGone:
                 raise
@@ -222,9 +222,9 @@ class RemoteEngine(Engine):
                 if problem is None:
                     problem = error
                     self._interrupts.stopping = True
-                    self._link.post("fault", **_fault(error))
+                    self._link.send(Kind.FAULT, **_fault(error))
                 continue
-            if done is not None and done["order"] == "play":
+            if done is not None and done["order"] == Kind.PLAY:
                 break
         self.stop_failure, self._holding = done["stop_failure"], done["holding"]
         self._facts = done["facts"]
@@ -244,7 +244,7 @@ class RemoteEngine(Engine):
             raise ending from self._original(ending)
 
     def _original(self, error: FluxError) -> BaseException | None:
-        """What was raised here and came back as ``error``: it has a traceback."""
+        """The exception that was raised in this process and came back as ``error``, if any."""
         known = [(e, error_fields(e)["what"]) for e in self._server.raised]
         return next((e for e, what in known if error.what.startswith(what)), None)
 
@@ -262,7 +262,7 @@ class RemoteEngine(Engine):
                 message = self._server.messages.get(timeout=max(until - time.monotonic(), 0.0))
             except queue.Empty:
                 return None
-            if message.kind == "done":
+            if message.kind == Kind.DONE:
                 return message
             self._handle(message)
 
@@ -273,26 +273,26 @@ class RemoteEngine(Engine):
             return
         fields = message.fields
         match message.kind:
-            case "first state":
-                self._reply(message.kind, lambda: self._made_source.first_state())
-            case "reset":
-                self._reply(message.kind, lambda: self._made_source.reset())
-            case "accepted":
-                self._made_source.accepted(self._server.answers.pop(fields["number"]))
-            case "refused":
-                self._made_source.refused(self._server.answers.pop(fields["number"]))
-            case "info":
+            case Kind.FIRST_STATE:
+                self._reply(message.kind, lambda: self._episode_client.first_state())
+            case Kind.RESET:
+                self._reply(message.kind, lambda: self._episode_client.reset())
+            case Kind.ACCEPTED:
+                self._episode_client.accepted(self._server.answers.pop(fields["number"]))
+            case Kind.REFUSED:
+                self._episode_client.refused(self._server.answers.pop(fields["number"]))
+            case Kind.INFO:
                 self._reporter.info(fields["text"])
-            case "warn":
+            case Kind.WARN:
                 self._reporter.warn(fields["text"])
-            case "artifact":
+            case Kind.ARTIFACT:
                 self._reporter.artifact(fields["artifact"], Path(fields["path"]))
-            case "log":
+            case Kind.LOG:
                 logging.getLogger(fields["logger"]).log(fields["level"], "%s", fields["text"])
-            case "released":
+            case Kind.RELEASED:
                 self._holding = False
                 raise error_of(fields)
-            case "failed":
+            case Kind.FAILED:
                 raise error_of(fields)
 
     def _happened(self, event: Event) -> None:
@@ -318,10 +318,10 @@ class RemoteEngine(Engine):
             observer.on_event(event)
 
     @property
-    def _made_source(self) -> ChunkSource:
-        source = self._server.source
-        assert source is not None, "the control process asks in an episode only"
-        return source
+    def _episode_client(self) -> PolicyClient:
+        client = self._server.client
+        assert client is not None, "the control process asks in an episode only"
+        return client
 
     def _reply(self, to: str, answer: Callable[[], Any]) -> None:
         """Answer a request of the control process, which waits for it while nothing moves."""
@@ -331,23 +331,23 @@ class RemoteEngine(Engine):
             raise
         except Exception as error:  # noqa: BLE001 - raised in the control process
             self._server.raised.append(error)
-            self._link.post("reply", to=to, **error_fields(error))
+            self._link.send(Kind.REPLY, to=to, **error_fields(error))
             return
-        self._link.post("reply", () if found is None else (found,), to=to)
+        self._link.send(Kind.REPLY, () if found is None else (found,), to=to)
 
-    def _order(self, order: str, timeout_s: float | None) -> Message:
+    def _order(self, order: Kind, timeout_s: float | None) -> Message:
         """Have an order carried out.
 
         Raises:
             FluxError: what went wrong with it.
         """
-        self._link.post(order)
-        done = self._await("done", timeout_s)
+        self._link.send(order)
+        done = self._await(Kind.DONE, timeout_s)
         if "error" in done.fields:
             raise error_of(done.fields)
         return done
 
-    def _await(self, kind: str, timeout_s: float | None) -> Message:
+    def _await(self, kind: Kind, timeout_s: float | None) -> Message:
         until = None if timeout_s is None else time.monotonic() + timeout_s
         while until is None or time.monotonic() < until:
             self._interrupts.check()
@@ -359,7 +359,7 @@ class RemoteEngine(Engine):
             if message.kind == kind:
                 return message
             self._handle(message)
-        raise RunFailed(f"the control process did not say {kind!r} within {timeout_s:g} s")
+        raise RunFailed(f"the control process sent no {kind.value!r} within {timeout_s:g} s")
 
     # Its end.
 
@@ -376,7 +376,7 @@ class RemoteEngine(Engine):
             ended = f"ended with exit code {code}"
             raise self._gone(ended if code >= 0 else f"was killed by {signal.Signals(-code).name}")
         if code is None and not self._server.alive:
-            self._link.post("close")
+            self._link.send(Kind.CLOSE)
             try:
                 process.wait(_END_S)
             except subprocess.TimeoutExpired:
@@ -388,8 +388,8 @@ class RemoteEngine(Engine):
             raise self._gone(f"did not run for {silent_s:.1f} s and was killed")
 
     def _patience_s(self) -> float | None:
-        """For how long the control process may not run; None while it waits for the operator."""
-        if self._server.source is None:
+        """How long the control process may not run; None while it waits for the operator."""
+        if self._server.client is None:
             return _HUNG_S if self._holding else None
         phase = self._server.phase
         if phase.stoppable:
@@ -423,10 +423,10 @@ class RemoteEngine(Engine):
         self._emit(Stopped(now, gone.rule, gone.what, now - began, failure))
         self._emit(EpisodeEnded(now, "failed", None, gone.what, 0, (self._latch.trips[-1],)))
 
-    def _ordered_stop(self, order: str) -> str | None:
+    def _ordered_stop(self, order: Kind) -> str | None:
         try:
-            self._link.post(order)
-            done = self._await("done", STOP_S + 1.0)
+            self._link.send(order)
+            done = self._await(Kind.DONE, STOP_S + 1.0)
         except Exception as error:  # noqa: BLE001 - reported; the rest of the end follows
             return str(error)
         failure: str | None = done.fields.get("result")
@@ -435,7 +435,7 @@ class RemoteEngine(Engine):
     def _end(self, patience_s: float) -> str | None:
         """Have the process stop the robot, disconnect and end; what went wrong."""
         assert self._process is not None, "the control process was started"
-        self._link.post("close")
+        self._link.send(Kind.CLOSE)
         failures: list[str] = []
         try:
             self._process.wait(patience_s)
@@ -445,7 +445,7 @@ class RemoteEngine(Engine):
         self._clean_up()
         while not self._server.messages.empty():
             message = self._server.messages.get()
-            if message.kind == "closed":
+            if message.kind == Kind.CLOSED:
                 failures += [failure for failure in message["failures"] if failure]
         return "; ".join(failures) or None
 

@@ -76,11 +76,11 @@ class RemoteOperator(Operator):
         return frame_of(self.look())
 
     def observe(self) -> tuple[dict[str, Any], Frame | None]:
-        """What the runner in the control process makes of one look; raises as ``get_frame``."""
+        """The observation that the runner in the control process makes; raises as ``get_frame``."""
         return window_of(self.look())
 
     def look(self) -> Look:
-        """What the control process makes of one look at the robot; raises as ``get_frame``."""
+        """Ask the control process for one reading of the robot; raises as ``get_frame``."""
         with self._lock:
             channel = self._channel
             if channel is None:

@@ -11,11 +11,11 @@ from concurrent.futures import Future
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.source import Answer, ChunkSource
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Message, error_fields
-from fluxvla_core.robot.process.remote_source import ahead_of
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields
+from fluxvla_core.robot.process.remote_policy_client import ahead_of
 from fluxvla_core.robot.robot import Robot
 
 _POLL_S = 0.004
@@ -46,32 +46,32 @@ class LinkServer:
         self.raised: deque[BaseException] = deque(maxlen=16)
         self.phase = Phase.OVER
         self._link, self._robot, self._interrupts = link, robot, interrupts
-        self._source: ChunkSource | None = None
+        self._client: PolicyClient | None = None
         self._signals = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="fluxvla-link", daemon=True)
         self._thread.start()
 
     @property
-    def source(self) -> ChunkSource | None:
-        """Of the episode that is under way; None between two."""
-        return self._source
+    def client(self) -> PolicyClient | None:
+        """The policy client of the running episode; None between two."""
+        return self._client
 
     @property
     def alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
-    def begin(self, source: ChunkSource) -> None:
+    def begin(self, client: PolicyClient) -> None:
         """An episode begins."""
         self.answers.clear()
         self.raised.clear()
         self._signals = len(self._interrupts.signals)
-        self._source = source
+        self._client = client
 
     def end(self) -> None:
         """The episode is over."""
-        self.phase, self._source = Phase.OVER, None
+        self.phase, self._client = Phase.OVER, None
 
     def close(self) -> None:
         """End the thread, after what the control process sent last."""
@@ -80,18 +80,18 @@ class LinkServer:
 
     def _serve(self) -> None:
         """Show that this process runs, answer questions, and watch the cameras."""
-        realtime.just_below_real_time()
+        realtime.raise_priority()
         watched = 0.0
         ended = False
         while not ended:
             ended = self._over.wait(_POLL_S)
-            self._link.beat()
+            self._link.mark_alive()
             self._link.flush()
             self._pass_signals_on()
             while (message := self._link.receive()) is not None:
-                if message.kind == "ask":
+                if message.kind == Kind.ASK:
                     self._ask(message)
-                elif message.kind == "late":
+                elif message.kind == Kind.LATE:
                     self._reply_delay(message["since"])
                 else:
                     self.messages.put(message)
@@ -103,36 +103,43 @@ class LinkServer:
     def _pass_signals_on(self) -> None:
         """A hook may keep the main thread for long; the arm is stopped meanwhile."""
         signals = self._interrupts.signals
-        if self._source is not None and len(signals) > self._signals:
+        if self._client is not None and len(signals) > self._signals:
             self._signals = len(signals)
-            self._link.post("signal", number=signals[-1])
+            self._link.send(Kind.SIGNAL, number=signals[-1])
 
     def _ask(self, message: Message) -> None:
-        source, number = self._source, message["number"]
-        if source is None:
+        client, number = self._client, message["number"]
+        if client is None:
             return
 
         def answered(future: Future[Answer]) -> None:
             error = future.exception()
             if error is not None:
                 self.raised.append(error)
-                self._link.post("answer", number=number, **error_fields(error))
+                self._link.send(Kind.ANSWER, number=number, **error_fields(error))
                 return
             answer = future.result()
             self.answers[number] = answer
-            if isinstance(answer.keyframes, FluxError):
-                refused = error_fields(answer.keyframes)
-                self._link.post("answer", number=number, observed=answer.observed, refused=refused)
+            if answer.error is not None:
+                refused = error_fields(answer.error)
+                self._link.send(
+                    Kind.ANSWER, number=number, observed=answer.observed, refused=refused
+                )
             else:
-                arrays = (answer.keyframes,)
-                self._link.post("answer", arrays, number=number, observed=answer.observed)
+                arrays = (answer.checked(),)
+                self._link.send(Kind.ANSWER, arrays, number=number, observed=answer.observed)
 
-        source.ask(ahead_of(message)).add_done_callback(answered)
+        client.ask(ahead_of(message)).add_done_callback(answered)
 
     def _reply_delay(self, since: float) -> None:
         late, seconds = self._robot.delays.longest(since)
-        self._link.post(
-            "reply", to="late", seconds=seconds, name=late.name, cause=late.cause, next=late.next
+        self._link.send(
+            Kind.REPLY,
+            to=Kind.LATE,
+            seconds=seconds,
+            name=late.name,
+            cause=late.cause,
+            next=late.next,
         )
 
     def _watch_cameras(self) -> None:
@@ -141,4 +148,4 @@ class LinkServer:
             self._robot.state()
         except FluxError as error:
             self.raised.append(error)
-            self._link.post("fault", **error_fields(error))
+            self._link.send(Kind.FAULT, **error_fields(error))

@@ -16,7 +16,6 @@ import numpy as np
 
 from fluxvla_core.build import (
     RunContext,
-    build_action_filter_from_cfg,
     build_operator_from_cfg,
     build_runner_from_cfg,
 )
@@ -24,18 +23,18 @@ from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter, Operator
 from fluxvla_core.plugins.files import load_plugin_files, plugin_files
 from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RUNNERS
-from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.safety import SafetySettings
 from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.episode import EpisodeSettings
-from fluxvla_core.robot.process.whole_robot import WholeRobot
+from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.settings import build_filters
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 
 @dataclass(frozen=True)
 class ControlSetup:
-    """What both processes know of a run.
+    """The settings of a run that both processes have.
 
     Args:
         config: the whole config; for classes that ask for it.
@@ -97,9 +96,9 @@ class ControlSetup:
         Raises:
             ConfigError, PluginError: the operator cannot be built.
         """
-        return self.make_side(reporter)[0]
+        return self.build_control_side(reporter)[0]
 
-    def make_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
+    def build_control_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
         """The robot that this process commands, not connected, and what sends the commands.
 
         Raises:
@@ -108,8 +107,8 @@ class ControlSetup:
         self._import_registered()
         if self.runner is not None:
             runner = build_runner_from_cfg(self.runner, self._context(reporter))
-            robot = WholeRobot(runner.ros_operator, self._spec(), sends=True)
-            execute, observe = runner.commanding_side(robot, self.cameras or ())
+            robot = UndividedRobot(runner.ros_operator, self._spec(), sends=True)
+            execute, observe = runner.control_side(robot, self.cameras or ())
             robot.observed_by(observe)
             return robot, execute
         made = self._operators_robot(reporter)
@@ -118,7 +117,7 @@ class ControlSetup:
     def _operators_robot(self, reporter: Reporter) -> Robot:
         built = build_operator_from_cfg(self.operator, self._context(reporter))
         if self.cameras is not None:
-            return WholeRobot(built, self._spec())
+            return UndividedRobot(built, self._spec())
         return Robot(Operator.adapt(built).without_cameras() or built, self._spec())
 
     def make_filters(self, reporter: Reporter) -> list[ActionFilter]:
@@ -128,13 +127,7 @@ class ControlSetup:
             ConfigError, PluginError: one of them cannot be built, or does not fit.
         """
         context = self._context(reporter)
-        built = [build_action_filter_from_cfg(table, context) for table in self.filters]
-        filters = [ActionFilter.adapt(each) for each in built]
-        if self.gripper_threshold is not None:
-            filters.append(SnapGripper(self.gripper_threshold))
-        for each in filters:
-            each.bind(self._spec())
-        return filters
+        return build_filters(self.filters, self.gripper_threshold, self._spec(), context)
 
     def _import_registered(self) -> None:
         known = set(sys.path)
@@ -196,7 +189,7 @@ def _is_found(module: str) -> bool:
 
 
 def not_plain(value: Any, key: str) -> str | None:
-    """What of ``value``, which is at ``key``, another process cannot be given; None if nothing."""
+    """What in ``value`` (at ``key``) cannot be sent to another process; None if nothing."""
     if isinstance(value, Mapping):
         strange = [name for name in value if not isinstance(name, str)]
         if strange:

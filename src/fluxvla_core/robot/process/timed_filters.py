@@ -2,7 +2,7 @@
 
 A filter computes between two commands. One that takes too long would make a command late, one that
 hangs would leave the arm to its last command. Here each computes in a thread of its own, and what
-is not there in time is left out. A filter that keeps the interpreter's lock cannot be interrupted:
+is not there in time is left out. A filter that holds the GIL cannot be interrupted:
 the main process then sees that the control process does not run, and kills it.
 """
 
@@ -64,7 +64,7 @@ def timed_filters(
 
 @dataclass(frozen=True)
 class _Result:
-    """What a filter made, ``(dim,)``; or what it raised."""
+    """A filter's output, ``(dim,)``, or the exception that it raised."""
 
     action: Array | None = None
     error: BaseException | None = None
@@ -191,7 +191,7 @@ class TimedFilter(ActionFilter):
     def _take(self, deadline: float) -> _Result | None:
         """The result of what the thread was given; None if it is not there by ``deadline``."""
         try:
-            with realtime.shared_interpreter():
+            with realtime.shared_gil():
                 result = self._results.get(timeout=max(deadline - time.monotonic(), 0.0))
         except queue.Empty:
             return None
@@ -200,7 +200,7 @@ class TimedFilter(ActionFilter):
 
     def _compute(self) -> None:
         # As in the sending thread, where filters run otherwise: a busy machine makes none late.
-        realtime.just_below_real_time()
+        realtime.raise_priority()
         while True:
             work = self._work.get()
             try:

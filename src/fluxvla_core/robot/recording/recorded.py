@@ -125,7 +125,7 @@ class Recorded:
 
     @property
     def instruction(self) -> str:
-        """What was to be done."""
+        """The instruction of the episode."""
         return str(self.start.get("instruction") or "")
 
     @property
@@ -179,7 +179,7 @@ class Recorded:
         return found
 
     def summary(self) -> dict[str, Any]:
-        """As ``episode.json``, counted again."""
+        """The content of ``episode.json``, computed again from the events."""
         return episode_log.summarise(self.events)
 
 
@@ -254,7 +254,7 @@ def read_lines(path: Path) -> tuple[list[Event], bool]:
 
 @dataclass(frozen=True)
 class BagContent:
-    """What a bag's file holds: events, and where its pictures are (topic, type, ns, place)."""
+    """Content of a bag: events, and where its images are (topic, type, ns, place)."""
 
     file: McapFile
     unpacker: ros.Unpacker

@@ -91,7 +91,7 @@ class EpisodeRecorder(EpisodeObserver):
                     event.at,
                     observed=event.reading.at,
                     rate_hz=self._policy.action_rate_hz,
-                    keyframes=event.keyframes,
+                    keyframes=event.actions,
                     ms=milliseconds(event.stages),
                 )
             case CommandSent():

@@ -18,7 +18,7 @@ from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.robot import Clock, Operator
 from fluxvla_core.errors import ConfigError, DataError, NotReady
 from fluxvla_core.robot.control.clock import MonotonicClock, SimulatedClock
-from fluxvla_core.robot.control.source import PolicyEnded
+from fluxvla_core.robot.control.policy_client import PolicyEnded
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,
@@ -108,7 +108,7 @@ class ReplayOperator(Operator):
             )
 
     def get_frame(self) -> RobotFrame:
-        """What belongs together now; pictures in fresh arrays, depth and base where recorded.
+        """The matched readings of this moment; images in new arrays, depth and base if recorded.
 
         Streams are as late, and as far apart, as they were when the robot was looked at last. No
         stream runs backwards: the recorded looks bound what is shown between them.
@@ -280,13 +280,13 @@ class ReplayPolicy(Policy):
 
     @property
     def action_rate_hz(self) -> float:
-        """Keyframes a second."""
+        """Actions a second."""
         key = "action_rate_hz" if self.actions == CHUNKS else "rate_hz"
         return float(self.recorded.start[key])
 
     @property
     def horizon(self) -> int:
-        """Keyframes of a chunk."""
+        """Actions of a chunk."""
         return len(self._chunks[0])
 
     @property

@@ -37,6 +37,7 @@ VECTORS: Mapping[str, str] = {
 BASES = f"{ROOT}/base"
 BASE = "base"
 CHUNKS = f"{ROOT}/chunk"
+# The name of a chunk's actions in the recording format.
 KEYFRAMES = "keyframes"
 
 STRING = "std_msgs/msg/String"

@@ -83,7 +83,7 @@ def row_times(recorded: Recorded, fps: float) -> Array:
 
 
 def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recorded]:
-    """Those that can be used; what is left out is reported."""
+    """The recordings that can be used; the others are reported."""
     found, failed = [], 0
     for path in paths:
         recorded = open_recording(path)

@@ -48,7 +48,7 @@ safe to call from any thread."""
 
 
 class Log(Protocol):
-    """Where events go: JSON lines, or a bag that ROS tools open, which has the pictures too.
+    """A file that events are written to: JSON lines, or a bag for ROS tools, also with images.
 
     Both take the same events and give the same events back (``recording.recorded``). Every method
     is called in one thread, but for the constructor.
@@ -96,7 +96,7 @@ class JsonLines(Log):
 
 
 def _json(value: Any) -> str:
-    """A chunk row by row: one call for all would keep the interpreter from the sending thread."""
+    """A chunk as lists, row by row: one call for all would hold the GIL for too long."""
     if isinstance(value, np.ndarray) and value.ndim > 1:
         return "[" + ", ".join(map(_json, value)) + "]"
     return json.dumps(value, default=ros.numpy_as_json)
@@ -104,7 +104,7 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """What is asked for beyond events and videos.
+    """What a complete recording holds beyond events and videos.
 
     Args:
         names: ``state`` and ``action`` -> joint names.
@@ -235,8 +235,8 @@ class EpisodeTrace:
         return JsonLines(self.folder)
 
     def _run(self) -> None:
-        # The sending thread waits for the interpreter while this thread has it.
-        realtime.just_below_real_time()
+        # The sending thread waits for the GIL while this thread holds it.
+        realtime.raise_priority()
         while True:
             try:
                 item = self._items.get(timeout=_POLL_S)
@@ -250,7 +250,7 @@ class EpisodeTrace:
                     self._guard(self._put, item)
             if self._error is None:
                 self._guard(self._between)
-        with realtime.normal():
+        with realtime.normal_priority():
             self._finish()
 
     def _finish(self) -> None:
@@ -271,7 +271,7 @@ class EpisodeTrace:
             self._log.add(item)
             return
         camera, stamp, image = item
-        with realtime.normal():
+        with realtime.normal_priority():
             if stamp is None:
                 self._film(camera, image)
             elif image.ndim == 2:
@@ -288,7 +288,7 @@ class EpisodeTrace:
         self._videos[camera].add(image)
 
     def _between(self) -> None:
-        """What is due from time to time."""
+        """Do the periodic work: poll, flush."""
         now = time.monotonic()
         if now - self._looked >= _POLL_S:
             self._looked = now
@@ -300,7 +300,7 @@ class EpisodeTrace:
     def _poll(self) -> None:
         if self._source is None or self._error is not None:
             return
-        with realtime.normal():
+        with realtime.normal_priority():
             self._poll_all(self._source)
 
     def _poll_all(self, source: Source) -> None:

@@ -1,0 +1,25 @@
+"""PI0.5 on ALOHA by adapters, in the language model and the action expert.
+
+fluxvla run --config configs/pi05_aloha_lora.py --section runner --nproc 8
+
+openpi's low-memory recipe (src/openpi/models/gemma.py and src/openpi/training/config.py): adapters
+in attention and feed-forward layers, alpha as large as the rank, no averaged weights. There the
+language model has rank 16 and the expert 32, and the vision tower is trained as a whole; here all
+have rank 16, and the tower stays as it is. The layers that states, actions and times pass are
+trained as a whole.
+"""
+
+_base_ = "pi05_aloha.py"
+
+runner = dict(
+    ema_decay=None,
+    lora=dict(
+        rank=16,
+        alpha=16,
+        target_modules=(
+            r"llm_(backbone|expert)\.layers\.\d+"
+            r"\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+        ),
+        modules_to_save=["action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out"],
+    ),
+)

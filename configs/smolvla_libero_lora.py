@@ -1,0 +1,22 @@
+"""SmolVLA on LIBERO-Object by adapters in the action expert; see ``smolvla_libero.py``.
+
+fluxvla run --config configs/smolvla_libero_lora.py --section runner --nproc 2
+
+LeRobot's defaults for SmolVLA (modeling_smolvla.py: queries and values of the expert, and the
+projections of states, actions and times) with the rank and the rate of its guide to adapters: 64
+and 1e-3, ten times that of full fine-tuning. Alpha is peft's own default.
+"""
+
+_base_ = "smolvla_libero.py"
+
+runner = dict(
+    learning_rate=1e-3,
+    lora=dict(
+        rank=64,
+        alpha=8,
+        target_modules=(
+            r"expert\.layers\.\d+\.self_attn\.[qv]_proj|state_proj|action_out_proj"
+            r"|embed_actions\.(action_in_proj|action_time_mlp_(in|out))"
+        ),
+    ),
+)

@@ -1,0 +1,1 @@
+"""Policies of an installed LeRobot as FluxVLA policies."""

@@ -1,0 +1,1 @@
+"""Videos and success rates in Weights & Biases (https://wandb.ai), online and offline."""

@@ -1,0 +1,222 @@
+"""The output of ``fluxvla run --dry-run``: the config, and what can be known of a training."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+from fluxvla_core.cli.config_commands import listing, used
+from fluxvla_core.cli.plan import Plan
+
+if TYPE_CHECKING:
+    from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.training.footprint import Footprint
+    from fluxvla_core.training.rehearsal import Rehearsal
+
+_GB = 1e9
+_COLUMNS = 80
+_ROWS = {
+    "parameters": "weights",
+    "gradients": "gradients",
+    "optimizer": "optimizer",
+    "averages": "averaged weights",
+    "gathered": "gathered, exchanged",
+    "weight_copies": "weights to compute",
+    "activations": "activations",
+    "recomputed": "recomputed block",
+    "batch": "batch",
+    "total": "one process",
+}
+
+
+def outline(plan: Plan, log_format: str, nproc: int | None) -> str:
+    """What ``--dry-run`` prints, for people or as one JSON object.
+
+    Args:
+        log_format: ``text`` or ``json``.
+        nproc: processes of the training; None for a few numbers of them.
+    """
+    found = _rehearsal(plan, nproc) if plan.trains and "model" in plan.config.tree else None
+    if log_format == "json":
+        return json.dumps(_as_json(plan, found))
+    lines = [
+        f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
+        f"work dir: {plan.work_dir}",
+        "plugins:",
+        *used(plan.uses),
+        "config:",
+        *(f"  {line}" for line in listing(plan.config, origin=True)),
+    ]
+    if isinstance(found, str):
+        lines += ["pipeline:", f"  {found}"]
+    elif found is not None:
+        lines += ["pipeline:", *(f"  {line}" for line in _pipeline(found)), *_memory(found)]
+    return "\n".join(lines)
+
+
+def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
+    """What is known of the training; a line that says why nothing is."""
+    from fluxvla_core.build import RunContext
+    from fluxvla_core.cli.reporters import heartbeat
+    from fluxvla_core.config.tree import freeze
+
+    try:
+        from fluxvla_core.training.rehearsal import PROCESSES, rehearse
+    except ImportError as error:
+        return f"shapes and memory are not known: {error}"
+    context = RunContext(
+        config=freeze(plan.config.tree),
+        section=plan.section,
+        work_dir=plan.work_dir,
+        origins=plan.config.origins,
+        config_file=plan.config.file,
+        nproc=nproc or 1,
+    )
+    with heartbeat("putting the training together without memory"):
+        return rehearse(context, PROCESSES if nproc is None else (nproc,))
+
+
+def _as_json(plan: Plan, found: Rehearsal | str | None) -> dict[str, Any]:
+    told: dict[str, Any] = {
+        "section": plan.section,
+        "trains": plan.trains,
+        "work_dir": str(plan.work_dir),
+        "plugins": [
+            {"key": u.key, "type": u.found.title, "provided_by": u.found.origin} for u in plan.uses
+        ],
+        "config": plan.config.tree,
+        "origins": dict(plan.config.origins),
+    }
+    if isinstance(found, str):
+        return {**told, "notes": [found]}
+    if found is None:
+        return told
+    data, robot = found.data, found.robot
+    pipeline = {
+        "dataset": None
+        if data is None
+        else {
+            "samples": None if data.dataset is None else len(data.dataset),
+            "states": data.states,
+            "actions": data.actions,
+            "cameras": {name: list(size or ()) or None for name, size in data.cameras.items()},
+        },
+        "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in found.batch.items()},
+        "model": {
+            "type": found.model,
+            "parameters": found.parameters,
+            "trained": found.trained,
+            "action_shape": None if found.action_shape is None else list(found.action_shape),
+        },
+        "robot": None if robot is None else robot.to_dict(),
+    }
+    memory = {
+        "precision": found.precision,
+        "activations_known": found.activations_known,
+        "left_out": list(_left_out()),
+        "bytes": {str(count): one.to_dict() for count, one in found.memory.items()},
+    }
+    return {**told, "pipeline": pipeline, "memory": memory, "notes": found.notes}
+
+
+def _pipeline(found: Rehearsal) -> list[str]:
+    """The way of the shapes from the data to the robot, a line each."""
+    rows: list[tuple[str, str]] = []
+    data = found.data
+    if data is not None:
+        rows.append(("dataset", _dataset(found)))
+        cameras = [f"{name} {_size(size)}" for name, size in data.cameras.items()]
+        rows.append(("cameras", ", ".join(cameras) or "none"))
+        rows.append(("sample", f"states {data.states}, actions {data.actions} wide"))
+    for number, (key, (shape, dtype)) in enumerate(found.batch.items()):
+        rows.append(("" if number else "batch", f"{key} {shape} {dtype}"))
+    if found.model:
+        share = found.trained / found.parameters if found.parameters else 0.0
+        counts = f"{found.parameters:,} parameters, {found.trained:,} trained ({share:.1%})"
+        rows.append(("model", f"{found.model}: {counts}"))
+        if found.action_shape is not None:
+            rows.append(("", "chunks of {} actions, {} wide".format(*found.action_shape)))
+    if found.robot is not None:
+        rows += _robot(found.robot)
+    rows += [("" if number else "notes", note) for number, note in enumerate(found.notes)]
+    width = max((len(name) for name, _ in rows), default=0)
+    return [
+        line
+        for name, text in rows
+        for line in textwrap.wrap(
+            text,
+            _COLUMNS - 2,
+            initial_indent=f"{name:{width}}  ",
+            subsequent_indent=" " * (width + 4),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    ]
+
+
+def _dataset(found: Rehearsal) -> str:
+    assert found.data is not None
+    dataset = found.data.dataset
+    if dataset is None:
+        return "not here: shapes are assumed (see notes)"
+    rate = "" if dataset.fps is None else f" at {dataset.fps:g} Hz"
+    stats = ", ".join(f"{name!r}" for name in dataset.statistics)
+    return f"{len(dataset):,} samples{rate}, {len(dataset.tasks)} tasks, statistics {stats}"
+
+
+def _robot(robot: EmbodimentSpec) -> list[tuple[str, str]]:
+    joints = robot.joints
+    cameras = ", ".join(f"{c.name} {_size((c.height, c.width))}" for c in robot.cameras)
+    speeds = sum(joint.by_speed for joint in joints)
+    jerks = sum(joint.jerk is not None for joint in joints)
+    limits = f"{len(joints) - speeds} positions, {len(joints)} speeds and accelerations"
+    return [
+        ("robot", f"{robot.name}: {robot.dim} joints at {robot.rate_hz:g} Hz"),
+        ("", f"cameras {cameras or 'none'}"),
+        ("", f"limits of {limits}, {jerks} jerks"),
+    ]
+
+
+def _size(size: tuple[int, int] | None) -> str:
+    return "of unknown size" if size is None else f"{size[0]}x{size[1]}"
+
+
+def _memory(found: Rehearsal) -> list[str]:
+    """The table of memory: a column for each number of processes, at most 80 characters."""
+    if not found.memory:
+        return []
+    counts = list(found.memory)
+    lines = [
+        f"memory of each process in GB (1e9 bytes), computing in {found.precision}:",
+        f"  {'processes':20}" + "".join(f"{count:>11}" for count in counts),
+    ]
+    for name, title in _ROWS.items():
+        values = [_value(one, name) for one in found.memory.values()]
+        unknown = name == "activations" and not found.activations_known
+        if max(values) < _GB / 2e3 and not unknown and name != "total":
+            continue
+        cells = "".join(f"{'?' if unknown else gigabytes(value):>11}" for value in values)
+        lines.append(f"  {title:20}{cells}")
+    together = [count * one.total for count, one in found.memory.items()]
+    lines.append(f"  {'all processes':20}" + "".join(f"{gigabytes(v):>11}" for v in together))
+    return [*lines, *_wrapped(f"Not counted: {', '.join(_left_out())}.")]
+
+
+def gigabytes(count: int) -> str:
+    """Bytes as GB of two decimals; three where there are few."""
+    return f"{count / _GB:.3f}" if count < _GB else f"{count / _GB:,.2f}"
+
+
+def _value(one: Footprint, name: str) -> int:
+    return one.to_dict()[name]
+
+
+def _left_out() -> tuple[str, ...]:
+    from fluxvla_core.training.footprint import LEFT_OUT
+
+    return LEFT_OUT
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, _COLUMNS, initial_indent="  ", subsequent_indent="  ")

@@ -1,0 +1,228 @@
+"""How a policy's model computes an answer: ``eager``, ``compiled`` or as a CUDA ``graph``.
+
+All three give the same actions, up to the rounding of sums in another order. A model that divides
+its answer (``VLA.observe``, ``VLA.denoise``) is timed in two parts, and can be captured: all of its
+denoising steps are then one graph, and what comes before them is another one where the model says
+that it may be.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import VLA
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.policies.clocks import Clock
+from fluxvla_core.policies.cuda_graph import CudaGraph, Record, Recorded, check_gpu, static
+from fluxvla_core.training.model import compile_units
+
+EXECUTIONS = ("eager", "compiled", "graph")
+KEPT_SHAPES = 4
+"""Recordings that are kept, one for each set of shapes; transforms pad, so that one is usual."""
+Batch = Mapping[str, Any]
+
+
+class Execution(Protocol):
+    """Answers batches by a model."""
+
+    caches_casts: bool
+    """Whether autocast may keep the weights that it has cast, which no capture allows."""
+
+    def answer(self, batch: Batch, clock: Clock) -> Tensor:
+        """``predict_action(**batch)``: normalised actions ``(B, T, D)``, until the next call."""
+
+
+class Eager:
+    """Operation by operation.
+
+    What follows from the weights alone is computed anew for each answer, so that they may change.
+    """
+
+    caches_casts = True
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.parts = Parts.of(model)
+
+    def answer(self, batch: Batch, clock: Clock) -> Tensor:
+        """See ``Execution``."""
+        parts = self.parts
+        if parts is None or continues(batch):
+            actions: Tensor = self.model.predict_action(**batch)
+            clock.mark("forward")
+            return actions
+        seen = self.model.observe(**parts.observation(batch))
+        clock.mark("prefix")
+        actions = self.model.denoise(seen, batch["noise"], self.tables())
+        clock.mark("denoise")
+        return actions
+
+    def tables(self) -> Mapping[str, Tensor]:
+        """The model's ``step_tables``."""
+        found: Mapping[str, Tensor] = VLA.adapt(self.model).step_tables()
+        return found
+
+
+class Compiled(Eager):
+    """With blocks that :func:`execution_of` has compiled.
+
+    The tables are computed once: the weights must stay.
+    """
+
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        self._tables: Mapping[str, Tensor] | None = None
+
+    def tables(self) -> Mapping[str, Tensor]:
+        """See ``Eager``."""
+        if self._tables is None:
+            self._tables = super().tables()
+        return self._tables
+
+
+class Graphed(Compiled):
+    """Compiled blocks, and all denoising steps launched at once.
+
+    A chunk that continues another one is guided by gradients, or holds other rows from call to
+    call: it is computed as ``Compiled`` does.
+
+    Args:
+        model: has ``observe`` and ``denoise``.
+        record: what records.
+
+    Raises:
+        ConfigError: the model does not divide its answer.
+    """
+
+    caches_casts = False
+
+    def __init__(self, model: Any, record: Record = CudaGraph) -> None:
+        if Parts.of(model) is None:
+            raise ConfigError(
+                f"execution 'graph': {type(model).__name__} has no observe() and denoise(), the "
+                "second of which would be captured",
+                next="execution='compiled' or 'eager'",
+            )
+        super().__init__(model)
+        self._record = record
+        self._recorded: OrderedDict[Any, Recording] = OrderedDict()
+
+    def answer(self, batch: Batch, clock: Clock) -> Tensor:
+        """See ``Execution``."""
+        assert self.parts is not None
+        if continues(batch):
+            return super().answer(batch, clock)
+        observation, noise = self.parts.observation(batch), batch["noise"]
+        key = tuple((n, t.shape, t.dtype) for n, t in sorted(batch.items()) if _tensor(t))
+        if key not in self._recorded:
+            self._recorded[key] = self._new(observation, noise)
+            if len(self._recorded) > KEPT_SHAPES:
+                self._recorded.popitem(last=False)
+        self._recorded.move_to_end(key)
+        recording = self._recorded[key]
+        seen = recording.observe(observation) if recording.observe else self._observe(observation)
+        clock.mark("prefix")
+        actions = recording.denoise({**seen, _NOISE: noise})[_NOISE]
+        clock.mark("denoise")
+        return actions
+
+    def _observe(self, observation: Batch) -> Mapping[str, Tensor]:
+        seen: Mapping[str, Tensor] = self.model.observe(**observation)
+        return seen
+
+    def _new(self, observation: Mapping[str, Tensor], noise: Tensor) -> Recording:
+        tables = self.tables()
+
+        def denoise(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            seen = {name: value for name, value in inputs.items() if name != _NOISE}
+            return {_NOISE: self.model.denoise(seen, inputs[_NOISE], tables)}
+
+        observe = None
+        if VLA.adapt(self.model).observe_is_capturable:
+            observe = self._record(self._observe, static(observation))
+            seen: Mapping[str, Tensor] = observe.outputs
+        else:
+            seen = static(self._observe(observation))
+        return Recording(observe, self._record(denoise, {**seen, **static({_NOISE: noise})}))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded for one set of shapes.
+
+    Args:
+        observe: None where the model's ``observe`` may not be captured.
+        denoise: reads the memory that ``observe`` writes.
+    """
+
+    observe: Recorded | None
+    denoise: Recorded
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parameters of a model's ``observe``; None: it takes any."""
+
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, model: Any) -> Parts | None:
+        """None if the model does not divide its answer."""
+        if not (implements(model, VLA, "observe") and implements(model, VLA, "denoise")):
+            return None
+        return cls(frozenset(inspect.signature(model.observe).parameters))
+
+    def observation(self, batch: Batch) -> dict[str, Any]:
+        """What of ``batch`` belongs to the observation."""
+        return {name: value for name, value in batch.items() if name in self.names}
+
+
+def execution_of(name: str, model: Any, compiled: bool = False) -> Execution:
+    """The way ``name`` of :data:`EXECUTIONS` for ``model``.
+
+    All but ``eager`` compile its blocks by ``torch.compile``, for the shapes that they meet.
+
+    Args:
+        compiled: its blocks are compiled already.
+
+    Raises:
+        ConfigError: there is no such way, no GPU for it, or the model cannot be run so.
+    """
+    check_execution(name)
+    if name == "eager":
+        return Eager(model)
+    made = Compiled(model) if name == "compiled" else Graphed(model)
+    if not compiled:
+        compile_units(model, dynamic=False)
+    return made
+
+
+def check_execution(name: str) -> None:
+    """Refuse a name that is unknown, and what cannot be done here, before anything is built.
+
+    Raises:
+        ConfigError: see :func:`execution_of`.
+    """
+    if name not in EXECUTIONS:
+        raise ConfigError(f"execution {name!r} is unknown; choose one of {', '.join(EXECUTIONS)}")
+    if name == "graph":
+        check_gpu()
+
+
+def continues(batch: Batch) -> bool:
+    """Whether a chunk is asked for that continues another one."""
+    return "prev_actions" in batch
+
+
+def _tensor(value: Any) -> bool:
+    return isinstance(value, Tensor)
+
+
+_NOISE = "noise"

@@ -1,0 +1,112 @@
+"""``PolicyClient``: how the control loop asks a policy, in this process or in another."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import RunFailed
+from fluxvla_core.robot.control.delays import DelaySource
+from fluxvla_core.robot.control.joiners import Ahead
+from fluxvla_core.robot.control.safety import BadChunk, Rule
+
+Array = npt.NDArray[np.float64]
+
+
+class PolicyFailed(RunFailed):
+    """A policy raised something."""
+
+    rule: ClassVar[str] = Rule.POLICY
+
+
+class PolicyEnded(RunFailed):
+    """A policy has no further answer: the episode ends well when the last one has been played."""
+
+    outcome = "policy_ended"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A policy's answer, as far as the control loop needs it.
+
+    Args:
+        observed: when the observation that it answers was made, on the robot's clock.
+        actions: ``(T, D)`` targets, read-only; None if the chunk is refused.
+        error: why the chunk is refused; None if it is not.
+    """
+
+    observed: float
+    actions: Array | None
+    error: BadChunk | None
+
+    def checked(self) -> Array:
+        """``(T, D)`` the actions.
+
+        Raises:
+            BadChunk: the chunk is refused.
+        """
+        if self.error is not None:
+            raise self.error
+        assert self.actions is not None, "an answer has actions or an error"
+        return self.actions
+
+
+class PolicyClient(ABC):
+    """Observes the robot and asks the policy, for one episode.
+
+    ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
+    return at once, ``late`` after a tenth of a second. Calls come from one thread at a time, but
+    for ``ask``, which a control process has called from a thread of its own.
+
+    Where another process observes and thinks, ``meanwhile`` is called again and again while
+    ``first_state`` or ``reset`` waits for it, if it is set: an arm that is held hears commands.
+    """
+
+    meanwhile: Callable[[], None] | None = None
+
+    @abstractmethod
+    def first_state(self) -> Array:
+        """Wait for the first complete observation; its ``(state_dim,)`` state.
+
+        Raises:
+            NotReady: there was none in time.
+            BadFrame: it is not what the embodiment describes.
+            Interrupted: a signal came meanwhile.
+        """
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Begin the episode for the policy, also once more after an answer that warmed it up.
+
+        Raises:
+            PolicyFailed: the policy raised something.
+        """
+
+    @abstractmethod
+    def ask(self, ahead: Ahead | None) -> Future[Answer]:
+        """Observe, and ask the policy.
+
+        Args:
+            ahead: what the policy has to continue; None for nothing.
+
+        Returns:
+            The answer, or what observing or the policy raised.
+        """
+
+    @abstractmethod
+    def accepted(self, answer: Answer) -> None:
+        """Called with an answer whose chunk is going to be played."""
+
+    @abstractmethod
+    def refused(self, answer: Answer) -> None:
+        """Called with an answer whose chunk is no motion for this arm."""
+
+    @abstractmethod
+    def late(self, since: float) -> tuple[DelaySource, float]:
+        """What took longest since ``since`` (monotonic, in seconds), and how many seconds of it."""

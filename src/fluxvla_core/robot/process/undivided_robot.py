@@ -1,0 +1,150 @@
+"""``UndividedRobot``: a robot whose commands and images are both handled in the control process."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.errors import FluxError
+from fluxvla_core.robot.control.safety import BadFrame, BadTiming
+from fluxvla_core.robot.process.frames import (
+    FrameChannel,
+    Look,
+    frame_of,
+    look_of,
+    look_of_window,
+)
+from fluxvla_core.robot.process.messages import error_fields
+from fluxvla_core.robot.robot import Measured, Robot, as_state, is_number
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+
+Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
+"""Makes a runner's observation, and returns the frame that it was made of, if there is one."""
+
+
+class UndividedRobot(Robot):
+    """A robot that is not divided; the main process asks for its frames.
+
+    They are read in a thread of its own: a camera that keeps ``get_frame`` waiting delays no
+    command. Code in there that holds the GIL does.
+
+    Args:
+        operator, embodiment, sends: as ``Robot`` has them.
+    """
+
+    def __init__(self, operator: Any, embodiment: EmbodimentSpec, sends: bool = False) -> None:
+        super().__init__(operator, embodiment, sends)
+        self._observe: Observe | None = None
+        self._cameras: tuple[str, ...] = ()
+        self._max_age_s = math.inf
+        # When the call of ``get_frame`` that is under way began; None if none is.
+        self._began: float | None = None
+        self._states: deque[Measured] = deque(maxlen=1)
+
+    def observed_by(self, observe: Observe) -> None:
+        """Have a runner make the observations, before ``serve``."""
+        self._observe = observe
+
+    def serve(self, channel: FrameChannel, cameras: Sequence[str], max_age_s: float) -> None:
+        """Begin to answer the main process.
+
+        Args:
+            channel: the control process's end.
+            cameras: names of the cameras whose pictures are sent.
+            max_age_s: how long ``get_frame`` may take while the arm moves.
+        """
+        self._cameras, self._max_age_s = tuple(cameras), max_age_s
+
+        def answer() -> None:
+            while True:
+                channel.wait_for_question()
+                self._began = time.monotonic()
+                look = self._look(channel)
+                self._began = None
+                channel.answer(look)
+
+        threading.Thread(target=answer, name="fluxvla-frames", daemon=True).start()
+
+    def check_reading(self) -> None:
+        """See that ``get_frame`` returns in time; asked at every command while the arm moves.
+
+        Raises:
+            BadTiming: it does not: what it will give is old.
+        """
+        began = self._began
+        seconds = 0.0 if began is None else time.monotonic() - began
+        if seconds > self._max_age_s:
+            raise BadTiming(
+                f"{self.reading.name} has not returned for {seconds:.2f} s, "
+                f"safety.max_age_s is {self._max_age_s:g}",
+                cause=self.reading.cause,
+                next=self.reading.next,
+            )
+
+    def state(self) -> Measured | None:
+        """As ``Robot.state``; without ``get_state`` that of each frame, once."""
+        measured = super().state()
+        if measured is not None or not self._states:
+            return measured
+        return self._states.popleft()
+
+    def _look(self, channel: FrameChannel) -> Look:
+        """The result of one ``get_frame``, or its error."""
+        try:
+            look = self._seen()
+            if channel.fits(look):
+                return look
+            error: BaseException = self._too_large(look)
+        except BaseException as raised:  # noqa: BLE001 - raised in the main process
+            error = raised
+        look = Look({"error": error_fields(error)})
+        if channel.fits(look):
+            return look
+        what = f"{self.reading.name} raised {type(error).__name__} with a very long message"
+        return Look({"error": error_fields(BadFrame(what))})
+
+    def _seen(self) -> Look:
+        if self._observe is None:
+            frame = self.frame()
+            look = look_of(frame, self._cameras, self.reading.name)
+            self._keep_state(frame.state, frame.stamps.get(STATE))
+            return look
+        try:
+            window, made_of = self._observe()
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BadFrame(
+                f"{self.reading.name}, or what the runner makes of it, "
+                f"raised {type(error).__name__}: {error}"
+            ) from error
+        look = look_of_window(window, made_of, self._cameras, "update_observation_window()")
+        if made_of is None:
+            self._keep_state(window.get("qpos"), None)
+        else:
+            self._keep_state(made_of.state, made_of.stamps.get(STATE))
+        return look
+
+    def _keep_state(self, found: Any, stamp: float | None) -> None:
+        """Keep a valid state for the tracking check; the main process reports an invalid one."""
+        try:
+            state = as_state(found, self.embodiment, self.reading.name)
+        except FluxError:
+            return
+        timed = stamp is not None and is_number(stamp) and math.isfinite(stamp)
+        self._states.append(Measured(state, stamp if timed and stamp else self.clock.now()))
+
+    def _too_large(self, look: Look) -> FluxError:
+        from fluxvla_core.robot.observation import check_frame  # rarely needed
+
+        try:
+            check_frame(frame_of(look), self.embodiment, self._cameras)
+        except BadFrame as error:
+            return error
+        size = sum(array.nbytes for array in look.arrays.values())
+        return BadFrame(f"{self.reading.name} gave {size} bytes, more than its embodiment says")

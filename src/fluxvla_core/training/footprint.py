@@ -1,0 +1,285 @@
+"""How much memory a training needs, counted on a model that has none.
+
+The model is built on torch's meta device, and runs its forward pass with fake tensors, which have
+shapes and dtypes only: a model of seven billion parameters is counted on a laptop. Weights,
+gradients and optimizer state are exact. Activations are what autograd keeps for the backward pass
+on a CPU, each storage once; other kernels of a GPU keep a little more or less.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from fluxvla_core.training.layout import Layout, nbytes
+from fluxvla_core.training.model import autocast, blocks_of, loss_of
+from fluxvla_core.training.parameters import trainable
+
+LEFT_OUT = (
+    "fragmentation of the allocator",
+    "the CUDA context",
+    "NCCL's buffers",
+    "workspaces of kernels",
+    "temporaries inside an operation",
+)
+"""What an estimate does not know of."""
+_VALUE = torch.ops.aten._local_scalar_dense.default
+_CAST = torch.ops.aten._to_copy.default
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Bytes that a forward pass leaves for the backward pass.
+
+    Args:
+        activations: storages that autograd keeps, without weights, buffers and the batch.
+        recomputed: what is left of them where the model's units are computed again: what goes into
+            them, and what is outside of them.
+        largest_unit: what the largest of these has inside, which is there again at its turn.
+        weight_copies: trained weights in the dtype that is computed in, which autocast makes.
+        batch: the inputs.
+    """
+
+    activations: int
+    recomputed: int
+    largest_unit: int
+    weight_copies: int
+    batch: int
+
+
+NOTHING = Kept(0, 0, 0, 0, 0)
+"""Where the batch is not known."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Bytes that one process needs on its device, when a step needs most.
+
+    Args:
+        parameters: weights and buffers.
+        gradients: when the backward pass ends.
+        optimizer: the optimizer's state.
+        averages: the averaged weights (``ema_decay``).
+        gathered: weights gathered from other processes, and gradients that are exchanged.
+        weight_copies: weights in the dtype that is computed in.
+        activations: what autograd keeps; with recomputation what is left of it.
+        recomputed: the activations of one block that is computed again.
+        batch: the inputs.
+    """
+
+    parameters: int
+    gradients: int
+    optimizer: int
+    averages: int
+    gathered: int
+    weight_copies: int
+    activations: int
+    recomputed: int
+    batch: int
+
+    @property
+    def total(self) -> int:
+        """The sum of all."""
+        return sum(asdict(self).values())
+
+    def to_dict(self) -> dict[str, int]:
+        """JSON values, with ``total``."""
+        return {**asdict(self), "total": self.total}
+
+
+def footprint(
+    layout: Layout, kept: Kept, optimizer: int, averaged: bool, recompute: bool
+) -> Footprint:
+    """Put together what was counted.
+
+    Args:
+        optimizer: bytes, of :func:`optimizer_bytes`.
+        averaged: whether averaged weights are kept.
+        recompute: whether the model's units are computed again in the backward pass.
+    """
+    return Footprint(
+        parameters=layout.parameters,
+        gradients=layout.gradients,
+        optimizer=optimizer,
+        averages=nbytes(t for group in layout.optimized for t in group) if averaged else 0,
+        gathered=layout.gathered,
+        weight_copies=kept.weight_copies,
+        activations=kept.recomputed if recompute else kept.activations,
+        recomputed=kept.largest_unit if recompute else 0,
+        batch=kept.batch,
+    )
+
+
+def optimizer_bytes(
+    build: Callable[[list[dict[str, Any]], float], torch.optim.Optimizer],
+    groups: Sequence[Sequence[Tensor]],
+) -> int:
+    """Bytes of the state that an optimizer has after its first step.
+
+    Args:
+        build: of the optimizer's settings: ``build(groups, learning_rate)``.
+        groups: the parameters, on any device; of one of processes that share them.
+    """
+    with FakeTensorMode():
+        made = [
+            {"params": [nn.Parameter(torch.empty(t.shape, dtype=t.dtype)) for t in group]}
+            for group in groups
+        ]
+        for group in made:
+            for parameter in group["params"]:
+                parameter.grad = torch.empty_like(parameter)
+        optimizer = build([{**group, "weight_decay": 0.0} for group in made], 1e-3)
+        optimizer.step()
+    return state_bytes(optimizer)
+
+
+def state_bytes(optimizer: torch.optim.Optimizer) -> int:
+    """Bytes of the tensors in an optimizer's state."""
+    states = optimizer.state.values()
+    return nbytes(v for state in states for v in state.values() if isinstance(v, Tensor))
+
+
+def fake(model: nn.Module, gathered_as: Mapping[str, torch.dtype] | None = None) -> nn.Module:
+    """A copy of ``model`` (on the meta device, or on any) of fake tensors on a CPU.
+
+    Args:
+        gathered_as: name of a weight -> its dtype there; that of the model by default.
+    """
+    dtypes = gathered_as or {}
+    known: dict[int, Any] = {}
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        for name, parameter in model.named_parameters():
+            values = torch.empty(parameter.shape, dtype=dtypes.get(name, parameter.dtype))
+            known[id(parameter)] = nn.Parameter(values, parameter.requires_grad)
+        for buffer in model.buffers():
+            known[id(buffer)] = torch.empty(buffer.shape, dtype=buffer.dtype)
+    made = copy.deepcopy(model, known)
+    made.__dict__["_fake_mode"] = mode
+    return made
+
+
+def kept_by_fake(model: nn.Module, batch: Mapping[str, Any], dtype: torch.dtype | None) -> Kept:
+    """:func:`kept` of a model that :func:`fake` made; ``batch`` has tensors on a CPU.
+
+    Raises:
+        Exception: what a model raises that decides by the values of its inputs, or of its weights.
+    """
+    mode: FakeTensorMode = model.__dict__["_fake_mode"]
+    inputs = {k: mode.from_tensor(v) if isinstance(v, Tensor) else v for k, v in batch.items()}
+    with mode:
+        return kept(model, inputs, dtype)
+
+
+def kept(model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | None) -> Kept:
+    """Count what the forward pass of a batch leaves for the backward pass.
+
+    Args:
+        model: of real tensors, or of fake ones.
+        arguments: of its ``forward``, on the same device.
+        dtype: of matrix products (autocast); None for that of the weights.
+    """
+    given = [v for v in arguments.values() if isinstance(v, Tensor)]
+    counter = _Counter(model, given)
+    device = next(model.parameters()).device
+    model.train()
+    with counter.in_units(model), counter, counter.hooks(), autocast(device, dtype):
+        loss_of(model(**arguments), type(model).__name__)
+    inside = {key: size for unit in counter.inside.values() for key, size in unit.items()}
+    left = counter.outside | counter.entering
+    units = (
+        sum(size for key, size in unit.items() if key not in left)
+        for unit in counter.inside.values()
+    )
+    return Kept(
+        activations=sum((counter.outside | inside).values()),
+        recomputed=sum(left.values()),
+        largest_unit=max(units, default=0),
+        weight_copies=sum(counter.copies.values()),
+        batch=nbytes(given),
+    )
+
+
+class _Counter(TorchDispatchMode):
+    """Counts storages that autograd keeps; answers checks of values that fake tensors lack.
+
+    Each of its tables is from a storage to its bytes: ``outside`` of the model's units, ``inside``
+    of each of them, ``entering`` them, and ``copies`` of weights.
+    """
+
+    def __init__(self, model: nn.Module, given: Sequence[Tensor]) -> None:
+        super().__init__()
+        self._own = {_key(t) for t in (*model.parameters(), *model.buffers(), *given)}
+        self._trained = {id(p) for p in trainable(model).values()}
+        self._held: list[Any] = []  # so that no other storage gets the place of one counted
+        self._unit: int | None = None
+        self.outside: dict[int, int] = {}
+        self.inside: dict[int, dict[int, int]] = {}
+        self.entering: dict[int, int] = {}
+        self.copies: dict[int, int] = {}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is _VALUE and isinstance(args[0], FakeTensor) and args[0].dtype is torch.bool:
+            return False  # models ask so whether an input is wrong
+        result = func(*args, **(kwargs or {}))
+        if func is _CAST and id(args[0]) in self._trained:
+            self._hold(result, self.copies)
+        return result
+
+    @contextmanager
+    def hooks(self) -> Iterator[None]:
+        with torch.autograd.graph.saved_tensors_hooks(self._pack, lambda tensor: tensor):
+            yield
+
+    @contextmanager
+    def in_units(self, model: nn.Module) -> Iterator[None]:
+        """Inside, it is known what each of the model's units keeps, and what goes into it."""
+        blocks = blocks_of(model)
+        before = [block.__dict__.get("forward") for block in blocks]
+        for number, block in enumerate(blocks):
+            block.__dict__["forward"] = self._watched(number, block.forward)
+        try:
+            yield
+        finally:
+            for block, forward in zip(blocks, before, strict=True):
+                block.__dict__.pop("forward")
+                if forward is not None:
+                    block.__dict__["forward"] = forward
+
+    def _watched(self, number: int, forward: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            if torch.is_grad_enabled():
+                for value in tree_leaves((args, kwargs)):
+                    if isinstance(value, Tensor) and _key(value) not in self._own:
+                        self._hold(value, self.entering)
+            around, self._unit = self._unit, number
+            try:
+                return forward(*args, **kwargs)
+            finally:
+                self._unit = around
+
+        return run
+
+    def _pack(self, tensor: Tensor) -> Tensor:
+        key = _key(tensor)
+        if key not in self._own and key not in self.copies:
+            found = self.outside if self._unit is None else self.inside.setdefault(self._unit, {})
+            self._hold(tensor, found)
+        return tensor
+
+    def _hold(self, tensor: Tensor, found: dict[int, int]) -> None:
+        storage = tensor.untyped_storage()
+        self._held.append(storage)
+        found[_key(tensor)] = storage.nbytes()
+
+
+def _key(tensor: Tensor) -> int:
+    return int(tensor.untyped_storage()._cdata)

@@ -1,0 +1,137 @@
+"""Parts of a model that a training starts from published weights of their own.
+
+A vision tower or a language model is published alone, under the names of the project that it comes
+from; the rest of the model is drawn anew. Which names correspond, the model says (``PartWeights``).
+"""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.checkpoints.foreign import HUB, foreign_folder, safetensors_in
+from fluxvla_core.checkpoints.parts import Stored, StoredTensors
+from fluxvla_core.contracts.training import PartWeights
+from fluxvla_core.errors import CheckpointError
+from fluxvla_core.training.weights import put_model_tensors, weights_by_name
+
+_SHOWN = 6
+_PICKLED = (".pt", ".pth", ".bin")
+_INSIDE = ("model", "state_dict")
+"""Keys under which a file may have its table of tensors."""
+
+
+def put_parts(model: nn.Module, parts: Sequence[PartWeights]) -> None:
+    """Give parts of a freshly built ``model`` their published weights.
+
+    Raises:
+        CheckpointError: a file is missing or damaged, or its tensors are not those of the part;
+            lists what is missing, left over or of another size.
+    """
+    for part in parts:
+        put_model_tensors(model, matched(tensors_at(part.place), weights_by_name(model), part))
+
+
+def matched(
+    tensors: Mapping[str, Tensor | Stored], wanted: Mapping[str, Tensor], part: PartWeights
+) -> dict[str, Tensor | Stored]:
+    """``tensors`` under the names of ``wanted``, as far as ``part`` names them.
+
+    Raises:
+        CheckpointError: as ``put_parts``.
+    """
+    theirs = {name: other for name in wanted if (other := _other_name(name, part.names))}
+    if not theirs:
+        parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in wanted))
+        raise CheckpointError(
+            f"no weight of the model has {' or '.join(map(repr, part.names))} in its name",
+            where=part.place,
+            cause=f"the model's parts are {parts}",
+        )
+    found = {name for name, other in theirs.items() if other in tensors}
+    tied = {id(wanted[name]) for name in found}  # two names here of what has one name there
+    missing = [
+        n for name, n in theirs.items() if name not in found and id(wanted[name]) not in tied
+    ]
+    used = set(theirs.values())
+    extra = [n for n in tensors if n not in used and not any(text in n for text in part.unread)]
+    sizes = [
+        f"{theirs[name]}: {tuple(tensors[theirs[name]].shape)} there, "
+        f"{tuple(wanted[name].shape)} here"
+        for name in sorted(found)
+        if tensors[theirs[name]].shape != wanted[name].shape
+    ]
+    kinds = (("missing", missing), ("left over", extra), ("of another size", sizes))
+    lines = [
+        f"    {len(items)} {kind}: {', '.join(sorted(items)[:_SHOWN])}"
+        f"{' …' if len(items) > _SHOWN else ''}"
+        for kind, items in kinds
+        if items
+    ]
+    if lines:
+        named = ", ".join(f"{own!r} is {other!r} there" for own, other in part.names.items())
+        raise CheckpointError(
+            "the tensors are not those of the part that they are for:\n" + "\n".join(lines),
+            where=part.place,
+            cause="they are of another model, or their names correspond in another way to those "
+            f"here: {named}",
+        )
+    return {name: tensors[theirs[name]] for name in sorted(found)}
+
+
+def tensors_at(place: str | Path) -> Mapping[str, Tensor | Stored]:
+    """The tensors of a safetensors file, a folder of them (or ``hf:<id>``), or a file of torch's.
+
+    A file of ``torch.save`` is read as data only: no object in it is built.
+
+    Raises:
+        CheckpointError: there is nothing there, or it holds no table of tensors.
+    """
+    path = Path(place).expanduser()
+    if str(place).startswith(HUB) or path.is_dir():
+        folder = foreign_folder(place)
+        if any((folder / f"model.safetensors{end}").is_file() for end in ("", ".index.json")):
+            return safetensors_in(folder)
+        files = sorted(folder.glob("*.safetensors"))
+        if not files:
+            raise CheckpointError("there is no safetensors file", where=str(folder))
+        return StoredTensors(files)
+    if not path.is_file():
+        raise CheckpointError(f"there are no weights at {path}")
+    if path.suffix == ".safetensors":
+        return StoredTensors([path])
+    if path.suffix in _PICKLED:
+        return _of_torch(path)
+    raise CheckpointError(
+        f"weights are read from files that end in .safetensors, {', '.join(_PICKLED)}, or a folder",
+        where=str(path),
+    )
+
+
+def _other_name(name: str, names: Mapping[str, str]) -> str | None:
+    """What the weight ``name`` is called there, by the longest of ``names`` that is in it."""
+    own = max((text for text in names if text in name), key=len, default=None)
+    return None if own is None else name.replace(own, names[own], 1)
+
+
+def _of_torch(path: Path) -> dict[str, Tensor]:
+    try:
+        content: Any = torch.load(
+            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
+        )
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        line = next(iter(str(error).splitlines()), type(error).__name__)
+        raise CheckpointError(f"it cannot be read as tensors: {line}", where=str(path)) from error
+    if isinstance(content, dict):
+        content = next(
+            (content[key] for key in _INSIDE if isinstance(content.get(key), dict)), content
+        )
+    if not isinstance(content, dict) or not all(isinstance(t, Tensor) for t in content.values()):
+        raise CheckpointError("it holds no table of tensors", where=str(path))
+    return {str(name): tensor for name, tensor in content.items()}

@@ -1,0 +1,312 @@
+"""A training that is put together without data, weights, memory or hardware: ``--dry-run``.
+
+What can be known is worked out from the dataset to the robot: shapes, cameras, statistics, limits,
+and the memory of each process. What cannot be, is said; nothing here ends the dry run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from fluxvla_core.build import (
+    RunContext,
+    build_operator_from_cfg,
+    build_runner_from_cfg,
+    build_vla_from_cfg,
+)
+from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.training import VLA
+from fluxvla_core.data.example import Example, example
+from fluxvla_core.errors import FluxError
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.training import lora
+from fluxvla_core.training.base_runner import BaseTrainRunner
+from fluxvla_core.training.footprint import (
+    NOTHING,
+    Footprint,
+    Kept,
+    fake,
+    footprint,
+    kept_by_fake,
+    optimizer_bytes,
+)
+from fluxvla_core.training.layout import Layout
+from fluxvla_core.training.model import ForwardArguments
+from fluxvla_core.training.parameters import trainable
+from fluxvla_core.training.strategy import Strategy
+
+PROCESSES = (1, 2, 4, 8)
+"""For which the memory is told, where nobody says how many there are."""
+
+
+@dataclass
+class Rehearsal:
+    """What is known of a training before it runs.
+
+    Args:
+        robot: of ``inference.operator``.
+        data: a sample.
+        batch: the collator's: name -> shape and dtype.
+        model: name of its class.
+        parameters, trained: their numbers.
+        action_shape: ``(T, D)`` of the model's chunks.
+        memory: number of processes -> what each of them needs.
+        precision: dtype that is computed in.
+        notes: what is not known, or does not fit.
+        skeleton: the model without memory, with its adapters.
+        inputs: the batch itself.
+    """
+
+    robot: EmbodimentSpec | None = None
+    data: Example | None = None
+    batch: dict[str, tuple[tuple[int, ...], str]] = field(default_factory=dict)
+    model: str = ""
+    parameters: int = 0
+    trained: int = 0
+    action_shape: tuple[int, int] | None = None
+    memory: dict[int, Footprint] = field(default_factory=dict)
+    precision: str = "float32"
+    activations_known: bool = False
+    notes: list[str] = field(default_factory=list)
+    skeleton: nn.Module | None = None
+    inputs: Mapping[str, Any] | None = None
+
+
+def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
+    """Put together the training of ``context.section``, as far as that can be done.
+
+    Args:
+        context: with the config's tree.
+        processes: for which numbers of them to count the memory.
+    """
+    found = Rehearsal()
+    found.robot = _robot(context.config, found.notes)
+    model = _model(context, found.notes)
+    runner = _runner(context, found.notes)
+    if model is not None:
+        found.model = type(model).__name__
+        found.parameters = sum(p.numel() for p in model.parameters())
+        found.action_shape = VLA.adapt(model).action_shape
+        if runner is not None and runner.lora is not None:
+            model = _with_adapters(model, runner, context, found.notes)
+    if model is not None:
+        found.trained = sum(p.numel() for p in trainable(model).values())
+    batch = _batch(context, found, runner)
+    found.skeleton, found.inputs = model, batch
+    _compare(found)
+    if model is None or runner is None or not processes:
+        return found
+    if not found.trained:
+        found.notes.append("the model has no trainable parameter: all of its parts are frozen")
+        return found
+    _count(found, model, runner, batch, processes)
+    return found
+
+
+def on_meta(context: RunContext) -> nn.Module:
+    """The config's ``model`` without memory.
+
+    Raises:
+        Exception: what its class raises.
+    """
+    with torch.device("meta"):
+        model: nn.Module = build_vla_from_cfg(context.config["model"], context)
+    return model
+
+
+def memory_of(
+    model: nn.Module,
+    runner: Strategy,
+    batch: Mapping[str, Any] | None,
+    processes: Sequence[int],
+    device_type: str,
+) -> dict[int, Footprint]:
+    """Number of processes -> what each of them needs on its device.
+
+    Args:
+        model: on the meta device, with its adapters.
+        runner: the strategy, with its settings.
+        batch: what the collator gives; None leaves activations out.
+
+    Raises:
+        Exception: what a model raises that decides by the values of its inputs.
+    """
+    options = runner.options
+    kept: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
+    found = {}
+    for count in processes:
+        layout = runner.memory_layout(model, count, device_type)
+        lowered = tuple(layout.gathered_as.items())
+        if lowered not in kept:
+            kept[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+        found[count] = footprint(
+            layout,
+            kept[lowered],
+            optimizer_bytes(runner.optimizer_settings.build, layout.optimized),
+            averaged=options.ema_decay is not None,
+            recompute=options.enable_gradient_checkpointing,
+        )
+    return found
+
+
+def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
+    """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
+    arguments = ForwardArguments(model)(batch)
+    return kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
+
+
+def _count(
+    found: Rehearsal,
+    model: nn.Module,
+    runner: Strategy,
+    batch: Mapping[str, Any] | None,
+    processes: Sequence[int],
+) -> None:
+    if type(runner)._wrap_model is Strategy._wrap_model:
+        processes = (1,)
+    elif type(runner).memory_layout is Strategy.memory_layout:
+        found.notes.append(
+            f"{type(runner).__name__} does not say how it divides a model (memory_layout): the "
+            "memory is that of whole copies"
+        )
+    if runner.compute_dtype is not None:
+        found.precision = str(runner.compute_dtype).removeprefix("torch.")
+    device = runner.options.device
+    device_type = "cpu" if device == "cpu" else "cuda"
+    for inputs in (batch, None):
+        try:
+            found.memory = memory_of(model, runner, inputs, processes, device_type)
+        except Exception as error:  # noqa: BLE001 - another's model; an estimate must not end the run
+            what = "activations are" if inputs is not None else "memory is"
+            found.notes.append(f"{what} not known: {_told(error)}")
+            continue
+        found.activations_known = inputs is not None
+        return
+
+
+def _robot(config: Mapping[str, Any], notes: list[str]) -> EmbodimentSpec | None:
+    section = config.get("inference")
+    table = section.get("operator") if isinstance(section, Mapping) else None
+    if table is None:
+        return None
+    try:
+        operator = Operator.adapt(build_operator_from_cfg(table))
+        try:
+            return operator.embodiment
+        finally:
+            operator.close()
+    except Exception as error:  # noqa: BLE001 - another's class; what is left is still of use
+        notes.append(f"the robot is not known: {_told(error)}")
+        return None
+
+
+def _model(context: RunContext, notes: list[str]) -> nn.Module | None:
+    try:
+        return on_meta(context)
+    except Exception as error:  # noqa: BLE001 - another's class
+        notes.append(f"the model cannot be built without memory: {_told(error)}")
+        return None
+
+
+def _with_adapters(
+    model: nn.Module, runner: Strategy, context: RunContext, notes: list[str]
+) -> nn.Module | None:
+    assert runner.lora is not None
+    try:
+        with torch.device("meta"):
+            lora.attach(model, runner.lora, context.where(f"{context.section}.lora"))
+    except Exception as error:  # noqa: BLE001 - peft's
+        notes.append(f"adapters cannot be put into the model: {_told(error)}")
+        return None
+    return model
+
+
+def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
+    """The section's runner without what it would open: trackers, observers, tokenizers."""
+    table = {**context.config[context.section], "metric": None, "tokenizer": None}
+    config = {k: v for k, v in context.config.items() if k != "hooks"}
+    config[context.section] = table
+    try:
+        runner = build_runner_from_cfg(table, replace(context, config=config))
+    except Exception as error:  # noqa: BLE001 - another's class
+        notes.append(f"the runner cannot be built: {_told(error)}")
+        return None
+    if not isinstance(runner, BaseTrainRunner):
+        notes.append(f"{type(runner).__name__} is no BaseTrainRunner: its memory is not known")
+        return None
+    return runner
+
+
+def _batch(
+    context: RunContext, found: Rehearsal, runner: BaseTrainRunner | None
+) -> Mapping[str, Any] | None:
+    try:
+        table = context.config["train_dataloader"]["dataset"]
+        widths = _widths(context.config.get("model", {}), found.action_shape)
+        found.data = example(table, context, found.robot, widths)
+        found.notes += found.data.assumed
+        if runner is None:
+            return None
+        size = runner.loader_options.per_device_batch_size
+        batch: Mapping[str, Any] = runner.collator([found.data.sample] * size)
+    except Exception as error:  # noqa: BLE001 - datasets and transforms of others
+        found.notes.append(f"the batch is not known: {_told(error)}")
+        return None
+    found.batch = {
+        key: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
+        for key, value in batch.items()
+        if isinstance(value, Tensor)
+    }
+    return batch
+
+
+def _widths(model: Any, chunk: tuple[int, int] | None) -> tuple[int, int]:
+    """Widths of states and actions that a model's table names; those of its chunks otherwise."""
+    actions = _named(model, "ori_action_dim") or _named(model, "action_dim")
+    actions = actions or (chunk[1] if chunk is not None else 1)
+    return _named(model, "state_dim") or actions, actions
+
+
+def _named(table: Any, key: str) -> int | None:
+    """The first number under ``key`` in nested tables."""
+    if not isinstance(table, Mapping):
+        return None
+    if isinstance(table.get(key), int):
+        return int(table[key])
+    inner = (_named(value, key) for value in table.values())
+    return next((value for value in inner if value is not None), None)
+
+
+def _compare(found: Rehearsal) -> None:
+    """Note where data, model and robot do not fit together."""
+    data, robot, chunk = found.data, found.robot, found.action_shape
+    if data is not None and data.dataset is not None and robot is not None:
+        for what, have, takes in (
+            ("states", data.states, robot.state_dim),
+            ("actions", data.actions, robot.dim),
+        ):
+            if have != takes:
+                found.notes.append(
+                    f"the dataset's {what} have {have} numbers, those of {robot.name} {takes}"
+                )
+    if robot is not None and data is not None:
+        missing = sorted(set(data.cameras) - {camera.name for camera in robot.cameras})
+        if missing:
+            found.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
+    actions = found.batch.get("actions")
+    if chunk is not None and actions is not None and actions[0][1:] != tuple(chunk):
+        found.notes.append(
+            f"the batch's actions are {actions[0][1:]} a sample, the model's chunks {tuple(chunk)}"
+        )
+
+
+def _told(error: Exception) -> str:
+    """An error in one line."""
+    text = error.what if isinstance(error, FluxError) else f"{type(error).__name__}: {error}"
+    lines = text.strip().splitlines() or [type(error).__name__]
+    return lines[0][:300]

@@ -1,0 +1,1 @@
+"""The documentation as a site: pages that are generated, links, the check of what was built."""

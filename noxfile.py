@@ -176,7 +176,7 @@ def skew(session: nox.Session) -> None:
 
 @nox.session
 def py313(session: nox.Session) -> None:
-    """What needs no torch, on Python 3.13: core, robots, hooks, kits, and the command line."""
+    """What needs no torch, on Python 3.13: configs, contracts, robots, hooks and kits."""
     with Steps(session) as step:
         pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
         env = pythons.filled(ROOT, nox.project.dependency_groups(pyproject, "dev"), session.log)

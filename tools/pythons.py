@@ -30,8 +30,6 @@ TESTED = (
     "tests/testing/test_action_filter_kit.py",
     "tests/testing/test_environment_kit.py",
     "tests/testing/test_hook_kit.py",
-    "tests/testing/test_inference_runner_kit.py",
-    "tests/testing/test_operator_kit.py",
     "tests/testing/test_policy_kit.py",
     *(f"plugins/{name}" for name in PLUGINS),
 )

@@ -32,7 +32,7 @@ class RegistryRow(NamedTuple):
         contract: ``module:class`` of the base class whose methods are the contract; None for
             classes that only the plugin that builds them calls.
         about: what its classes are, for people.
-        api: version of the contract that this core supports. A class declares ``api = "1.0"``: the
+        api: version of the contract that this core speaks. A class declares ``api = "1.0"``: the
             same major and no newer minor is accepted.
     """
 
@@ -119,7 +119,7 @@ def check_api(registry: str, name: str, written: Any, origin: str) -> None:
         return
     upgrade = "fluxvla-core" if want > have else origin.partition(" ")[0]
     raise IncompatiblePlugin(
-        f"{origin}: {name} is written for {registry} {written}, this core supports {speaks}",
+        f"{origin}: {name} is written for {registry} {written}, this core speaks {speaks}",
         next=f"pip install --upgrade {upgrade}",
     )
 

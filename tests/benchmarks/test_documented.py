@@ -99,27 +99,6 @@ def test_for_which_steps_the_loop_costs_nothing_to_speak_of() -> None:
     assert low <= cases[ONE_LAYER]["own_cpu_ms"] <= high
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_how_chunks_are_joined_at_each_delay(way: str) -> None:
-    found = [row for row in results("rtc")["rows"] if row["chunk_joining"] == way]
-    assert tuple(row["delay_s"] for row in found) == DELAYS
-    table = rows("control", "| delay 0 / 50 / 100 / 200 / 300 ms |")
-    ((_, *said),) = (row for row in table if row[0] == f"`{way}`")
-    (episodes,) = {row["episodes"] for row in found}
-    assert f"{episodes} episodes per row and delay" in page("control")
-    assert {row["successes"] for row in found} == {0}
-    assert "completes no hand-over yet" in page("control")
-    assert {row["late"] for row in found} == {0.0}
-    assert "No chunk was late" in page("control")
-    assert f"after {results('rtc')['step']} training steps" in page("control")
-    assert said == [
-        joined(found, "gap_rad", 2),
-        joined(found, "largest_step_rad", 2),
-        joined(found, "acceleration_rms", 1),
-        joined(found, "jerk_rms", 0),
-    ]
-
-
 def test_the_memory_of_each_family_is_the_recorded_one() -> None:
     families = results("memory")["families"]
     assert list(families) == list(memory.FAMILIES)
@@ -158,3 +137,24 @@ def test_the_recorded_memory_is_what_the_program_counts(name: str) -> None:
         pytest.importorskip(package)
     found = json.loads(json.dumps(memory.of_family(memory.FAMILIES[name])))
     assert found == results("memory")["families"][name]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_how_chunks_are_joined_at_each_delay(way: str) -> None:
+    found = [row for row in results("rtc")["rows"] if row["chunk_joining"] == way]
+    assert tuple(row["delay_s"] for row in found) == DELAYS
+    table = rows("control", "| delay 0 / 50 / 100 / 200 / 300 ms |")
+    ((_, *said),) = (row for row in table if row[0] == f"`{way}`")
+    (episodes,) = {row["episodes"] for row in found}
+    assert f"{episodes} episodes per row and delay" in page("control")
+    assert {row["successes"] for row in found} == {0}
+    assert "completes no hand-over yet" in page("control")
+    assert {row["late"] for row in found} == {0.0}
+    assert "No chunk was late" in page("control")
+    assert f"after {results('rtc')['step']} training steps" in page("control")
+    assert said == [
+        joined(found, "gap_rad", 2),
+        joined(found, "largest_step_rad", 2),
+        joined(found, "acceleration_rms", 1),
+        joined(found, "jerk_rms", 0),
+    ]

@@ -453,7 +453,7 @@ def test_plugins_that_cannot_work(write: Write, install: Install) -> None:
         "(a stale or orphaned install): reinstall acme-toy"
     ) in text
     assert (
-        "b.type: acme-toy 1.0: Old is written for operators 9.0, this core supports 1.0: "
+        "b.type: acme-toy 1.0: Old is written for operators 9.0, this core speaks 1.0: "
         "pip install --upgrade fluxvla-core"
     ) in text
     assert "c.type: picky-toy 1.0 needs fluxvla-core>=99, but " in text

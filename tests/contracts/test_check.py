@@ -240,7 +240,7 @@ def test_a_class_for_another_contract_is_refused_in_every_registry(install, regi
         files={"acme_late.py": "class Late:\n    api = '9.0'\n"},
     )
     there = BY_NAME[registry]
-    message = rf"Late is written for {registry} 9\.0, this core supports 1\.0"
+    message = rf"Late is written for {registry} 9\.0, this core speaks 1\.0"
     with pytest.raises(IncompatiblePlugin, match=message):
         there.register_module()(type("Late", (), {"api": "9.0"}))
     with pytest.raises(IncompatiblePlugin, match=message):
@@ -397,3 +397,13 @@ def test_a_model_that_inherits_can_be_given_another_class_as_fsdp_does():
         model = type("Model", bases, {})()
         model.__class__ = type("ShardedModel", (Sharded, type(model)), {})
         assert isinstance(model, Sharded)
+
+
+def test_a_model_chooses_what_of_an_observation_it_takes():
+    class Looks(VLA, nn.Module):
+        def forward(self, x): ...
+        def predict_action(self, images, lang_tokens, noise): ...
+        def observe(self, images, lang_tokens, lang_masks=None): ...
+        def denoise(self, seen, noise, tables): ...
+
+    check_class("vlas", Looks, "here")

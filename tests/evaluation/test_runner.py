@@ -285,7 +285,7 @@ def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
     path.write_text(WALKING.read_text() + "\n# faster\n")
     forget_plugin_files()
     load_plugin_files([path])
-    with pytest.raises(UsageError, match=r"other code ran them: source code \w+ -> \w+") as caught:
+    with pytest.raises(UsageError, match=r"run with other code: source code \w+ -> \w+") as caught:
         evaluate(tmp_path, **options, reporter=listener)
     assert "--set eval.reuse=true to count them" in str(caught.value)
     assert (tmp_path / "eval" / "results.json").read_text() == before
@@ -297,7 +297,7 @@ def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
     assert second["reused"]["episodes"] == 2
     assert results(tmp_path)["groups"]["policy"]["all"]["episodes"] == 3
     # The third is of this code; the other two are not, however often they were counted.
-    with pytest.raises(UsageError, match="other code ran them"):
+    with pytest.raises(UsageError, match="run with other code"):
         evaluate(tmp_path, **options)
     compared = read(tmp_path)
     assert len(compared.records) == 3

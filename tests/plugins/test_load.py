@@ -142,7 +142,7 @@ def test_the_contract_version_is_caret_checked(install, api, upgrade):
     install("fluxvla-x", entry_points=entry("X", "mod_x:X"), files={"mod_x.py": source})
     with pytest.raises(IncompatiblePlugin) as error:
         OPERATORS.get("X")
-    assert f"written for operators {api}, this core supports 1.0" in str(error.value)
+    assert f"written for operators {api}, this core speaks 1.0" in str(error.value)
     assert f"pip install --upgrade {upgrade}" in str(error.value)
 
 

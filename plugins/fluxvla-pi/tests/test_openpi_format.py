@@ -183,14 +183,15 @@ def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(tmp_path, family
     _, out = brought(tmp_path, family, ("top", "none", "right"))
     policy = load_policy(out)
     assert policy.cameras == ("top", "right")
-    act, asked = policy.model.predict_action, []
-    monkeypatch.setattr(policy.model, "predict_action", lambda **b: asked.append(b) or act(**b))
+    act, look, asked = policy.model.predict_action, policy.model.observe, []
+    monkeypatch.setattr(policy.model, "observe", lambda **b: asked.append(b) or look(**b))
     images, state = pi_inputs.observation()
     pictures = {"top": images["front"], "right": images["front"][::-1].copy()}
     policy.reset(pi_inputs.SEED)
     policy.predict_action({"qpos": state, "images": pictures, "task_description": "put it away"})
 
-    (batch,) = asked
+    monkeypatch.undo()
+    batch = {**asked[0], "noise": torch.ones(1, *policy.model.action_shape)}
     top, right = batch["images"].chunk(2, 1)
     masks = torch.tensor([[True, False, True]])
     with torch.no_grad():

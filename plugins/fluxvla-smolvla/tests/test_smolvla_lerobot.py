@@ -118,10 +118,11 @@ def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(
         imported(source, tmp_path / "ours", tokenizer, "--camera", f"{first}=none")
     )
     assert f"cameras {', '.join(others)}; " in capsys.readouterr().out
-    act, asked = policy.model.predict_action, []
-    monkeypatch.setattr(policy.model, "predict_action", lambda **b: asked.append(b) or act(**b))
+    act, look, asked = policy.model.predict_action, policy.model.observe, []
+    monkeypatch.setattr(policy.model, "observe", lambda **b: asked.append(b) or look(**b))
     policy.predict_action(raw_observation(0))
-    (batch,) = asked
+    monkeypatch.undo()
+    batch = {**asked[0], "noise": torch.ones(1, *policy.model.action_shape)}
     gone = -torch.ones_like(batch["images"][:, :3])
     masks = torch.cat([torch.zeros(1, 1, dtype=torch.bool), batch["img_masks"].bool()], 1)
     with torch.no_grad():

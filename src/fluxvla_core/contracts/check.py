@@ -74,6 +74,8 @@ def _arguments(contract: type[Contract], function: Any) -> Arguments:
     if keywords:
         more = any(p.kind is Parameter.VAR_KEYWORD for p in taken)
         return (*keywords, ANY_OTHER) if more else tuple(keywords)
+    if [p.kind for p in taken] == [Parameter.VAR_KEYWORD]:
+        return None  # such as ``VLA.observe``: the class chooses
     return len(taken)
 
 

@@ -208,7 +208,7 @@ def kept(model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | No
     )
 
 
-class _Counter(TorchDispatchMode):
+class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts storages that autograd keeps; answers checks of values that fake tensors lack.
 
     Each of its tables is from a storage to its bytes: ``outside`` of the model's units, ``inside``
@@ -216,7 +216,7 @@ class _Counter(TorchDispatchMode):
     """
 
     def __init__(self, model: nn.Module, given: Sequence[Tensor]) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self._own = {_key(t) for t in (*model.parameters(), *model.buffers(), *given)}
         self._trained = {id(p) for p in trainable(model).values()}
         self._held: list[Any] = []  # so that no other storage gets the place of one counted

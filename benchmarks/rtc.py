@@ -9,7 +9,7 @@ the new one replaces the old one (``latest_only``), is faded in (``overlap``), a
 (``temporal_ensemble``) or continues it by guidance in every denoising step (``rtc``; a policy that
 was trained with ``prefix_conditioning`` continues as it was trained to). Figures of a row, over all
 its episodes: successes with their 95 % Wilson interval; seconds until done; ``gap_rad``, how far
-the first keyframe of a chunk that is not over when the chunk arrives lies from where the chunk
+the first action of a chunk that is not over when the chunk arrives lies from where the chunk
 before it would have been by then, mean and largest over the joins (of the joint that differs most);
 the largest step of the joined target from one command to the next; acceleration and jerk of the
 commands (rms over the arms' joints); and the share of late chunks, for which the arm had to wait.
@@ -48,23 +48,23 @@ def chunks_of(events: list[dict[str, Any]]) -> list[tuple[Chunk, float]]:
     found = []
     for row in events:
         if row["event"] == "chunk":
-            keyframes = np.array(row["keyframes"])
+            actions = np.array(row["keyframes"])
             before = [command for at, command in sent if at <= row["observed"]]
-            anchor = np.array(before[-1]) if before else keyframes[0]
-            found.append((Chunk(keyframes, row["rate_hz"], row["observed"], anchor), row["t"]))
+            anchor = np.array(before[-1]) if before else actions[0]
+            found.append((Chunk(actions, row["rate_hz"], row["observed"], anchor), row["t"]))
     return found
 
 
 def gap(old: Chunk, new: Chunk, arrived: float) -> float | None:
-    """How far the first keyframe of ``new`` that is to come lies from ``old``; None beyond its end.
+    """How far the first action of ``new`` that is to come lies from ``old``; None beyond its end.
 
     In rad, of the arms' joint that differs most.
     """
     row = int((arrived - new.observed) * new.rate_hz + 1e-6)
     elapsed = new.observed + (row + 1) / new.rate_hz - old.observed
-    if row >= len(new.keyframes) or not old.reaches(elapsed):
+    if row >= len(new.actions) or not old.reaches(elapsed):
         return None
-    apart: Array = np.abs(new.keyframes[row] - old.at(elapsed))[ARM_COLUMNS]
+    apart: Array = np.abs(new.actions[row] - old.at(elapsed))[ARM_COLUMNS]
     return float(apart.max())
 
 

@@ -38,7 +38,7 @@ def test_a_gap_is_where_the_first_keyframe_to_come_lies(delay: float, row: int) 
     """The old chunk goes through 0.1 j after j tenths; the new one, asked at 0.5 s, is off."""
     old, new = at(0.1, 0.0), at(0.6, 0.5)
     assert rtc.gap(old, new, 0.5 + delay) == pytest.approx(0.0, abs=1e-9)
-    moved = new.keyframes.copy()
+    moved = new.actions.copy()
     moved[row, 2] += 0.25
     moved[row, 6] += 9.0  # a gripper's
     apart = Chunk(moved, 10.0, 0.5, new.anchor)

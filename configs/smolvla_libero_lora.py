@@ -3,8 +3,8 @@
 fluxvla run --config configs/smolvla_libero_lora.py --section runner --nproc 2
 
 LeRobot's defaults for SmolVLA (modeling_smolvla.py: queries and values of the expert, and the
-projections of states, actions and times) with the rank and the rate of its guide to adapters: 64
-and 1e-3, ten times that of full fine-tuning. Alpha is peft's own default.
+projections of states, actions and times) with rank, alpha and rate of its guide to adapters
+(huggingface.co/docs/lerobot/peft_training): 64, 64 and 1e-3, ten times that of full fine-tuning.
 """
 
 _base_ = "smolvla_libero.py"
@@ -13,7 +13,7 @@ runner = dict(
     learning_rate=1e-3,
     lora=dict(
         rank=64,
-        alpha=8,
+        alpha=64,
         target_modules=(
             r"expert\.layers\.\d+\.self_attn\.[qv]_proj|state_proj|action_out_proj"
             r"|embed_actions\.(action_in_proj|action_time_mlp_(in|out))"

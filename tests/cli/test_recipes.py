@@ -29,7 +29,8 @@ def test_a_recipe_is_complete(name: str, capsys: pytest.CaptureFixture[str]) -> 
     found = json.loads(capsys.readouterr().out)
     assert not [note for note in found["notes"] if WRONG.search(note)]
     told = found["memory"]["bytes"]["2"]
-    assert 0 < told["gradients"] <= told["parameters"]
+    # FSDP divides gradients at the end of a step; until then a process has them whole.
+    assert 0 < told["gradients"] <= 2 * told["parameters"]
     # Qwen3-VL decides by the values of its tokens where it is trained.
     assert found["memory"]["activations_known"] == (name != "gr00t_n17_libero_full")
 

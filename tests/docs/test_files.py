@@ -11,8 +11,10 @@ import pytest
 from fluxvla_core.build import RunContext
 from fluxvla_core.evaluation.runner import EvalRunner
 from fluxvla_core.robot.recording.episode_log import EpisodeSummary
+from tests.evaluation.conftest import walking
 
-pytest_plugins = ["tests.evaluation.conftest"]
+__all__ = ["walking"]
+
 PAGE = Path(__file__).parents[2] / "docs" / "files.md"
 LIVE = {"outcome", "ticks", "late_ticks", "missed_ticks", "skipped_beats", "trips", "record"}
 

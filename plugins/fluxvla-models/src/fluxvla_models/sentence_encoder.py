@@ -38,7 +38,9 @@ class SentenceEncoder(nn.Module):
         logging.disable_progress_bar()  # a local file of 90 MB is there in a blink
         try:
             if built_without_memory():
-                config = AutoConfig.from_pretrained(str(folder), local_files_only=True)
+                config = AutoConfig.from_pretrained(
+                    str(folder), local_files_only=True, trust_remote_code=False
+                )
                 self.encoder = AutoModel.from_config(config, trust_remote_code=False)
             else:
                 self.encoder = AutoModel.from_pretrained(

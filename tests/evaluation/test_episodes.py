@@ -109,7 +109,7 @@ def test_an_episode_log_of_other_versions_is_asked_for(tmp_path):
     assert json.loads(path.read_text().splitlines()[1])["return"] is None, "JSON has no NaN"
     assert len(EvalLog(path, {"a": 1}, code=CODE).records(keys_of(1))) == 1
     newer = {**CODE, "versions": {"mujoco": "3.4.0", "numpy": "2"}}
-    with pytest.raises(UsageError, match=r"ran them: mujoco 3\.3\.0 -> 3\.4\.0\n"):
+    with pytest.raises(UsageError, match=r"run with other code: mujoco 3\.3\.0 -> 3\.4\.0\n"):
         EvalLog(path, {"a": 1}, code=newer)
     beside = tmp_path / "episodes-0000-of-0002.jsonl"
     with pytest.raises(UsageError, match=r"mujoco 3\.3\.0 -> 3\.4\.0"):

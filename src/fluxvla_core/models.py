@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from fluxvla_core.checkpoints.foreign import foreign_folder as foreign_folder
     from fluxvla_core.checkpoints.foreign import renamed as renamed
     from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
+    from fluxvla_core.checkpoints.foreign import torch_table as torch_table
     from fluxvla_core.checkpoints.foreign import without_cameras as without_cameras
     from fluxvla_core.checkpoints.parts import Stored as Stored
     from fluxvla_core.contracts.checkpoint_format import CheckpointFormat as CheckpointFormat
@@ -47,6 +48,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "foreign_folder",
             "renamed",
             "safetensors_in",
+            "torch_table",
             "without_cameras",
         ],
         "fluxvla_core.checkpoints.parts": ["Stored"],

@@ -149,7 +149,7 @@ def test_a_pickle_would_be_seen(source):
 # tests/data/test_no_code.py sees that they are read with weights_only=True.
 PUBLISHED = {
     ROOT / "plugins/fluxvla-openvla/src/fluxvla_openvla/formats.py",
-    ROOT / "src/fluxvla_core/training/part_weights.py",
+    ROOT / "src/fluxvla_core/checkpoints/foreign.py",
 }
 
 

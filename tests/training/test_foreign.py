@@ -214,7 +214,7 @@ def test_two_formats_that_recognise_it_are_told_apart_by_name(tmp_path):
         (["--camera", "wrist=front"], "the checkpoint has no such camera; it has base"),
         (["--camera", "front"], "'front' is not THEIRS=OURS"),
         (["--camera", "base=a", "--camera", "base=b"], "--camera base=… is given twice"),
-        (["--camera", "base=none"], "ReachVLA (reach) needs the pictures of all cameras"),
+        (["--camera", "base=none"], "ReachVLA (reach) needs the images of all cameras"),
         (["--robot", "arm"], "a checkpoint of ReachVLA (reach) is of one robot"),
         (["--rate", "0"], "--rate 0 is not a rate"),
         (["--rate", "nan"], "--rate nan is not a rate"),
@@ -236,10 +236,7 @@ class ManyFormat(ReachFormat):
     def recognizes(self, folder):
         return (folder / "many").is_file()
 
-    def read(self, folder, tokenizer=None):
-        return self.read_for(folder, tokenizer)
-
-    def read_for(self, folder, tokenizer=None, robot=None, absent=()):
+    def read(self, folder, tokenizer=None, robot=None, absent=()):
         found = super().read(folder, tokenizer)
         chosen = chosen_robot(("acme_arm", "acme_dog"), robot, str(folder))
         cameras = ("observation.images.base", "left", "right")

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
+from fluxvla_core.training.formats import read_foreign
 from tests.oracles import fill
 
 from . import published
@@ -126,14 +127,14 @@ def test_of_several_robots_one_is_chosen(version, tmp_path, monkeypatch):
     own["action"]["arm"] |= {"max": [8.0] * 4, "q99": [8.0] * 4}
     file.write_text(json.dumps(content))
 
-    left, chosen = FORMATS[version]().read(source), FORMATS[version]().read_for(source, robot="gr1")
+    left, chosen = FORMATS[version]().read(source), FORMATS[version]().read(source, robot="gr1")
 
     assert (left.model["embodiment_id"], chosen.model["embodiment_id"]) == (2, 1)
     low = "q01" if version == "n1.7" else "min"
     assert chosen.statistics["private"]["action"][low] == [-7.0] * 4 + [joined("action", low)[4]]
     assert left.statistics["private"]["action"][low] == joined("action", low).tolist()
     with pytest.raises(UsageError, match=r"mean 'gr1'. It knows gr1, new_embodiment, oxe_droid"):
-        FORMATS[version]().read_for(source, robot="gr2")
+        FORMATS[version]().read(source, robot="gr2")
 
 
 @pytest.mark.parametrize("project", SAVED)
@@ -141,7 +142,7 @@ def test_of_several_robots_one_is_chosen(version, tmp_path, monkeypatch):
 def test_a_camera_that_the_robot_lacks_has_no_place(version, project, tmp_path, monkeypatch):
     source = SAVED[project](version, tmp_path / "theirs", monkeypatch)
     kind = LeRobotGR00TFormat if project == "lerobot" else FORMATS[version]
-    found, both = kind().read_for(source, absent=("front",)), kind().read(source)
+    found, both = kind().read(source, absent=("front",)), kind().read(source)
     assert (found.img_keys, both.img_keys) == (("wrist",), CAMERAS)
     prompts, of_both = (
         next(table for table in read.transforms if "max_len" in table) for read in (found, both)
@@ -150,13 +151,13 @@ def test_a_camera_that_the_robot_lacks_has_no_place(version, project, tmp_path, 
         assert (prompts["num_images"], of_both["num_images"]) == (1, 2)
     assert prompts["max_len"] < of_both["max_len"]
     with pytest.raises(UsageError, match="no such camera; it has front, wrist"):
-        kind().read_for(source, absent=("top",))
+        kind().read(source, absent=("top",))
 
 
 def test_lerobots_folders_are_of_one_robot(tmp_path, monkeypatch):
     source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch)
-    with pytest.raises(UsageError, match="It knows none by name"):
-        LeRobotGR00TFormat().read_for(source, robot="gr1")
+    with pytest.raises(UsageError, match=r"--robot gr1: .* is of one robot, which has no name"):
+        read_foreign(source, "lerobot", robot="gr1")
 
 
 @pytest.mark.parametrize("version", ["n1.5", "n1.7"])

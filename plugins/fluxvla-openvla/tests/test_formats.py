@@ -13,6 +13,7 @@ from fluxvla_core import load_policy
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, ConfigError, UsageError
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
+from fluxvla_core.training.formats import read_foreign
 
 from . import published
 
@@ -156,7 +157,7 @@ def test_of_several_statistics_one_is_chosen(tmp_path, capsys):
     (source / "fluxvla_openvla.json").write_text(json.dumps({**sidecar, "unnorm_key": "fractal"}))
     assert run("import-checkpoint", source, tmp_path / "chosen", *words) == 0
     read = OpenVLAFormat().read
-    found, chosen = read(source), OpenVLAFormat().read_for(source, robot="bridge_orig")
+    found, chosen = read(source), OpenVLAFormat().read(source, robot="bridge_orig")
     for got, name in ((found, "fractal"), (chosen, "bridge_orig")):
         kept = {key: both[name][key] for key in ("proprio", "action")}
         assert got.statistics == {"private": kept}
@@ -167,8 +168,8 @@ def test_of_several_statistics_one_is_chosen(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "--robot bridge: the checkpoint knows no such robot; did you mean 'bridge_orig'" in told
     assert "It knows bridge_orig, fractal" in told
-    with pytest.raises(UsageError, match="OpenVLA needs the pictures of all cameras"):
-        OpenVLAFormat().read_for(source, absent=("image",))
+    with pytest.raises(UsageError, match="needs the images of all cameras"):
+        read_foreign(source, absent=("image",))
     policy = load_policy(tmp_path / "chosen")
     policy.reset(0)
     images = {"image": SEEN["image"]}

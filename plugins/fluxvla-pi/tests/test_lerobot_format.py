@@ -19,6 +19,7 @@ from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner
+from fluxvla_core.training.formats import read_foreign
 
 from .oracles import pi_inputs
 from .published_folders import (
@@ -167,9 +168,9 @@ def test_a_camera_that_the_robot_lacks(tmp_path, bring, capsys):
     chunk = policy.predict_action(observation("pi05"))
     assert chunk.shape == (pi_inputs.HORIZON, pi_inputs.ROBOT_ACTIONS)
     with pytest.raises(UsageError, match="no such camera; it has front, wrist"):
-        LeRobotPiFormat().read_for(tmp_path / "theirs", absent=("top",))
-    with pytest.raises(UsageError, match=r"--robot x: .* It knows none by name"):
-        LeRobotPiFormat().read_for(tmp_path / "theirs", robot="x")
+        LeRobotPiFormat().read(tmp_path / "theirs", absent=("top",))
+    with pytest.raises(UsageError, match=r"--robot x: .* is of one robot, which has no name"):
+        read_foreign(tmp_path / "theirs", "lerobot", robot="x")
 
 
 def test_a_base_model_without_statistics(tmp_path):

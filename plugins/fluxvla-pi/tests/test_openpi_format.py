@@ -169,12 +169,12 @@ def test_statistics_of_two_robots(tmp_path):
     assert (found.statistics, found.transforms) == ({"private": {}}, ())
     text = " ".join(found.notes)
     assert "statistics of several robots (acme/arm, other): choose one by --robot" in text
-    chosen = OpenPiFormat().read_for(source, robot="acme/arm")
+    chosen = OpenPiFormat().read(source, robot="acme/arm")
     alone = OpenPiFormat().read(openpi_folder(tmp_path / "alone", "pi0"))
     assert chosen.statistics == alone.statistics
     assert chosen.transforms == alone.transforms
     with pytest.raises(UsageError, match=r"--robot arm: .* It knows acme/arm, other"):
-        OpenPiFormat().read_for(source, robot="arm")
+        OpenPiFormat().read(source, robot="arm")
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -131,7 +131,7 @@ def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(
             act(**batch), act(**{**batch, "images": images, "img_masks": masks})
         )
     with pytest.raises(UsageError, match=f"no such camera; it has {', '.join(CAMERAS)}"):
-        LeRobotSmolVLA().read_for(source, str(tokenizer), absent=("none_such",))
+        LeRobotSmolVLA().read(source, str(tokenizer), absent=("none_such",))
 
 
 def test_a_policy_continues_a_chunk(source, tmp_path, tokenizer):

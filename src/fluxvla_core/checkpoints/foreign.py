@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from fluxvla_core.checkpoints.parts import Stored, StoredTensors
@@ -45,6 +48,26 @@ def safetensors_in(folder: str | Path, stem: str = "model") -> Mapping[str, Stor
     if missing:
         raise CheckpointError(f"no file has {missing[0]!r}, which is listed", where=str(index))
     return tensors
+
+
+def torch_table(file: Path) -> dict[str, Any]:
+    """What a file of ``torch.save`` holds: a table of tensors, or of tables of them.
+
+    Published weights are pickles in places. They are read as data alone: no object is built.
+
+    Raises:
+        CheckpointError: it cannot be read so, or holds no table.
+    """
+    try:
+        content: Any = torch.load(
+            file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file)
+        )
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        line = next(iter(str(error).splitlines()), type(error).__name__)
+        raise CheckpointError(f"it cannot be read as tensors: {line}", where=str(file)) from error
+    if not isinstance(content, dict):
+        raise CheckpointError("it holds no table of tensors", where=str(file))
+    return content
 
 
 class Renamed(Mapping[str, "Tensor | Stored"]):

@@ -61,34 +61,23 @@ class CheckpointFormat(Contract):
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         """The checkpoint in ``folder``.
 
+        A format whose checkpoints leave a choice has parameters for it besides, which are then
+        options of ``fluxvla import-checkpoint``:
+
+        * ``robot: str | None = None``: whose statistics (and layers) are meant, where a checkpoint
+          knows several, by the name that it has for it: GR00T's embodiment tag, OpenVLA's
+          ``unnorm_key``; see ``chosen_robot``.
+        * ``absent: Sequence[str] = ()``: cameras that the robot does not have, by the checkpoint's
+          names. The model acts as in that project when their images are missing; see
+          ``without_cameras``.
+
         Args:
             tokenizer: ``model_path`` of the tokenizer, for formats that bring none.
 
         Raises:
             CheckpointError: it is damaged, of a newer format, or of a model that is not built here.
+            UsageError: it knows no such robot or camera; says which there are.
         """
-
-    def read_for(
-        self,
-        folder: Path,
-        tokenizer: str | None = None,
-        robot: str | None = None,
-        absent: Sequence[str] = (),
-    ) -> ForeignCheckpoint:
-        """As ``read``, for one of several robots or without some of the cameras.
-
-        Args:
-            robot: whose statistics (and layers) are meant, where the checkpoint knows several, by
-                the name that it has for it: GR00T's embodiment tag, OpenVLA's ``unnorm_key``.
-            absent: cameras that the robot does not have, by the checkpoint's names. The model acts
-                as in that project when their pictures are missing.
-
-        Raises:
-            CheckpointError: as ``read``.
-            UsageError: the checkpoint knows no such robot or camera, or the model cannot do
-                without; it says which there are (``chosen_robot``, ``without_cameras``).
-        """
-        raise NotImplementedError(f"{type(self).__name__} reads its checkpoints as they are")
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
         """Write ``checkpoint`` into the empty ``folder`` as that project saves one.

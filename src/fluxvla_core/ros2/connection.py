@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib
+import importlib.util
 import os
 import re
 import secrets
@@ -118,17 +119,17 @@ class Connection:
     Args:
         name: begins the node's name; process id and a random part make it unique.
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID`` (0 without it).
-        commands: whether a robot is commanded through it. Then messages go through the loopback
-            interface: Fast DDS's shared memory has locks, and a process that is stopped while it
-            has one stops whoever sends to it. And callbacks come from rclpy's ``EventsExecutor``
-            where it has one (from Kilted on), at a third of the CPU time.
+        small: whether all messages are small: states and commands, as in the control process. They
+            go through the loopback interface: Fast DDS's shared memory has locks, and a process
+            that is stopped while it has one stops whoever sends to it. Callbacks come from rclpy's
+            ``EventsExecutor`` where there is one (from Kilted on), at a third of the CPU time.
 
     Raises:
         LoadFailed: there is no rclpy here.
         ConfigError: the domain is no number from 0 to 232.
     """
 
-    def __init__(self, name: str, domain_id: int | None = None, commands: bool = False) -> None:
+    def __init__(self, name: str, domain_id: int | None = None, small: bool = False) -> None:
         rclpy = require_rclpy()
         _check_domain(domain_id)
         keep_large_blocks()
@@ -144,7 +145,7 @@ class Connection:
         self._lock = threading.Lock()
         self._context = Context()
         transports = ExitStack()
-        if commands:
+        if small:
             transports.enter_context(_udp_alone())
         with transports:
             rclpy.init(
@@ -166,7 +167,7 @@ class Connection:
         try:
             self.domain: int = self._context.get_domain_id()
             self.every(WATCH_S, self._watch)
-            self._executor = _executor(self._context, commands)
+            self._executor = _executor(self._context, small)
             self._executor.add_node(self.node)
         except BaseException:
             self._context.try_shutdown()
@@ -253,15 +254,13 @@ class Connection:
 
 
 def _executor(context: Any, events: bool) -> Any:
+    # Jazzy has no such module.
+    if events and importlib.util.find_spec("rclpy.experimental") is not None:
+        from rclpy.experimental import EventsExecutor
+
+        return EventsExecutor(context=context)
     from rclpy.executors import SingleThreadedExecutor
 
-    if events:
-        try:
-            from rclpy.experimental import EventsExecutor
-        except ImportError:
-            pass  # Jazzy has none.
-        else:
-            return EventsExecutor(context=context)
     return SingleThreadedExecutor(context=context)
 
 

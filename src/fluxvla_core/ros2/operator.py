@@ -182,7 +182,7 @@ class RosOperator(Operator):
             self._fault, self._last, self._moving = None, None, False
             name = f"fluxvla_{self.embodiment.name}{_NODE[self._part]}"
             # A process that commands an arm is not to wait for another one's locks.
-            connection = Connection(name, self.domain_id, commands=not self._part.cameras)
+            connection = Connection(name, self.domain_id, small=not self._part.cameras)
             try:
                 self._subscribe_all(connection)
                 self._connection = connection

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.checkpoints.foreign import HUB, foreign_folder
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
-from fluxvla_core.contracts.contract import implements
 from fluxvla_core.errors import CheckpointError, PluginError, UsageError, nearest
 from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS
 
@@ -24,7 +25,7 @@ def read_foreign(
     """Another project's checkpoint, by the format that recognises it.
 
     Args:
-        robot, absent: see ``CheckpointFormat.read_for``.
+        robot, absent: see ``CheckpointFormat.read``.
 
     Raises:
         CheckpointError: none does, or it is damaged.
@@ -62,22 +63,23 @@ def _read(
     robot: str | None,
     absent: Sequence[str],
 ) -> ForeignCheckpoint:
-    if robot is None and not absent:
-        return chosen.read(folder, tokenizer)
-    if implements(chosen, CheckpointFormat, "read_for"):
-        return chosen.read_for(folder, tokenizer, robot, absent)
+    # As of a model's ``predict_action``: what a parameter names is what it can do.
+    able = inspect.signature(chosen.read).parameters
     kinds = ", ".join(chosen.model_types)
-    if robot is not None:
+    if robot is not None and "robot" not in able:
         raise UsageError(
             f"--robot {robot}: a checkpoint of {kinds} ({chosen.name}) is of one robot, which has "
             "no name there",
             next="leave --robot out",
         )
-    raise UsageError(
-        f"--camera {absent[0]}=none: {kinds} ({chosen.name}) needs the pictures of all cameras "
-        "that it was trained with",
-        next="give it another camera's: --camera THEIRS=OURS",
-    )
+    if absent and "absent" not in able:
+        raise UsageError(
+            f"--camera {absent[0]}=none: {kinds} ({chosen.name}) needs the images of all cameras "
+            "that it was trained with",
+            next="give it another camera's: --camera THEIRS=OURS",
+        )
+    choices: dict[str, Any] = {"robot": robot, "absent": absent}
+    return chosen.read(folder, tokenizer, **{k: v for k, v in choices.items() if k in able})
 
 
 def is_foreign(place: str | Path) -> bool:

@@ -6,16 +6,13 @@ from; the rest of the model is drawn anew. Which names correspond, the model say
 
 from __future__ import annotations
 
-import pickle
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.foreign import HUB, foreign_folder, safetensors_in
+from fluxvla_core.checkpoints.foreign import HUB, foreign_folder, safetensors_in, torch_table
 from fluxvla_core.checkpoints.parts import Stored, StoredTensors
 from fluxvla_core.contracts.training import PartWeights
 from fluxvla_core.errors import CheckpointError
@@ -121,17 +118,9 @@ def _other_name(name: str, names: Mapping[str, str]) -> str | None:
 
 
 def _of_torch(path: Path) -> dict[str, Tensor]:
-    try:
-        content: Any = torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        line = next(iter(str(error).splitlines()), type(error).__name__)
-        raise CheckpointError(f"it cannot be read as tensors: {line}", where=str(path)) from error
-    if isinstance(content, dict):
-        content = next(
-            (content[key] for key in _INSIDE if isinstance(content.get(key), dict)), content
-        )
-    if not isinstance(content, dict) or not all(isinstance(t, Tensor) for t in content.values()):
+    content = torch_table(path)
+    tables = (content[key] for key in _INSIDE if isinstance(content.get(key), dict))
+    found: dict[str, Any] = next(tables, content)
+    if not all(isinstance(value, Tensor) for value in found.values()):
         raise CheckpointError("it holds no table of tensors", where=str(path))
-    return {str(name): tensor for name, tensor in content.items()}
+    return {str(name): tensor for name, tensor in found.items()}

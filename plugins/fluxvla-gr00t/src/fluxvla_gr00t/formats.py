@@ -45,28 +45,23 @@ class GR00TN15Format(CheckpointFormat):
         """Whether its ``config.json`` is of GR00T N1.5."""
         return _model_type(folder) == "gr00t_n1_5"
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        """The checkpoint in ``folder``.
-
-        Args:
-            tokenizer: the folder of Eagle's tokenizer.
-
-        Raises:
-            CheckpointError: it is damaged, or does something that GR00T here does not.
-        """
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
+    def read(
         self,
         folder: Path,
         tokenizer: str | None = None,
         robot: str | None = None,
         absent: Sequence[str] = (),
     ) -> ForeignCheckpoint:
-        """The same of one robot, or with fewer pictures: NVIDIA's takes as many as there are.
+        """The checkpoint in ``folder``.
 
         Args:
+            tokenizer: the folder of Eagle's tokenizer.
             robot: its embodiment tag.
+            absent: cameras without pictures; NVIDIA's takes as many as there are.
+
+        Raises:
+            CheckpointError: it is damaged, or does something that GR00T here does not.
+            UsageError: it knows no such robot or camera.
         """
         file = folder / "config.json"
         config = read_json(file, dict[str, Any], CheckpointError)
@@ -99,28 +94,23 @@ class GR00TN17Format(CheckpointFormat):
         """Whether its ``config.json`` is of GR00T N1.7."""
         return _model_type(folder) == "Gr00tN1d7"
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        """The checkpoint in ``folder``.
-
-        Args:
-            tokenizer: the folder of Qwen3-VL's tokenizer.
-
-        Raises:
-            CheckpointError: it is damaged, or does something that GR00T here does not.
-        """
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
+    def read(
         self,
         folder: Path,
         tokenizer: str | None = None,
         robot: str | None = None,
         absent: Sequence[str] = (),
     ) -> ForeignCheckpoint:
-        """The same of one robot, or with fewer pictures: NVIDIA's takes as many as there are.
+        """The checkpoint in ``folder``.
 
         Args:
+            tokenizer: the folder of Qwen3-VL's tokenizer.
             robot: its embodiment tag.
+            absent: cameras without pictures; NVIDIA's takes as many as there are.
+
+        Raises:
+            CheckpointError: it is damaged, or does something that GR00T here does not.
+            UsageError: it knows no such robot or camera.
         """
         file = folder / "config.json"
         settings = _Settings(read_json(file, dict[str, Any], CheckpointError), str(file))

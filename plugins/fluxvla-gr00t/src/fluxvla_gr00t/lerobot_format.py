@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from fluxvla_models.lerobot_files import POSTPROCESSOR, PREPROCESSOR, Step, read_steps, whole
 
 from fluxvla_core.errors import CheckpointError, FluxError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, chosen_robot, safetensors_in
+from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
 from fluxvla_gr00t.lerobot_write import write
 from fluxvla_gr00t.robots import GRIPPER, Robot, fewer_cameras, flat_robot, grouped_robot
@@ -76,26 +76,19 @@ class LeRobotGR00TFormat(CheckpointFormat):
             return False
         return config.get("type") == "groot"
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+    def read(
+        self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()
+    ) -> ForeignCheckpoint:
         """The checkpoint in ``folder``.
 
         Args:
             tokenizer: the folder of the backbone's tokenizer.
+            absent: cameras without pictures; LeRobot takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or has steps that are not LeRobot's for GR00T.
+            UsageError: it has no such camera.
         """
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
-        self,
-        folder: Path,
-        tokenizer: str | None = None,
-        robot: str | None = None,
-        absent: Sequence[str] = (),
-    ) -> ForeignCheckpoint:
-        """The same with fewer pictures: LeRobot takes as many as there are."""
-        chosen_robot((), robot, str(folder / _PRE))
         config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
         steps, packing, version = _preprocessor(folder)
         pack = packing.config

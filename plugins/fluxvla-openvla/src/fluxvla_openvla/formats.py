@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,13 +11,14 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
     Stored,
     chosen_robot,
     safetensors_in,
+    torch_table,
 )
 from fluxvla_openvla.folder import (
     BACKBONE,
@@ -68,29 +68,19 @@ class OpenVLAFormat(CheckpointFormat):
             return False
         return config.get("model_type") == "openvla" or is_native(folder, config)
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        """The checkpoint in ``folder``; nothing is read of safetensors before it is used."""
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
-        self,
-        folder: Path,
-        tokenizer: str | None = None,
-        robot: str | None = None,
-        absent: Sequence[str] = (),
+    def read(
+        self, folder: Path, tokenizer: str | None = None, robot: str | None = None
     ) -> ForeignCheckpoint:
-        """The same by the statistics of the dataset ``robot``, which OpenVLA calls unnorm_key.
+        """The checkpoint in ``folder``; nothing is read of safetensors before it is used.
+
+        Args:
+            tokenizer: not used: one comes with it.
+            robot: the dataset whose statistics are meant, OpenVLA's ``unnorm_key``.
 
         Raises:
-            UsageError: there are none of it, or cameras are said to be absent: the authors' code
-                knows no such model.
+            CheckpointError: it is damaged, or of a model that is not built here.
+            UsageError: it has no statistics of that dataset.
         """
-        if absent:
-            raise UsageError(
-                f"--camera {absent[0]}=none: OpenVLA needs the pictures of all cameras that it was "
-                "trained with",
-                next="give it another camera's: --camera THEIRS=OURS",
-            )
         config, sidecar = read_config(folder) or {}, read_sidecar(folder)
         native = is_native(folder, config)
         check_config(config, folder)
@@ -246,7 +236,7 @@ def _hugging_face(folder: Path, film: bool) -> dict[str, Any]:
 
 
 def _native(file: Path) -> dict[str, Any]:
-    content = _load(file)
+    content = torch_table(file)
     model = content.get("model")
     if not isinstance(model, Mapping):
         raise CheckpointError("it has no table 'model'", where=str(file))
@@ -365,21 +355,8 @@ def _with_mask(statistics: Mapping[str, Any], mask: Sequence[bool] | None) -> di
 
 
 def _tensors(file: Path) -> dict[str, Tensor]:
-    content = _load(file)
+    content = torch_table(file)
     others = [name for name, value in content.items() if not isinstance(value, Tensor)]
     if others:
         raise CheckpointError(f"{others[0]!r} is not a tensor", where=str(file))
-    return content
-
-
-def _load(file: Path) -> dict[str, Any]:
-    """A table of tensors, and of tables, from a file of ``torch.save``: data only, no objects."""
-    try:
-        content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise CheckpointError(
-            f"it cannot be read as tensors: {str(error).splitlines()[0]}", where=str(file)
-        ) from error
-    if not isinstance(content, dict):
-        raise CheckpointError("it holds no table of tensors", where=str(file))
     return content

@@ -17,7 +17,6 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
-    chosen_robot,
     safetensors_in,
     without_cameras,
 )
@@ -55,20 +54,20 @@ class LeRobotPiFormat(CheckpointFormat):
             return False
         return config.get("type") in FAMILIES
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        """The checkpoint in ``folder``; see ``CheckpointFormat``."""
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
-        self,
-        folder: Path,
-        tokenizer: str | None = None,
-        robot: str | None = None,
-        absent: Sequence[str] = (),
+    def read(
+        self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()
     ) -> ForeignCheckpoint:
-        """The same without some of its cameras: LeRobot masks those that are missing."""
+        """The checkpoint in ``folder``.
+
+        Args:
+            tokenizer: the folder of PaliGemma's tokenizer.
+            absent: cameras without pictures, which LeRobot masks.
+
+        Raises:
+            CheckpointError: it is damaged, or does something that PI0 here does not.
+            UsageError: it has no such camera.
+        """
         where = str(folder / CONFIG)
-        chosen_robot((), robot, where)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
         for key, value in _FIXED.items():
             if config.get(key, value) != value:

@@ -49,18 +49,24 @@ class OpenPiFormat(CheckpointFormat):
         """Whether there are weights, and statistics as openpi has them."""
         return (folder / "model.safetensors").is_file() and bool(_statistics_files(folder))
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        """The checkpoint in ``folder``; see ``CheckpointFormat``."""
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
+    def read(
         self,
         folder: Path,
         tokenizer: str | None = None,
         robot: str | None = None,
         absent: Sequence[str] = (),
     ) -> ForeignCheckpoint:
-        """The same of one robot, or without some of its cameras: openpi masks missing ones."""
+        """The checkpoint in ``folder``.
+
+        Args:
+            tokenizer: the folder of PaliGemma's tokenizer.
+            robot: the folder below ``assets`` that has its statistics.
+            absent: cameras without pictures, which openpi masks.
+
+        Raises:
+            CheckpointError: it is damaged, or of a model that is not built here.
+            UsageError: it knows no such robot or camera.
+        """
         assets = folder / "assets"
         files = {f.parent.relative_to(assets).as_posix(): f for f in _statistics_files(folder)}
         chosen = chosen_robot(files, robot, str(assets))

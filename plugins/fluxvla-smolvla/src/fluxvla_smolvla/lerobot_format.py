@@ -15,7 +15,6 @@ from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
     Stored,
-    chosen_robot,
     renamed,
     safetensors_in,
     without_cameras,
@@ -64,27 +63,20 @@ class LeRobotSmolVLA(CheckpointFormat):
             return False
         return config.get("type") == MODEL_TYPE
 
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
+    def read(
+        self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()
+    ) -> ForeignCheckpoint:
         """The checkpoint in ``folder``.
 
         Args:
             tokenizer: the folder of SmolVLM2's tokenizer, which LeRobot fetches from the hub.
+            absent: cameras without pictures, which LeRobot leaves out.
 
         Raises:
             CheckpointError: it is damaged, or does something that SmolVLA here does not.
+            UsageError: it has no such camera.
         """
-        return self.read_for(folder, tokenizer)
-
-    def read_for(
-        self,
-        folder: Path,
-        tokenizer: str | None = None,
-        robot: str | None = None,
-        absent: Sequence[str] = (),
-    ) -> ForeignCheckpoint:
-        """The same without some of its cameras: LeRobot leaves out those that are missing."""
         where = str(folder / "config.json")
-        chosen_robot((), robot, where)
         config = Settings(read_json(folder / "config.json", dict[str, Any], CheckpointError), where)
         config.refuse_unsupported()
         stored = safetensors_in(folder)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.training import Transform as Transform
     from fluxvla_core.training.base_runner import BaseTrainRunner as BaseTrainRunner
     from fluxvla_core.training.distributed import World as World
-    from fluxvla_core.training.distributed import share_buffers as share_buffers
+    from fluxvla_core.training.distributed import broadcast_buffers as broadcast_buffers
     from fluxvla_core.training.layout import Layout as Layout
     from fluxvla_core.training.layout import bare as bare
     from fluxvla_core.training.layout import nbytes as nbytes
@@ -52,11 +52,12 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "VLA",
         ],
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
-        "fluxvla_core.training.distributed": ["World", "share_buffers"],
+        "fluxvla_core.training.distributed": ["World", "broadcast_buffers"],
         "fluxvla_core.training.layout": ["Layout", "bare", "nbytes", "whole"],
         "fluxvla_core.training.model": ["units_of"],
         "fluxvla_core.training.parameters": ["decay_groups", "refuse_scalars", "trainable"],
         "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },
+    deprecated={"share_buffers": "broadcast_buffers"},
 )

@@ -26,7 +26,7 @@ from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
-from fluxvla_core.training.distributed import World, agree, on_first, texts
+from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_max, run_on_rank0
 from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.rng import rng_state
 
@@ -93,17 +93,17 @@ def save_snapshot(
             writer.fill_folder(name, fill)
         return ""
 
-    on_first(world, prepare)
+    run_on_rank0(world, prepare)
     files = [
         *_model_files(saver, snapshot),
         TensorFile.whole(rng_file(world.rank), rng_state(), True),
     ]
     if split:
-        parts = own_parts(tensors, world.first)
+        parts = own_parts(tensors, world.is_rank0)
         if parts:
             files.append(TensorFile.parts(part_file(world.rank), parts))
     else:
-        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
+        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.is_rank0))
 
     def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
         try:
@@ -111,7 +111,7 @@ def save_snapshot(
                 file.write(writer)
         except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
             writer.refuse(error)
-        reports = texts(group, writer.report())
+        reports = all_gather_text(group, writer.report())
 
         def finish() -> str:
             writer.join(reports)
@@ -126,7 +126,7 @@ def save_snapshot(
                 warn(f"old checkpoints could not be removed: {error}")
             return str(path)
 
-        return Path(on_first(group, finish))
+        return Path(run_on_rank0(group, finish))
 
     saver.start(step, files, write)
     return writer.final
@@ -138,7 +138,7 @@ def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
-    first = saver.world.first
+    first = saver.world.is_rank0
     files = [TensorFile.whole(ckpt.MODEL, model, first)]
     if snapshot.adapter:
         files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
@@ -295,7 +295,7 @@ class Saver:
         if job is None:
             return None
         if job.thread is not None:
-            if not wait and agree(self.world, int(job.thread.is_alive())):
+            if not wait and all_reduce_max(self.world, int(job.thread.is_alive())):
                 return None
             job.thread.join()
         if self._hook is not None:

@@ -229,7 +229,7 @@ class Strategy(TrainRunner):
             RunFailed: it could not be written; the earlier ones are as they were.
         """
         saved = self.saver.settle(wait) if self.saver is not None else None
-        if saved is None or not self.world.first:
+        if saved is None or not self.world.is_rank0:
             return
         from fluxvla_core.checkpoints.retention import name_best
 
@@ -252,7 +252,7 @@ class Strategy(TrainRunner):
         adapter = lora.adapter_names(self.model)
         elsewhere = {*brings.names, *adapter}
         documents: dict[str, Mapping[str, Any]] = {}
-        if self.world.first:
+        if self.world.is_rank0:
             documents |= run_documents(self.context, self.dataset, self.model)
         if self.lora is not None:
             documents[lora.CONFIG] = self.lora.for_peft(self.adapter_base)
@@ -296,7 +296,7 @@ class Strategy(TrainRunner):
         saved, warnings = resuming.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
-        for warning in warnings if self.world.first else ():
+        for warning in warnings if self.world.is_rank0 else ():
             self.context.reporter.warn(warning)
         self._load_model_state(resuming.load_weights(checkpoint, self.model, self.left_out))
         described = checkpoint.json(ckpt.OPTIMIZER_META, SavedOptimizer)

@@ -18,7 +18,7 @@ from fluxvla_core.checkpoints.parts import Stored
 from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
-from fluxvla_core.training.distributed import World, on_first
+from fluxvla_core.training.distributed import World, run_on_rank0
 from fluxvla_core.training.formats import is_foreign, read_foreign
 from fluxvla_core.training.model import frozen_sources, set_frozen_source
 
@@ -293,7 +293,7 @@ def start_training_from(
     if place is None:
         return
     # Found once: ranks that looked one after the other could find different ones.
-    found = start_from(model, on_first(world, lambda: exact_place(place)))
+    found = start_from(model, run_on_rank0(world, lambda: exact_place(place)))
     if adapter:
         set_frozen_source(model, str(found))
 

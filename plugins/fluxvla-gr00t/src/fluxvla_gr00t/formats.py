@@ -57,7 +57,7 @@ class GR00TN15Format(CheckpointFormat):
         Args:
             tokenizer: the folder of Eagle's tokenizer.
             robot: its embodiment tag.
-            absent: cameras without pictures; NVIDIA's takes as many as there are.
+            absent: cameras without images; NVIDIA's takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.
@@ -106,7 +106,7 @@ class GR00TN17Format(CheckpointFormat):
         Args:
             tokenizer: the folder of Qwen3-VL's tokenizer.
             robot: its embodiment tag.
-            absent: cameras without pictures; NVIDIA's takes as many as there are.
+            absent: cameras without images; NVIDIA's takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.

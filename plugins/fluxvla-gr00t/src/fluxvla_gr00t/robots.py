@@ -98,7 +98,7 @@ def n15_robot(folder: Path, wanted: str | None = None) -> Robot:
         rate=rates.pop() or None if len(rates) == 1 else None,
         notes=(
             "its groups of joints are in the order of metadata.json; a data config of NVIDIA's "
-            "may have had another, or have cut pictures first",
+            "may have had another, or have cut images first",
         ),
     )
 

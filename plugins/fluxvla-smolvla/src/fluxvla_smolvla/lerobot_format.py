@@ -41,7 +41,7 @@ COMPILED = "model._orig_mod."
 UNSUPPORTED = {
     "adapt_to_pi_aloha": (False, "its joints and grippers are those of pi0's ALOHA"),
     "use_delta_joint_actions_aloha": (False, "its actions are differences"),
-    "add_image_special_tokens": (False, "tokens stand around its pictures"),
+    "add_image_special_tokens": (False, "tokens stand around its images"),
     "use_peft": (False, "it is an adapter for other weights"),
     "n_obs_steps": (1, "it looks at several frames"),
 }
@@ -70,7 +70,7 @@ class LeRobotSmolVLA(CheckpointFormat):
 
         Args:
             tokenizer: the folder of SmolVLM2's tokenizer, which LeRobot fetches from the hub.
-            absent: cameras without pictures, which LeRobot leaves out.
+            absent: cameras without images, which LeRobot leaves out.
 
         Raises:
             CheckpointError: it is damaged, or does something that SmolVLA here does not.

@@ -124,7 +124,7 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
     """State's and action's normalisation, from LeRobot's names.
 
     Raises:
-        CheckpointError: an unknown normalisation, or one of pictures.
+        CheckpointError: an unknown normalisation, or one of images.
     """
     texts = _texts(mapping, "the mapping of normalisations", where)
     unknown = {kind: norm for kind, norm in texts.items() if norm not in NORMS}
@@ -135,7 +135,7 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
         )
     if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
         raise CheckpointError(
-            f"pictures are normalised by {mapping['VISUAL']}; SmolVLA takes them as they are "
+            f"images are normalised by {mapping['VISUAL']}; SmolVLA takes them as they are "
             "(IDENTITY)",
             where=where,
         )

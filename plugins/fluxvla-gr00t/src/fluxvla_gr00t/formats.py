@@ -184,7 +184,7 @@ class _Settings:
 
 
 def _head(settings: _Settings) -> dict[str, Any]:
-    """What both versions say of the head in the same words."""
+    """Settings of the head that both versions name alike."""
     dit, context = settings.table("diffusion_model_cfg"), settings.table("vl_self_attention_cfg")
     settings.require(_FIXED)
     dit.require({**_FIXED_DIT, "output_dim": settings.count("hidden_size")})

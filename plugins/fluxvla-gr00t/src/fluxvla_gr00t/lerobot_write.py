@@ -66,7 +66,7 @@ _ACTING = {
 
 @dataclass(frozen=True)
 class Facts:
-    """What LeRobot's config and processors say of a checkpoint.
+    """Facts of a checkpoint that LeRobot's config and processors hold.
 
     Args:
         version: ``n1.5`` or ``n1.7``.
@@ -218,7 +218,7 @@ def _config(checkpoint: ForeignCheckpoint, facts: Facts) -> dict[str, Any]:
 
 
 def _packing(checkpoint: ForeignCheckpoint, facts: Facts) -> dict[str, Any]:
-    """What the steps that pack inputs of both versions have in common."""
+    """Settings that the packing steps of both versions share."""
     return {
         "state_horizon": 1,
         "action_horizon": checkpoint.horizon,

@@ -1,4 +1,4 @@
-"""What published checkpoints of GR00T know of robots: cameras, statistics, numbers of embodiments.
+"""Robots of published GR00T checkpoints: cameras, statistics, embodiment ids.
 
 A checkpoint may know several robots by their tags. N1.5 has ``experiment_cfg/metadata.json``:
 ``{tag: {"statistics": {"state" | "action": {group: {min, max, mean, std, q01, q99}}}, "modalities":

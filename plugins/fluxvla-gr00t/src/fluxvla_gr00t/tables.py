@@ -1,4 +1,4 @@
-"""What published checkpoints become here: tables of model and transforms, weights, statistics."""
+"""Published checkpoints as tables of model and transforms, weights and statistics."""
 
 from __future__ import annotations
 

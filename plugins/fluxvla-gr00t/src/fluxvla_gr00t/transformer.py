@@ -212,7 +212,7 @@ class DiT(nn.Module):
         return self._out(x, self.modulate(functional.silu(time))[:, None])
 
     def step_tables(self, steps: Tensor) -> dict[str, Tensor]:
-        """What follows from the times ``steps`` ``(K,)`` of all integration steps.
+        """Tensors that depend only on the times ``steps`` ``(K,)`` of the integration steps.
 
         ``blocks`` ``(layers, K, 2 * W)``: scale and shift of each block; ``last`` ``(K, 2 * W)``.
         """

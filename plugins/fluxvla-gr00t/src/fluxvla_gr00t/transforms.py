@@ -1,4 +1,4 @@
-"""What GR00T N1.7 does to images, instructions, states and actions before the model."""
+"""Preprocessing of GR00T N1.7: images, instructions, states and actions."""
 
 from __future__ import annotations
 

@@ -33,11 +33,11 @@ from fluxvla_smolvla.model import SMOLVLM2, SmolVLA
 
 MODEL_TYPE = "smolvla"
 HEAD_DIM = 64
-"""Of SmolLM2 of every size, and of SigLIP's base model."""
+"""Width of an attention head in SmolLM2 of every size, and in SigLIP's base model."""
 VISION_HEADS = {1152: 16}
 """Width of a vision tower -> its heads, where they are not ``HEAD_DIM`` wide: SigLIP so400m."""
 COMPILED = "model._orig_mod."
-"""What names begin with if the policy was compiled when it was saved."""
+"""Prefix of names if the policy was compiled when it was saved."""
 UNSUPPORTED = {
     "adapt_to_pi_aloha": (False, "its joints and grippers are those of pi0's ALOHA"),
     "use_delta_joint_actions_aloha": (False, "its actions are differences"),

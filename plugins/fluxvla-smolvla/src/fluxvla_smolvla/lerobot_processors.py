@@ -55,7 +55,7 @@ Statistics = dict[str, dict[str, list[float]]]
 
 @dataclass(frozen=True)
 class Processors:
-    """What LeRobot does before and after the model.
+    """LeRobot's pre- and postprocessing of the model.
 
     Args:
         norms: ``STATE`` and ``ACTION`` -> the name of a normalisation.
@@ -149,7 +149,7 @@ def _texts(table: Any, what: str, where: str) -> dict[str, str]:
 
 
 def _statistics(tensors: Mapping[str, Stored]) -> Statistics:
-    """Those of a step, flat as ``<feature>.<statistic>``."""
+    """Statistics of a step, flat as ``<feature>.<statistic>``."""
     found: Statistics = {}
     for name, stored in tensors.items():
         feature, _, statistic = name.rpartition(".")

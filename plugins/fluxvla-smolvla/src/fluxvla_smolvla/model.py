@@ -28,7 +28,7 @@ from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
 LOSSES = ("valid", "all")
 SMOLVLM2 = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 BLACK = -1.0
-"""What images are padded with, normalised."""
+"""Normalised value that images are padded with."""
 
 
 class LanguageModel(nn.Module):

@@ -27,7 +27,7 @@ class Rotation:
 
     @classmethod
     def at(cls, positions: Tensor, head_dim: int) -> Rotation:
-        """For ``positions`` ``(B, L)``, in fp32."""
+        """Cosines and sines at ``positions`` ``(B, L)``, in fp32."""
         half = torch.arange(head_dim // 2, dtype=torch.float32, device=positions.device)
         angles = positions[:, None, :, None].float() / LONGEST_WAVE ** (2.0 / head_dim * half)
         return cls(angles.cos(), angles.sin())

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
-from fluxvla_core.checkpoints.parts import is_split, own_parts
 from fluxvla_core.checkpoints.retention import rotate
+from fluxvla_core.checkpoints.shards import is_sharded, local_shards
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
@@ -80,14 +80,14 @@ def save_snapshot(
     world = saver.world
     writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
     tensors = snapshot.optimizer
-    split = any(map(is_split, tensors.values()))
+    sharded = any(map(is_sharded, tensors.values()))
     values = {ckpt.OPTIMIZER_META: snapshot.described, ckpt.TRAINER: snapshot.trainer}
     documents: dict[str, bytes] = {}
 
     def prepare() -> str:
         for name, value in {**values, **snapshot.documents}.items():
             documents[name] = json_bytes(name, value)
-        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
+        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_SHARDS] if sharded else []))
         # Now rather than in the thread: the training may use the same tokenizer meanwhile.
         for name, fill in snapshot.folders.items():
             writer.fill_folder(name, fill)
@@ -96,14 +96,14 @@ def save_snapshot(
     run_on_rank0(world, prepare)
     files = [
         *_model_files(saver, snapshot),
-        TensorFile.whole(rng_file(world.rank), rng_state(), True),
+        TensorFile.full(rng_file(world.rank), rng_state(), True),
     ]
-    if split:
-        parts = own_parts(tensors, world.is_rank0)
-        if parts:
-            files.append(TensorFile.parts(part_file(world.rank), parts))
+    if sharded:
+        shards = local_shards(tensors, world.is_rank0)
+        if shards:
+            files.append(TensorFile.shards(shard_file(world.rank), shards))
     else:
-        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.is_rank0))
+        files.append(TensorFile.full(ckpt.OPTIMIZER, tensors, world.is_rank0))
 
     def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
         try:
@@ -139,11 +139,11 @@ def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
     first = saver.world.is_rank0
-    files = [TensorFile.whole(ckpt.MODEL, model, first)]
+    files = [TensorFile.full(ckpt.MODEL, model, first)]
     if snapshot.adapter:
-        files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
+        files.append(TensorFile.full(lora.WEIGHTS, snapshot.adapter, first))
     if snapshot.ema is not None:
-        files.append(TensorFile.whole(ckpt.EMA, snapshot.ema.shadow, first))
+        files.append(TensorFile.full(ckpt.EMA, snapshot.ema.shadow, first))
     return files
 
 
@@ -152,9 +152,9 @@ def rng_file(rank: int) -> str:
     return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
 
 
-def part_file(rank: int) -> str:
-    """Name of a rank's file with its parts of the optimizer's state."""
-    return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
+def shard_file(rank: int) -> str:
+    """Name of a rank's file with its shards of the optimizer's state."""
+    return f"{ckpt.OPTIMIZER_SHARDS}/rank-{rank:05d}.safetensors"
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:

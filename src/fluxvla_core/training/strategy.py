@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.checkpoints.lock import WorkDirLock
-    from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.checkpoints.shards import Stored
     from fluxvla_core.data.sampler import EpisodeShards
     from fluxvla_core.training.batches import StepPlan
     from fluxvla_core.training.distributed import World
@@ -110,9 +110,9 @@ class Strategy(TrainRunner):
             processes: that train, all on one machine.
             device_type: ``cuda`` or ``cpu``.
         """
-        from fluxvla_core.training.layout import whole
+        from fluxvla_core.training.layout import replicated_layout
 
-        return whole(model)
+        return replicated_layout(model)
 
     def unwrap_model(self, vla: nn.Module) -> nn.Module:
         """The model inside what ``_wrap_model`` returned, with the names that are saved."""
@@ -330,9 +330,9 @@ class Strategy(TrainRunner):
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
         """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
-        from fluxvla_core.training.weights import put_model_tensors
+        from fluxvla_core.training.weights import load_full_tensors
 
-        put_model_tensors(self.model, state)
+        load_full_tensors(self.model, state)
 
     def _load_optimizer_state(self, state: dict[str, Any]) -> bool:
         """Take an optimizer's state in the form of its ``state_dict``; whether it was taken."""

@@ -106,8 +106,8 @@ class ProcessQwenPrompts(Transform):
         ids = list(self.tokenizer.encode(_IMAGE_TOKEN))
         if len(ids) != 1:
             raise ConfigError(
-                f"ProcessQwenPrompts: {_IMAGE_TOKEN} is not one token of this tokenizer but "
-                f"{len(ids)}",
+                f"ProcessQwenPrompts: {_IMAGE_TOKEN} is not a token of this tokenizer, which "
+                f"makes {len(ids)} of it",
                 cause="the tokenizer is not the one of the vision-language model",
             )
         self._image_token = int(ids[0])

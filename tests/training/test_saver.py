@@ -151,7 +151,7 @@ def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, 
         return gathered
 
     plain = run(tmp_path / "plain")
-    monkeypatch.setattr(tensors, "is_split", lambda tensor: True)
+    monkeypatch.setattr(tensors, "is_sharded", lambda tensor: True)
     monkeypatch.setattr(tensors, "whole", pretended)
     split = run(tmp_path / "split")
 

@@ -137,7 +137,7 @@ class BaseTrainRunner(Strategy):
             self._trainer.close()
         if self.saver is not None:
             self.saver.close()
-        if self.world.first:
+        if self.world.is_rank0:
             self.metric.finalize()
         self.hooks.call("run_finished", outcome=outcome)
         if self._work_dir_lock is not None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.tensors import whole
+from fluxvla_core.checkpoints.tensors import full_tensor
 
 
 def gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
     """The norm of all gradients over all ranks, a scalar on the device."""
-    return whole(torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None]))
+    return full_tensor(
+        torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    )
 
 
 def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:

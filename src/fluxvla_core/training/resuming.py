@@ -28,7 +28,7 @@ from fluxvla_core.checkpoints.retention import clear_leftovers, name_best, set_a
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
-from fluxvla_core.training.distributed import World, agree, on_first
+from fluxvla_core.training.distributed import World, all_reduce_max, run_on_rank0
 from fluxvla_core.training.lora import LoraOptions, adapter_tensors
 from fluxvla_core.training.progress import Progress, SavedTrainer
 from fluxvla_core.training.rng import rank_seed, seed_all, seeds_of, set_rng_state
@@ -56,7 +56,7 @@ def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
         locks.append(lock_work_dir(context.work_dir, context.reporter.warn))
         return ""
 
-    on_first(world, take)
+    run_on_rank0(world, take)
     return locks[0] if locks else None
 
 
@@ -77,7 +77,7 @@ def choose_checkpoint(
         CheckpointError: the one at the path is missing or damaged.
         UsageError: the work dir has checkpoints of another run.
     """
-    found = on_first(world, lambda: _choose(context, resume, first))
+    found = run_on_rank0(world, lambda: _choose(context, resume, first))
     return Checkpoint.open(found) if found else None
 
 
@@ -305,13 +305,13 @@ def forget_missing(
     checkpoint from elsewhere, neither itself nor the best one before it is here.
     """
     elsewhere = lost = False
-    if world.first:
+    if world.is_rank0:
         here = work_dir / FOLDER / step_name(progress.step)
         elsewhere = resumed is None or resumed.path.resolve() != here.resolve()
         lost = not name_best(work_dir, -1 if elsewhere else progress.best_step)
-    if agree(world, elsewhere):
+    if all_reduce_max(world, elsewhere):
         progress.saved = -1
-    if agree(world, lost):
+    if all_reduce_max(world, lost):
         progress.best, progress.best_step = None, -1
 
 

@@ -18,15 +18,15 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
-from fluxvla_core.checkpoints.parts import is_split, own_parts
 from fluxvla_core.checkpoints.retention import rotate
+from fluxvla_core.checkpoints.shards import is_sharded, local_shards
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
-from fluxvla_core.training.distributed import World, agree, on_first, texts
+from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_max, run_on_rank0
 from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.rng import rng_state
 
@@ -80,30 +80,30 @@ def save_snapshot(
     world = saver.world
     writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
     tensors = snapshot.optimizer
-    split = any(map(is_split, tensors.values()))
+    sharded = any(map(is_sharded, tensors.values()))
     values = {ckpt.OPTIMIZER_META: snapshot.described, ckpt.TRAINER: snapshot.trainer}
     documents: dict[str, bytes] = {}
 
     def prepare() -> str:
         for name, value in {**values, **snapshot.documents}.items():
             documents[name] = json_bytes(name, value)
-        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
+        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_SHARDS] if sharded else []))
         # Now rather than in the thread: the training may use the same tokenizer meanwhile.
         for name, fill in snapshot.folders.items():
             writer.fill_folder(name, fill)
         return ""
 
-    on_first(world, prepare)
+    run_on_rank0(world, prepare)
     files = [
         *_model_files(saver, snapshot),
-        TensorFile.whole(rng_file(world.rank), rng_state(), True),
+        TensorFile.full(rng_file(world.rank), rng_state(), True),
     ]
-    if split:
-        parts = own_parts(tensors, world.first)
-        if parts:
-            files.append(TensorFile.parts(part_file(world.rank), parts))
+    if sharded:
+        shards = local_shards(tensors, world.is_rank0)
+        if shards:
+            files.append(TensorFile.shards(shard_file(world.rank), shards))
     else:
-        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
+        files.append(TensorFile.full(ckpt.OPTIMIZER, tensors, world.is_rank0))
 
     def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
         try:
@@ -111,7 +111,7 @@ def save_snapshot(
                 file.write(writer)
         except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
             writer.refuse(error)
-        reports = texts(group, writer.report())
+        reports = all_gather_text(group, writer.report())
 
         def finish() -> str:
             writer.join(reports)
@@ -126,7 +126,7 @@ def save_snapshot(
                 warn(f"old checkpoints could not be removed: {error}")
             return str(path)
 
-        return Path(on_first(group, finish))
+        return Path(run_on_rank0(group, finish))
 
     saver.start(step, files, write)
     return writer.final
@@ -138,12 +138,12 @@ def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
-    first = saver.world.first
-    files = [TensorFile.whole(ckpt.MODEL, model, first)]
+    first = saver.world.is_rank0
+    files = [TensorFile.full(ckpt.MODEL, model, first)]
     if snapshot.adapter:
-        files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
+        files.append(TensorFile.full(lora.WEIGHTS, snapshot.adapter, first))
     if snapshot.ema is not None:
-        files.append(TensorFile.whole(ckpt.EMA, snapshot.ema.shadow, first))
+        files.append(TensorFile.full(ckpt.EMA, snapshot.ema.shadow, first))
     return files
 
 
@@ -152,9 +152,9 @@ def rng_file(rank: int) -> str:
     return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
 
 
-def part_file(rank: int) -> str:
-    """Name of a rank's file with its parts of the optimizer's state."""
-    return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
+def shard_file(rank: int) -> str:
+    """Name of a rank's file with its shards of the optimizer's state."""
+    return f"{ckpt.OPTIMIZER_SHARDS}/rank-{rank:05d}.safetensors"
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
@@ -295,7 +295,7 @@ class Saver:
         if job is None:
             return None
         if job.thread is not None:
-            if not wait and agree(self.world, int(job.thread.is_alive())):
+            if not wait and all_reduce_max(self.world, int(job.thread.is_alive())):
                 return None
             job.thread.join()
         if self._hook is not None:

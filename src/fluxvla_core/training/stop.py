@@ -11,7 +11,7 @@ from types import FrameType, TracebackType
 
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
-from fluxvla_core.training.distributed import World, agree, on_first
+from fluxvla_core.training.distributed import World, all_reduce_max, run_on_rank0
 
 NOTICE_S = 0.5
 """Seconds within which ranks hear of each other's signals, if steps are shorter."""
@@ -85,9 +85,9 @@ class StopRequest:
             FluxError: the first rank's check failed; on every rank.
         """
         trouble = self._trouble(now)
-        number = agree(self._world, self._signal if trouble is None else _TROUBLE)
+        number = all_reduce_max(self._world, self._signal if trouble is None else _TROUBLE)
         if number == _TROUBLE:
-            on_first(self._world, lambda: _raise(trouble))
+            run_on_rank0(self._world, lambda: _raise(trouble))
         return number
 
     def _trouble(self, now: bool) -> FluxError | None:

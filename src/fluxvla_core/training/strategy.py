@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.checkpoints.lock import WorkDirLock
-    from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.checkpoints.shards import Stored
     from fluxvla_core.data.sampler import EpisodeShards
     from fluxvla_core.training.batches import StepPlan
     from fluxvla_core.training.distributed import World
@@ -110,9 +110,9 @@ class Strategy(TrainRunner):
             processes: that train, all on one machine.
             device_type: ``cuda`` or ``cpu``.
         """
-        from fluxvla_core.training.layout import whole
+        from fluxvla_core.training.layout import replicated_layout
 
-        return whole(model)
+        return replicated_layout(model)
 
     def unwrap_model(self, vla: nn.Module) -> nn.Module:
         """The model inside what ``_wrap_model`` returned, with the names that are saved."""
@@ -229,7 +229,7 @@ class Strategy(TrainRunner):
             RunFailed: it could not be written; the earlier ones are as they were.
         """
         saved = self.saver.settle(wait) if self.saver is not None else None
-        if saved is None or not self.world.first:
+        if saved is None or not self.world.is_rank0:
             return
         from fluxvla_core.checkpoints.retention import name_best
 
@@ -252,7 +252,7 @@ class Strategy(TrainRunner):
         adapter = lora.adapter_names(self.model)
         elsewhere = {*brings.names, *adapter}
         documents: dict[str, Mapping[str, Any]] = {}
-        if self.world.first:
+        if self.world.is_rank0:
             documents |= run_documents(self.context, self.dataset, self.model)
         if self.lora is not None:
             documents[lora.CONFIG] = self.lora.for_peft(self.adapter_base)
@@ -296,7 +296,7 @@ class Strategy(TrainRunner):
         saved, warnings = resuming.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
-        for warning in warnings if self.world.first else ():
+        for warning in warnings if self.world.is_rank0 else ():
             self.context.reporter.warn(warning)
         self._load_model_state(resuming.load_weights(checkpoint, self.model, self.left_out))
         described = checkpoint.json(ckpt.OPTIMIZER_META, SavedOptimizer)
@@ -330,9 +330,9 @@ class Strategy(TrainRunner):
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
         """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
-        from fluxvla_core.training.weights import put_model_tensors
+        from fluxvla_core.training.weights import load_full_tensors
 
-        put_model_tensors(self.model, state)
+        load_full_tensors(self.model, state)
 
     def _load_optimizer_state(self, state: dict[str, Any]) -> bool:
         """Take an optimizer's state in the form of its ``state_dict``; whether it was taken."""

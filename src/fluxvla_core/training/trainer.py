@@ -61,12 +61,12 @@ class Trainer:
         """Give the runner what its steps and its checkpoints need, and the dataset its seed."""
         runner = self._runner
         options, world, context = runner.options, runner.world, runner.context
-        if not world.first:
+        if not world.is_rank0:
             runner.hooks = HookCaller(context)
         runner.dataset = dataset
         take_seed(dataset, options.seed)
         warnings = Dataset.adapt(dataset).warnings()
-        for warning in warnings if world.first else ():
+        for warning in warnings if world.is_rank0 else ():
             context.reporter.warn(warning)
         where = context.where("train_dataloader.shuffle_episodes")
         shards = episode_shards(dataset, runner.loader_options.shuffle_episodes, where)
@@ -102,7 +102,7 @@ class Trainer:
 
     def _start_metrics(self, dataset: Any) -> None:
         runner = self._runner
-        if runner.world.first:
+        if runner.world.is_rank0:
             progress = runner.progress
             reported = progress.step - (progress.unvalidated is not None)
             runner.metric.start(reported, runner.context.config)
@@ -119,7 +119,7 @@ class Trainer:
             sampler,
             runner.loader_options.per_device_num_workers,
             pin_memory=world.device.type == "cuda",
-            reporter=runner.context.reporter if world.first else None,
+            reporter=runner.context.reporter if world.is_rank0 else None,
             seed=runner.options.seed,
         )
         return iter(loader)
@@ -205,7 +205,7 @@ class Trainer:
     def _report(self, records: list[dict[str, Any]]) -> None:
         """Give the records to the metric, and the newest one to people and hooks."""
         runner = self._runner
-        if not (runner.world.first and records):
+        if not (runner.world.is_rank0 and records):
             return
         for record in records:
             runner.metric.commit(**record)
@@ -222,7 +222,7 @@ class Trainer:
             return
         runner.settle_saves()
         self._stop.asked(now=True)
-        if runner.world.first:
+        if runner.world.is_rank0:
             runner.metric.sync()
         runner.save_checkpoint(
             runner.context.work_dir, progress.step, progress.cursor.epoch, progress.loss
@@ -245,7 +245,7 @@ class Trainer:
         shown = to_device(first, runner.world.device)
         if runner.flops is not None and runner.forward_arguments is not None:
             trouble = runner.flops.count(runner.forward_arguments(shown))
-            if trouble is not None and runner.world.first:
+            if trouble is not None and runner.world.is_rank0:
                 runner.context.reporter.warn(f"mfu is not reported: {trouble}")
         runner.warm_up(shown)
 
@@ -276,7 +276,7 @@ class Trainer:
         if better:
             # There already, unless it was another work dir's.
             self.save()
-            if runner.world.first:
+            if runner.world.is_rank0:
                 name_best(runner.context.work_dir, runner.progress.step)
         return 0
 
@@ -310,7 +310,7 @@ class Trainer:
             return self._stop.asked(), False
         record["val_loss"] = loss
         better = runner.progress.validated(loss)
-        if self._stops_early() and runner.world.first:
+        if self._stops_early() and runner.world.is_rank0:
             progress = runner.progress
             runner.context.reporter.info(
                 f"no better validation loss than {progress.best:.6g} (step "

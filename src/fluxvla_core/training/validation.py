@@ -16,7 +16,7 @@ from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.training.batches import loader_source, to_device
-from fluxvla_core.training.distributed import World, total
+from fluxvla_core.training.distributed import World, all_reduce_sum
 from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.options import LoaderOptions
 from fluxvla_core.training.rng import rank_seed, rng_state, seed_all, set_rng_state, take_seed
@@ -99,7 +99,9 @@ class Validation:
                 if self._stop.asked():
                     return None
             found = torch.stack(losses).double().cpu()
-        summed = total(self._world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
+        summed = all_reduce_sum(
+            self._world, torch.stack([found.sum(), torch.tensor(float(len(found)))])
+        )
         mean = float(summed[0] / summed[1])
         if not torch.isfinite(summed).all():
             raise NotFinite(

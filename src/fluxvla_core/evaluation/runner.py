@@ -104,6 +104,7 @@ class EvalRunner(Runner):
         norm_stats_key: which of the checkpoint's statistics.
         height, width: size of the policy's pictures; as in its training data by default.
         device, mixed_precision_dtype: torch device and precision of the policy.
+        execution, quantization: how its model computes, see ``load_policy``.
         episode_timeout_s: an episode that takes longer is tried again in a new process.
         reuse: also count existing episodes that other code ran (other versions, changed plugins),
             which is an error otherwise.
@@ -149,6 +150,8 @@ class EvalRunner(Runner):
         width: int | None = None,
         device: str = "cpu",
         mixed_precision_dtype: str = "float32",
+        execution: str = "eager",
+        quantization: str | None = None,
         episode_timeout_s: float = 1800.0,
         reuse: bool = False,
     ) -> None:
@@ -210,6 +213,8 @@ class EvalRunner(Runner):
             device=device,
             precision=mixed_precision_dtype,
             batch_size=batch_size,
+            execution=execution,
+            quantization=quantization,
         )
         served = batch_size > 1 or not device.startswith("cpu")
         self._serve = served if serve_policy is None else serve_policy
@@ -226,7 +231,8 @@ class EvalRunner(Runner):
         """Look at the environment and find the checkpoint.
 
         Raises:
-            ConfigError: the environment has no such task or camera, or names no expert.
+            ConfigError: the environment has no such task or camera, or names no expert; or the
+                policy cannot compute here as it should.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
         """
         environment = Environment.adapt(build_environment_from_cfg(self._environment))
@@ -240,6 +246,7 @@ class EvalRunner(Runner):
             raise self.config_error("video_cameras", error.what) from error
         self._tasks = self._spec.select_tasks(self.task_names)
         if policy in FROM_CHECKPOINT or self.baseline:
+            self._source.check()
             self._checkpoint = chosen_checkpoint(self.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]

@@ -48,6 +48,7 @@ class LiberoEvalRunner(EvalRunner):
             say which; see :class:`~fluxvla_libero.environment.LiberoEnvironment`.
         max_steps: instead of the suite's limit.
         mixed_precision_dtype, enable_mixed_precision_training: ``bf16`` inference, if enabled.
+        execution, quantization: how the model computes, see ``load_policy``.
         policy: ``checkpoint``, or ``expert``, ``untrained``, ``random`` for comparison.
         instruction_swap: repeat every episode with the instruction of another task that could be
             done in the same scene, and test whether the right one does better.
@@ -85,6 +86,8 @@ class LiberoEvalRunner(EvalRunner):
         max_steps: int | None = None,
         mixed_precision_dtype: str = "bf16",
         enable_mixed_precision_training: bool = False,
+        execution: str = "eager",
+        quantization: str | None = None,
         policy: str | Mapping[str, Any] = "checkpoint",
         instruction_swap: bool = False,
         baseline: bool = False,
@@ -167,6 +170,8 @@ class LiberoEvalRunner(EvalRunner):
             mixed_precision_dtype=(
                 mixed_precision_dtype if enable_mixed_precision_training else "float32"
             ),
+            execution=execution,
+            quantization=quantization,
             episode_timeout_s=episode_timeout_s,
             reuse=reuse,
         )

@@ -24,13 +24,11 @@ from fluxvla_core.evaluation.episodes import (
     POLICY,
     SWAPPED,
     EpisodeKey,
-    EvalLog,
     Shard,
     episode_keys,
-    open_eval_log,
-    run_in_pool,
     shard_of,
 )
+from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log
 from fluxvla_core.evaluation.live import LiveSettings, live_options
 from fluxvla_core.evaluation.options import EvalOptions
 from fluxvla_core.evaluation.policies import (
@@ -52,7 +50,7 @@ from fluxvla_core.evaluation.videos import (
     recorded_videos,
     with_others,
 )
-from fluxvla_core.evaluation.worker import EpisodeWorker, Job, Settings
+from fluxvla_core.evaluation.worker import EpisodeWorker, Job, Settings, run_in_pool
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"

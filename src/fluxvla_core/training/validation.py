@@ -96,7 +96,7 @@ class Validation:
             # Every rank has as many batches, so all ask equally often.
             for batch in self._loader:
                 losses.append(loss_of_batch(to_device(batch, self._world.device)))
-                if self._stop.asked():
+                if self._stop.poll_now():
                     return None
             found = torch.stack(losses).double().cpu()
         summed = all_reduce_sum(

@@ -323,7 +323,7 @@ class Strategy(TrainRunner):
         return self.progress.step
 
     def _schedule_state(self, saved: Mapping[str, Any]) -> Any:
-        """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller.
+        """State of the schedule at resuming; if the step size changed, at the same sample.
 
         The rate follows the part of the run that is done. A count of the old steps would be past
         the end of fewer, larger ones, and train the rest at a rate of 0.
@@ -362,7 +362,7 @@ class Strategy(TrainRunner):
     def load_optimizer_tensors(
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
-        """The inverse of :meth:`optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
+        """The inverse of :meth:`optimizer_tensors`, with :meth:`_load_optimizer_state`."""
         from fluxvla_core.training.optimizer_state import torch_state
 
         state = torch_state(self.model, self.optimizer, tensors, described, where)

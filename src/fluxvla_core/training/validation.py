@@ -114,7 +114,7 @@ class Validation:
 
 @contextmanager
 def evaluating(model: nn.Module, ema: Ema | None, seed: int) -> Iterator[None]:
-    """Inside, the model evaluates: with averaged weights if kept, and the same draws every time."""
+    """Context manager: the model in eval mode, with EMA weights if kept and a fixed seed."""
     drawn = rng_state()
     seed_all(seed)
     model.eval()

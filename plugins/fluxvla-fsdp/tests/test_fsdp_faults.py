@@ -60,7 +60,7 @@ def two_ranks(work_dir):
 
 def save(runner, folder, step):
     runner.save_checkpoint(folder, step, 0)
-    runner.settle_saves()
+    runner.finish_pending_save()
 
 
 def train_a_step(runner):

@@ -111,8 +111,8 @@ class BaseTrainRunner(Strategy):
                     self._run_epoch_based() if self.max_steps is None else self._run_step_based()
                 )
                 self._trainer.save()
-                self.settle_saves()
-                self.late_stop = stop.asked()
+                self.finish_pending_save()
+                self.late_stop = stop.poll_now()
             outcome = "interrupted" if signal else "ok"
         except (RuntimeError, MemoryError, OSError, RunFailed) as error:
             self.check_work_dir()

@@ -120,7 +120,7 @@ def _stay_inside() -> None:
 
 
 def _attempts_store() -> Any:
-    """Where ranks find each other, with names that no earlier attempt has used.
+    """The rendezvous store, with a prefix that no earlier attempt has used.
 
     torchrun keeps one store over all restarts of a job; by the names of the last attempt ranks
     would find addresses of processes that have ended.

@@ -99,8 +99,8 @@ def import_checkpoint(
         if found.embodiment is not None:
             writer.write_json(ckpt.EMBODIMENT, found.embodiment.to_dict())
         pipeline = Pipeline(found.transforms)
-        writer.fill_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
-        writer.enter_folder(ckpt.PROCESSORS)
+        writer.write_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
+        writer.add_folder(ckpt.PROCESSORS)
         return writer.commit(), found
 
 

@@ -63,7 +63,7 @@ def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
 def choose_checkpoint(
     world: World, context: RunContext, resume: str | None, first: str | None = None
 ) -> Checkpoint | None:
-    """The verified checkpoint to resume from, None to start afresh; the same on every rank.
+    """The verified checkpoint to resume from, None to start from scratch; the same on every rank.
 
     Also clears what killed saves left in the work dir, which :func:`lock_on_first` made this run's.
 
@@ -91,7 +91,7 @@ def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
     if checkpoint is None:
         place = first if resume == AUTO else resume
         if place is None or place == AUTO:
-            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts afresh")
+            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts from scratch")
             return ""
         checkpoint = Checkpoint.open(place)
         checkpoint.verify()

@@ -66,7 +66,7 @@ def save_snapshot(
     keep: int,
     spare: int | None = None,
 ) -> Path:
-    """Begin the checkpoint of ``step``; ``saver.settle`` says when it is complete.
+    """Begin the checkpoint of ``step``; ``saver.finish_pending`` says when it is complete.
 
     Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
     but for that of step ``spare``; old ones that cannot be removed are only warned of.
@@ -90,7 +90,7 @@ def save_snapshot(
         writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_SHARDS] if sharded else []))
         # Now rather than in the thread: the training may use the same tokenizer meanwhile.
         for name, fill in snapshot.folders.items():
-            writer.fill_folder(name, fill)
+            writer.write_folder(name, fill)
         return ""
 
     run_on_rank0(world, prepare)
@@ -110,15 +110,15 @@ def save_snapshot(
             for file in held:
                 file.write(writer)
         except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
-            writer.refuse(error)
-        reports = all_gather_text(group, writer.report())
+            writer.set_error(error)
+        reports = all_gather_text(group, writer.rank_report())
 
         def finish() -> str:
-            writer.join(reports)
+            writer.merge_reports(reports)
             for name, data in documents.items():
                 writer.write_bytes(name, data)
             for name in snapshot.folders:
-                writer.enter_folder(name)
+                writer.add_folder(name)
             path = writer.commit()
             try:
                 rotate(work_dir, keep, spare=spare)
@@ -255,35 +255,38 @@ class Saver:
     ) -> None:
         """Let ``write(world, files, warn)`` make the checkpoint of ``step``; all ranks call it.
 
-        The one before must have been settled.
+        The one before must have been finished with :meth:`finish_pending`.
         """
         job = self._job = _Job(step)
         warn = job.warnings.append
         if not self.background:
             self._run(job, lambda: write(self.world, files, warn))
             return
-        gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
-        ready = _reached(self.world.device)
+        gathered = [file.gathered(partial(self._host_copy, file.name)) for file in files]
+        stream = _copy_stream(self.world.device)
         job.thread = threading.Thread(
             target=self._run,
-            args=(job, lambda: write(self._threads, self._held(job, gathered, ready), warn)),
+            args=(
+                job,
+                lambda: write(self._threads, self._host_copies(job, gathered, stream), warn),
+            ),
             name=f"checkpoint-{step}",
             daemon=True,
         )
         job.thread.start()
         if self._before_step is None:
-            self.copied()
+            self.wait_for_copies()
         else:
             # Only while there is something to wait for: each hook costs every step its time.
-            self._hook = self._before_step(lambda *_: self.copied())
+            self._hook = self._before_step(lambda *_: self.wait_for_copies())
 
-    def copied(self) -> None:
-        """Wait until weights and optimizer may change; needed before anything but a step does."""
+    def wait_for_copies(self) -> None:
+        """Wait until weights and optimizer may change. The optimizer's step does so by itself."""
         if self._job is not None and self._job.thread is not None:
             self._job.copied.wait()
 
-    def settle(self, wait: bool) -> Saved | None:
-        """The outcome of the save under way; all ranks call it at the same step.
+    def finish_pending(self, wait: bool) -> Saved | None:
+        """Finish the pending save, if there is one; all ranks call it at the same step.
 
         Args:
             wait: for its end; otherwise None is returned while some rank still writes.
@@ -307,27 +310,27 @@ class Saver:
         return Saved(job.step, job.path, tuple(job.warnings))
 
     def close(self) -> None:
-        """Let the checkpoint on its way be finished, whatever becomes of it."""
+        """Wait for the pending save, whether it succeeds or not."""
         if self._job is not None and self._job.thread is not None:
             self._job.thread.join()
 
     def _run(self, job: _Job, work: Callable[[], Path]) -> None:
         try:
             job.path = work()
-        except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
+        except BaseException as error:  # noqa: BLE001 - finish_pending raises it
             job.error = error
 
-    def _held(
-        self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
+    def _host_copies(
+        self, job: _Job, files: Sequence[TensorFile], stream: AbstractContextManager[object]
     ) -> Iterator[TensorFile]:
         """Copies of ``files``; all are made before the first is written."""
         try:
-            with ready:
+            with stream:
                 held = [
                     replace(
                         file,
                         tensors=tuple(
-                            self._copy_of(file.name, i, t) for i, t in enumerate(file.tensors)
+                            self._host_copy(file.name, i, t) for i, t in enumerate(file.tensors)
                         ),
                     )
                     for file in files
@@ -336,23 +339,23 @@ class Saver:
             job.copied.set()
         yield from held
 
-    def _copy_of(self, file: str, index: int, tensor: Tensor) -> Tensor:
+    def _host_copy(self, file: str, index: int, tensor: Tensor) -> Tensor:
         return self._copy((file, index), tensor)
 
     def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
-        """``tensor`` in host memory that is kept from save to save, pinned if it is on a GPU."""
-        kept = self._memory.get(place)
-        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
-            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
-            self._memory[place] = kept
-        if kept is tensor:
-            return kept
+        """``tensor`` in a host buffer that is reused by every save, pinned if it is on a GPU."""
+        buffer = self._memory.get(place)
+        if buffer is None or buffer.shape != tensor.shape or buffer.dtype != tensor.dtype:
+            buffer = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+            self._memory[place] = buffer
+        if buffer is tensor:
+            return buffer
         with torch.no_grad():
-            return kept.copy_(tensor)
+            return buffer.copy_(tensor)
 
 
-def _reached(device: torch.device) -> AbstractContextManager[object]:
-    """Inside, a GPU copies on another stream, after what has been enqueued up to now."""
+def _copy_stream(device: torch.device) -> AbstractContextManager[object]:
+    """Context manager: CUDA stream for the copies, which waits for all work enqueued so far."""
     if device.type != "cuda":
         return nullcontext()
     stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]

@@ -96,7 +96,7 @@ class Validation:
             # Every rank has as many batches, so all ask equally often.
             for batch in self._loader:
                 losses.append(loss_of_batch(to_device(batch, self._world.device)))
-                if self._stop.asked():
+                if self._stop.poll_now():
                     return None
             found = torch.stack(losses).double().cpu()
         summed = all_reduce_sum(
@@ -114,7 +114,7 @@ class Validation:
 
 @contextmanager
 def evaluating(model: nn.Module, ema: Ema | None, seed: int) -> Iterator[None]:
-    """Inside, the model evaluates: with averaged weights if kept, and the same draws every time."""
+    """Context manager: the model in eval mode, with EMA weights if kept and a fixed seed."""
     drawn = rng_state()
     seed_all(seed)
     model.eval()

@@ -74,7 +74,7 @@ class DDPTrainRunner(BaseTrainRunner):
 
         return replicated_layout(model)
 
-    def warm_up(self, batch: dict[str, Any]) -> None:
+    def before_first_step(self, batch: dict[str, Any]) -> None:
         """Let torch rearrange its buckets, and learn a static graph, before the first step.
 
         DistributedDataParallel orders its buckets by how gradients arrived in its first backward

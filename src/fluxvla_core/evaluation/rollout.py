@@ -23,7 +23,7 @@ from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
 from fluxvla_core.robot.control.clamps import PassThrough
 from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.sender import CommandFormer
+from fluxvla_core.robot.control.sender import CommandPipeline
 from fluxvla_core.robot.control.tracking import action_columns, action_values
 from fluxvla_core.spec.embodiment import Camera
 
@@ -67,7 +67,7 @@ class ChunkCommands:
         self._action_rate = action_rate_hz or self._rate
         self._columns = action_columns(body) if spec.limited else np.arange(0)
         self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
-        self._former = CommandFormer(self._limiter or PassThrough(body))
+        self._pipeline = CommandPipeline(self._limiter or PassThrough(body))
 
     def start(self, state: Array) -> None:
         """Begin an episode where the robot is."""
@@ -83,7 +83,7 @@ class ChunkCommands:
 
     def command(self, target: Array) -> Array:
         """The ``(dim,)`` command for one target."""
-        commands, clamps = self._former.form(target[None])
+        commands, clamps = self._pipeline.form(target[None])
         self.clamped += bool(clamps[0])
         return np.asarray(commands[0])
 

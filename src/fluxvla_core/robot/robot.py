@@ -33,8 +33,8 @@ _LEAST_SPEED = 0.01
 
 
 @dataclass(frozen=True)
-class Measured:
-    """``(state_dim,)`` where the robot was, and when that arrived, on its clock."""
+class StateSample:
+    """A ``(state_dim,)`` state and when it arrived (seconds on the robot's clock)."""
 
     state: npt.NDArray[np.float64]
     at: float
@@ -88,7 +88,7 @@ class Robot:
         self.sent_s: float | None = None
         self._reads_state, self._stamps_state = self._has("get_state"), self._has("state_stamp")
         # A replayed robot ignores commands, so tracking is not checked.
-        self.follows = bool(self._operator.follows_commands)
+        self.follows_commands = bool(self._operator.follows_commands)
         self.clock = clock_of(self._operator)
         self.lockstep = in_lockstep(self.clock)
         self.delays = DelayMonitor()
@@ -135,7 +135,7 @@ class Robot:
         """
         return as_frame(self._ask("get_frame", self._operator.get_frame), self.reading.name)
 
-    def state(self) -> Measured | None:
+    def state(self) -> StateSample | None:
         """The state alone, from an operator that has ``get_state``; else None.
 
         It is read after each command, on a real robot while another thread may read frames.
@@ -156,7 +156,7 @@ class Robot:
                 at = as_number(stamp, f"{self.name}.state_stamp()")
             found = self._ask("get_state", self._operator.get_state)
             state = as_state(found, self.embodiment, self._measuring.name)
-        return Measured(state, self.clock.now() if at is None else at)
+        return StateSample(state, self.clock.now() if at is None else at)
 
     @property
     def speed(self) -> Callable[[], float] | None:
@@ -192,7 +192,7 @@ class Robot:
         return implements(self._described, Operator, "begin_episode")
 
     @property
-    def tells_hold(self) -> bool:
+    def reports_last_action(self) -> bool:
         """Whether ``commanded`` holds after a stop too: without ``last_action`` an operator's own
         ``stop`` may have commanded anything."""
         return self._has("last_action") or not self.can_stop

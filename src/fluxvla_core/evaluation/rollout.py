@@ -149,12 +149,12 @@ def run_episode(
         instruction = observation["task_description"]
         # Before the policy is queried: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
-        seen = time.perf_counter()
+        observed_at = time.perf_counter()
         chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
         answered = time.perf_counter()
         del observation  # so that the next pictures can have its memory: fresh pages cost more
-        spent["observe"] += seen - at
-        spent["policy"] += answered - seen
+        spent["observe"] += observed_at - at
+        spent["policy"] += answered - observed_at
         calls += 1
         problem = not_finite(chunk, spec.embodiment.joint_names)
         if problem is not None:
@@ -162,14 +162,14 @@ def run_episode(
             break
         for target in commands.targets(chunk[: settings.replan_every]):
             at = time.perf_counter()
-            found = environment.step(commands.command(target))
+            outcome = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
             steps += 1
-            total += found.reward
+            total += outcome.reward
             # Before anything is made of it: a scene that resets itself may even look like success.
             state = check_step(environment, steps)
-            success, ended = bool(found.success), bool(found.ended)
-            behaviours = None if found.behaviours is None else dict(found.behaviours)
+            success, ended = bool(outcome.success), bool(outcome.ended)
+            behaviours = None if outcome.behaviours is None else dict(outcome.behaviours)
             if not own_hash:
                 state_digest.update(state.tobytes())
             if on_step is not None:

@@ -99,13 +99,13 @@ def option_fields(cls: type) -> tuple[Parameter, ...]:
 
 
 def _runtime_meanings(cls: type) -> dict[str, str]:
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for base in cls.__mro__[:-1]:
         init = base.__dict__.get("__init__")
-        said = argument_texts(init.__doc__) if inspect.isfunction(init) else {}
-        said |= argument_texts(base.__doc__) | field_texts(_class_node(base))
-        found = {**said, **found}
-    return found
+        texts = argument_texts(init.__doc__) if inspect.isfunction(init) else {}
+        texts |= argument_texts(base.__doc__) | field_texts(_class_node(base))
+        meanings = {**texts, **meanings}
+    return meanings
 
 
 def _class_node(cls: type) -> ast.ClassDef:

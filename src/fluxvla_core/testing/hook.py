@@ -125,15 +125,15 @@ class Watched:
             return  # one that raised is left out
         method = getattr(self._hook, name)
         parameters = inspect.signature(method).parameters.values()
-        given = {"context": self.context, **arguments}
+        values = {"context": self.context, **arguments}
         if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            given = {p.name: given[p.name] for p in parameters if p.name in given}
+            values = {p.name: values[p.name] for p in parameters if p.name in values}
         start = time.perf_counter()
         try:
-            method(**given)
+            method(**values)
         except Exception as error:  # noqa: BLE001 - said in the assertion
-            told = f"hook {self._name}.{name} raised {type(error).__name__}: {error}"
-            self.problems.append(told)
+            message = f"hook {self._name}.{name} raised {type(error).__name__}: {error}"
+            self.problems.append(message)
         self.taken.setdefault(name, []).append(time.perf_counter() - start)
 
     def told(self, what: str) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from fluxvla_core import _lazy
 
 if TYPE_CHECKING:
+    from fluxvla_core.contracts.frame import RobotFrame as RobotFrame
     from fluxvla_core.ros2 import images as images
     from fluxvla_core.ros2 import joints as joints
     from fluxvla_core.ros2 import qos as qos
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.faults import Fault as Fault
     from fluxvla_core.ros2.faults import Faults as Faults
     from fluxvla_core.ros2.faults import Outbox as Outbox
-    from fluxvla_core.ros2.frames import RobotFrame as RobotFrame
     from fluxvla_core.ros2.messages import COMPRESSED_IMAGE as COMPRESSED_IMAGE
     from fluxvla_core.ros2.messages import FLOAT64 as FLOAT64
     from fluxvla_core.ros2.messages import FLOAT64_ARRAY as FLOAT64_ARRAY
@@ -50,7 +50,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.ros2.stop_motion": ["checked_action"],
         "fluxvla_core.ros2.connection": ["Connection", "require_rclpy"],
         "fluxvla_core.ros2.faults": ["AMOUNTS", "Fault", "Faults", "MODES", "Outbox"],
-        "fluxvla_core.ros2.frames": ["RobotFrame"],
+        "fluxvla_core.contracts.frame": ["RobotFrame"],
         "fluxvla_core.ros2.images": ["images"],
         "fluxvla_core.ros2.joints": ["joints"],
         "fluxvla_core.ros2.messages": [

@@ -21,12 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
+from fluxvla_core.contracts.frame import RobotFrame
 from fluxvla_core.contracts.part import Part
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.ros2.messages import message_class
 from fluxvla_core.ros2.readings import POLL_S, Readings
 from fluxvla_core.ros2.startup import Startup

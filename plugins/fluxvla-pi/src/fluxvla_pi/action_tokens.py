@@ -44,7 +44,7 @@ class ActionWords:
         """The words that a config's table names.
 
         Raises:
-            ConfigError: an unknown key, or an id that is no word.
+            ConfigError: an unknown key, or no ``begin``.
         """
         table = table or {}
         known = [field.name for field in fields(cls)]
@@ -54,23 +54,25 @@ class ActionWords:
                 f"{where}: words has no {', '.join(unknown)}; it has {', '.join(known)}"
             )
         found = cls(**{**table, "begin": tuple(table.get("begin", cls.begin))})
-        ids = (found.bos, *found.begin, found.stop, found.eos)
-        if not found.begin or any(not 0 <= i < found.vocab_size for i in ids):
-            raise ConfigError(
-                f"{where}: of words, bos, begin, stop and eos are {ids}; the tokenizer has the ids "
-                f"0..{found.vocab_size - 1} (vocab_size)"
-            )
+        if not found.begin:
+            raise ConfigError(f"{where}: words.begin is empty: how an answer begins is not known")
         return found
 
     def check(self, count: int, where: str) -> None:
         """Check that ``count`` action tokens find a place.
 
         Raises:
-            ConfigError: there are too few words, or one of them is one of the answer's own.
+            ConfigError: there are too few words, one of them is one of the answer's own, or one
+                of those is no word.
         """
         highest = self.vocab_size - 1 - self.skipped
         lowest = highest - count + 1
         ids = (self.bos, *self.begin, self.stop, self.eos)
+        if any(not 0 <= i < self.vocab_size for i in ids):
+            raise ConfigError(
+                f"{where}: bos, begin, stop and eos are the words {ids}; there are "
+                f"0..{self.vocab_size - 1} (words.vocab_size)"
+            )
         if lowest < 0 or any(lowest <= i <= highest for i in ids):
             raise ConfigError(
                 f"{where}: {count} action tokens would take the words {lowest}..{highest}, and the "

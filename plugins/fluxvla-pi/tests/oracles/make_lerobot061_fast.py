@@ -154,7 +154,6 @@ def policy_of():
         n_action_steps=tiny.HORIZON,
         max_action_tokens=64,
         max_decoding_steps=tiny.FAST_STEPS,
-        fast_skip_tokens=tiny.ACTION_WORDS["skipped"],
         validate_action_token_prefix=False,
         tokenizer_max_length=120,
         dtype="float32",
@@ -258,6 +257,9 @@ def whole_policy(folder: Path) -> dict[str, torch.Tensor]:
         "action_token_masks": batch["action.token_mask"],
     }
     batch = before(raw)
+    words = (batch["observation.language.tokens"], batch["observation.language.attention_mask"])
+    pictures = policy._preprocess_images(batch)
+    found["answer"] = policy.model.sample_actions_fast_kv_cache(*pictures, *words, tiny.FAST_STEPS)
     found["commands"] = after(policy.predict_action_chunk(batch))
     whole = tiny.fast_answers(policy.action_tokenizer(found["normalized_actions"])[0])["whole"]
     chunk = policy.detokenize_actions(torch.tensor([whole]), tiny.HORIZON, tiny.ROBOT_ACTIONS)

@@ -108,12 +108,12 @@ def first_noise():
 
 # -- PI0-FAST ------------------------------------------------------------------------------------
 
-FAST_WORDS, FAST_VOCABULARY = 448, 288
+FAST_WORDS, FAST_VOCABULARY = 576, 288
 FAST_TOKENS, FAST_STEPS = 24, 12
 _FAST_TEXT = ["<pad>", "<eos>", "<bos>", "<unk>", *LETTERS, "|"]
 ACTION_WORDS = {
     "vocab_size": FAST_WORDS,
-    "skipped": 4,
+    "skipped": 128,
     "bos": 2,
     "begin": [_FAST_TEXT.index(letter) for letter in "Action: "],
     "stop": _FAST_TEXT.index("|"),

@@ -193,8 +193,6 @@ def test_frozen_parts_get_no_gradient():
     assert all(name.startswith(("vision_backbone.", "projector.")) for name in trained)
     model = small(freeze_vision_backbone=True)
     model(**fast_batch())["loss"].backward()
-    assert all(
-        name.startswith("llm_backbone.")
-        for name, p in model.named_parameters()
-        if p.grad is not None
-    )
+    trained = {name for name, p in model.named_parameters() if p.grad is not None}
+    assert trained
+    assert all(name.startswith("llm_backbone.") for name in trained)

@@ -30,8 +30,9 @@ from .oracles.pi_inputs import (
 from .tiny import FAST
 
 SEEN = ("images", "img_masks", "lang_tokens", "lang_masks")
-FLOW = (*SEEN, "states", "actions", "action_masks", "noise", "time")
-KEYS = {"pi0": FLOW, "pi05": FLOW, "pi0_fast": (*SEEN, "action_tokens", "action_token_masks")}
+FLOW = ("states", "actions", "action_masks", "noise", "time")
+SAID = ("action_tokens", "action_token_masks")
+LEARNED = {"pi0": FLOW, "pi05": FLOW, "pi0_fast": SAID}
 MODELS = {
     "pi0_fast": {"type": "PI0FAST", **FAST_SIZES, "tokenizer": FAST},
     "pi0": {"type": "PI0FlowMatching", **SIZES, "max_state_dim": STATES},
@@ -72,6 +73,7 @@ class Samples:
 
 def train(work_dir, family, runner, batch, resume=None):
     """One run of four steps."""
+    learned = LEARNED[family]
     config = {
         "model": MODELS[family],
         "train_dataloader": {"per_device_batch_size": batch},
@@ -84,7 +86,11 @@ def train(work_dir, family, runner, batch, resume=None):
             "max_keep_ckpts": 0,
             "seed": 3,
             "enable_mixed_precision_training": False,
-            "collator": {"type": "DictCollator", "keys": list(KEYS[family])},
+            "collator": {
+                "type": "DictCollator",
+                "keys": [*SEEN, *learned],
+                "meta_keys": [key for key in (*FLOW, *SAID) if key not in learned],
+            },
             **runner,
         },
     }

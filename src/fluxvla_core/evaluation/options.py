@@ -41,6 +41,10 @@ class EvalOptions:
     """torch device of the policy."""
     mixed_precision_dtype: str = "float32"
     """precision of the policy: ``float32`` or ``bf16``."""
+    execution: str = "eager"
+    """how the policy's model computes, see ``load_policy``."""
+    quantization: str | None = None
+    """how the policy's model computes, see ``load_policy``."""
 
     tasks: Sequence[str] | None = None
     """names of the tasks; all by default."""
@@ -155,4 +159,6 @@ class EvalOptions:
             device=self.device,
             precision=self.mixed_precision_dtype,
             batch_size=self.batch_size,
+            execution=self.execution,
+            quantization=self.quantization,
         )

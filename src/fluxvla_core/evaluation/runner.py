@@ -117,7 +117,8 @@ class EvalRunner(Runner):
         """Look at the environment and find the checkpoint.
 
         Raises:
-            ConfigError: the environment has no such task or camera, or names no expert.
+            ConfigError: the environment has no such task or camera, or names no expert; or the
+                policy cannot compute here as it should.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
         """
         given = self.options
@@ -140,6 +141,7 @@ class EvalRunner(Runner):
             raise self.config_error("video_cameras", error.what) from error
         self._tasks = self._spec.select_tasks(self.task_names)
         if policy in FROM_CHECKPOINT or given.baseline:
+            given.source(policy, None).check()
             self._checkpoint = chosen_checkpoint(given.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]

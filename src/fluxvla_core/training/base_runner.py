@@ -111,8 +111,8 @@ class BaseTrainRunner(Strategy):
                     self._run_epoch_based() if self.max_steps is None else self._run_step_based()
                 )
                 self._trainer.save()
-                self.settle_saves()
-                self.late_stop = stop.asked()
+                self.finish_pending_save()
+                self.late_stop = stop.poll_now()
             outcome = "interrupted" if signal else "ok"
         except (RuntimeError, MemoryError, OSError, RunFailed) as error:
             self.check_work_dir()
@@ -137,7 +137,7 @@ class BaseTrainRunner(Strategy):
             self._trainer.close()
         if self.saver is not None:
             self.saver.close()
-        if self.world.first:
+        if self.world.is_rank0:
             self.metric.finalize()
         self.hooks.call("run_finished", outcome=outcome)
         if self._work_dir_lock is not None:

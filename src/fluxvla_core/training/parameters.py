@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.tensors import whole
+from fluxvla_core.checkpoints.tensors import full_tensor
 from fluxvla_core.errors import ConfigError
 
 
@@ -55,7 +55,9 @@ def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
 
 def gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
     """The norm of all gradients over all ranks, a scalar on the device."""
-    return whole(torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None]))
+    return full_tensor(
+        torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    )
 
 
 def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:

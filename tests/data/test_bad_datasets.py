@@ -53,7 +53,7 @@ def edit_column(root, file, name, change):
 
 def test_missing(tmp_path):
     text = refused(tmp_path / "nowhere")
-    assert f"{tmp_path / 'nowhere'}: there is not dataset here: the folder does not exist" in text
+    assert f"{tmp_path / 'nowhere'}: no dataset here: the folder does not exist" in text
     assert "check data_root_path" in text
 
 

@@ -245,7 +245,7 @@ def test_frames_without_an_episode_and_episodes_without_frames(tmp_path, spec):
     writer = LeRobotWriter(tmp_path / "d", 10, spec())
     with pytest.raises(DataError, match="save_episode: no frame was added since the last episode"):
         writer.save_episode()
-    with pytest.raises(DataError, match="no episode was saved, so there is not dataset to write"):
+    with pytest.raises(DataError, match="no episode was saved, so there is no dataset to write"):
         writer.finalize()
     writer.add_frame(**frame())
     with pytest.raises(DataError, match="finalize: 1 frames belong to no episode"):

@@ -123,10 +123,10 @@ def test_the_specifications_parameters_and_how_to_compute_are_taken(tmp_path):
     }
     runner = build_runner_from_cfg(table, RunContext(work_dir=tmp_path, nproc=3))
     assert runner.workers == 3
-    assert runner._source.precision == "bf16"
-    assert (runner._source.execution, runner._source.quantization) == ("compiled", "int8")
-    assert runner._size == (224, 224)
-    assert runner._rollout.policy_seed == 7
+    assert runner.options.mixed_precision_dtype == "bf16"
+    assert (runner.options.execution, runner.options.quantization) == ("compiled", "int8")
+    assert runner.options.size == (224, 224)
+    assert runner.options.policy_seed == 7
     assert runner.model_family == "pi0"
 
 

@@ -50,10 +50,10 @@ def asked():
 def test_sampling_is_eulers_method():
     model, (batch, noise) = tiny_model(), asked()
     with torch.no_grad():
-        memory = model._memory(*batch.values())
+        cache = model._encode_prefix(*batch.values())
         x = noise
         for t in (1.0, 0.75, 0.5, 0.25):
-            x = x - model._velocity(x, torch.full((3,), t), memory) / 4
+            x = x - model._velocity(x, torch.full((3,), t), cache) / 4
         assert relative(model.predict_action(**batch, noise=noise), x) < 1e-6
 
 
@@ -140,11 +140,11 @@ def test_actions_of_a_prefix_are_given_without_noise_and_not_counted():
         other = {**batch, "noise": torch.where(given[..., None], 9.0, batch["noise"])}
         torch.testing.assert_close(model(**other, prefix_len=length)["loss"], found["loss"])
         # By hand: the velocity at what is half known, errors of the rest over all.
-        memory = model._memory(*observed, batch["states"])
+        cache = model._encode_prefix(*observed, batch["states"])
         for k in range(2):
             t = torch.where(given[:, k], 0.0, 1 - batch["time"][:, k : k + 1])
             x = torch.lerp(batch["actions"], batch["noise"][:, k], t[..., None])
-            velocity = model._velocity(x, t, memory)
+            velocity = model._velocity(x, t, cache)
             errors = (batch["noise"][:, k] - batch["actions"] - velocity).square()
             total += (errors * ~given[:, k, :, None])[..., :ACTION].sum().item()
     assert found["loss"].item() == pytest.approx(total / (3 * 2 * HORIZON * ACTION), rel=1e-5)
@@ -262,7 +262,7 @@ def test_states_and_statistics_that_do_not_fit_are_refused(settings, sample, wor
         SmolVLANormalize(**settings)(whole)
 
 
-def test_pictures_that_do_not_fit_are_refused():
+def test_images_that_do_not_fit_are_refused():
     with pytest.raises(ConfigError, match="height 3 and width None are not a size"):
         SmolVLAImages(height=3)
     with pytest.raises(ConfigError, match="empty_cameras -1 is below 0"):
@@ -273,13 +273,13 @@ def test_pictures_that_do_not_fit_are_refused():
     assert "<SmolVLAImages>.height=512" in str(caught.value)
 
 
-def test_pictures_that_are_normalised_on_the_device_are_the_same():
+def test_images_that_are_normalised_on_the_device_are_the_same():
     from fluxvla_core.data import Pipeline
 
-    picture = np.random.default_rng(0).integers(0, 256, (3, 8, 12)).astype(np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (3, 8, 12)).astype(np.uint8)
     table = {"type": "SmolVLAImages", "empty_cameras": 1}
     pipeline = Pipeline([table, {"type": "SmolVLAPrompt"}])
-    sample = {"images": [picture], "img_masks": np.array([True]), "task_description": "wave"}
+    sample = {"images": [image], "img_masks": np.array([True]), "task_description": "wave"}
     here, deferred = pipeline(sample), pipeline.deferring()(sample)
     assert deferred["images"].dtype == np.uint8
     divide, multiply, subtract, again = deferred["image_scale"][..., None, None]

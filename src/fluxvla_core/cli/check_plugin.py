@@ -210,7 +210,7 @@ def _agree(args: argparse.Namespace, registry: str) -> None:
     say(f"{moves}. Clear its space, and keep a hand on the emergency stop.")
     say(f"Type {args.name} to let it move:")
     if sys.stdin.readline().strip() != args.name:
-        raise UsageError("nobody agreed, and nothing was moved")
+        raise UsageError("not confirmed; nothing was moved")
 
 
 def _arguments(words: list[str]) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class ImportCheckpoint:
             help="the checkpoint's folder, or hf:OWNER/NAME[@REVISION] on the Hugging Face hub",
         )
         parser.add_argument("folder", metavar="OUT", help="the folder to make")
-        parser.once("--format", metavar="NAME", help="the project; by default it is found out")
+        parser.once("--format", metavar="NAME", help="the project's format (default: detected)")
         parser.once(
             "--tokenizer", metavar="DIR", help="the tokenizer's folder, if the checkpoint has none"
         )

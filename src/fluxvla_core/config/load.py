@@ -23,7 +23,7 @@ SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100
 """Levels of tables and lists in a config; this project's own have fewer than 10."""
 MOST_KEYS = 5_000
-"""Of all tables together; this project's own configs have fewer than 500."""
+"""Most keys of all tables together; this project's own configs have fewer than 500."""
 _LONGEST_CHAIN = 50  # files
 _LONGEST_FILE = 1 << 20  # bytes
 

@@ -21,7 +21,7 @@ from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 HEIGHT, WIDTH = 480, 640
-"""Of a picture, where neither the dataset nor the robot says."""
+"""Size of an image, where neither the dataset nor the robot says."""
 INSTRUCTION = "pick up the cube and put it into the box"
 _MARK = re.compile(r"<[^<>\s]+>|\w+|[^\w\s]")
 

@@ -172,7 +172,7 @@ class LeRobotWriter:
                 next="call save_episode() or discard_episode() first",
             )
         if not self._saved:
-            raise DataError(f"{self.root}: no episode was saved, so there is not dataset to write")
+            raise DataError(f"{self.root}: no episode was saved, so there is no dataset to write")
         built = self._staging / "dataset"
         shutil.rmtree(built, ignore_errors=True)
         try:

@@ -56,7 +56,7 @@ class DatasetConformance(Conformance):
         return dataset
 
     def indices(self, dataset: Dataset) -> tuple[int, ...]:
-        """Of the samples that are compared: the first ones, one in the middle, the last."""
+        """Indices of the samples that are compared: the first ones, one in the middle, the last."""
         length = len(dataset)
         return tuple(sorted({0, min(1, length - 1), length // 2, length - 1}))
 

@@ -48,7 +48,7 @@ class ModelConformance(Conformance):
     steps: ClassVar[int] = 40
     """Steps in which the loss of one batch must fall by a tenth."""
     learning_rate: ClassVar[float] = 1e-2
-    """Of these steps, with AdamW."""
+    """Learning rate of these steps, with AdamW."""
     unused: ClassVar[tuple[str, ...]] = ()
     """Beginnings of the names of trainable parameters that a step may leave out."""
 

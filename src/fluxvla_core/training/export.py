@@ -68,7 +68,7 @@ def export(source: str | Path, target: str | Path) -> Path:
         what="the export",
         go_on="export again, or name a folder on another disk; the checkpoint is as it was",
     ) as writer:
-        TensorFile.whole(ckpt.MODEL, weights_by_name(model), True).write(writer)
+        TensorFile.full(ckpt.MODEL, weights_by_name(model), True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, {**config, "config": tree, "origins": origins})
         for name in sorted(checkpoint.manifest.files):

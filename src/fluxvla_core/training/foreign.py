@@ -16,7 +16,7 @@ from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.parts import Stored
+from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names
 from fluxvla_core.checkpoints.writer import PARTIAL, CheckpointWriter
 from fluxvla_core.config.load import FORMAT
@@ -89,7 +89,7 @@ def import_checkpoint(
         what="the import",
         go_on="import again, or name a folder on another disk; the source is as it was",
     ) as writer:
-        TensorFile.whole(ckpt.MODEL, tensors, True).write(writer)
+        TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, _config(found))
         writer.write_json(ckpt.ENVIRONMENT, environment())
@@ -99,8 +99,8 @@ def import_checkpoint(
         if found.embodiment is not None:
             writer.write_json(ckpt.EMBODIMENT, found.embodiment.to_dict())
         pipeline = Pipeline(found.transforms)
-        writer.fill_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
-        writer.enter_folder(ckpt.PROCESSORS)
+        writer.write_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
+        writer.add_folder(ckpt.PROCESSORS)
         return writer.commit(), found
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.parts import Stored
-from fluxvla_core.checkpoints.tensors import like
+from fluxvla_core.checkpoints.shards import Stored
+from fluxvla_core.checkpoints.tensors import shard_like
 from fluxvla_core.errors import CheckpointError
 
 NamedState = dict[str, Tensor]
@@ -78,7 +78,7 @@ def torch_state(
             same = value.shape == parameters[name].shape
             everything = tuple(slice(0, n) for n in value.shape)
             # A copy: what was read may be a view of the checkpoint's file.
-            value = (like(parameters[name], value) if same else value[everything]).clone()
+            value = (shard_like(parameters[name], value) if same else value[everything]).clone()
         state.setdefault(index[name], {})[key] = value
     groups, first = [], 0
     for mine, saved in zip(optimizer.param_groups, described["groups"], strict=True):

@@ -13,10 +13,10 @@ from typing import Any
 from torch import Tensor, nn
 
 from fluxvla_core.checkpoints.foreign import HUB, foreign_folder, safetensors_in, torch_table
-from fluxvla_core.checkpoints.parts import Stored, StoredTensors
+from fluxvla_core.checkpoints.shards import Stored, StoredTensors
 from fluxvla_core.contracts.training import PartWeights
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.training.weights import put_model_tensors, weights_by_name
+from fluxvla_core.training.weights import load_full_tensors, weights_by_name
 
 _SHOWN = 6
 _PICKLED = (".pt", ".pth", ".bin")
@@ -32,7 +32,7 @@ def put_parts(model: nn.Module, parts: Sequence[PartWeights]) -> None:
             lists what is missing, left over or of another size.
     """
     for part in parts:
-        put_model_tensors(model, matched(tensors_at(part.place), weights_by_name(model), part))
+        load_full_tensors(model, matched(tensors_at(part.place), weights_by_name(model), part))
 
 
 def matched(

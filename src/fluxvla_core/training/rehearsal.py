@@ -41,7 +41,7 @@ from fluxvla_core.training.parameters import trainable
 from fluxvla_core.training.strategy import Strategy
 
 PROCESSES = (1, 2, 4, 8)
-"""For which the memory is told, where nobody says how many there are."""
+"""Numbers of processes to estimate memory for, without ``--nproc``."""
 
 
 @dataclass

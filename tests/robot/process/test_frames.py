@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.frame import Frame, RobotFrame
 from fluxvla_core.errors import FluxError, NotReady, Rejected
 from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.robot.process.frames import (
@@ -76,6 +76,24 @@ def test_a_frame_arrives_in_fresh_arrays(ends):
     assert first.images["front"].flags.writeable
     assert not np.shares_memory(first.images["front"], second.images["front"])
     assert not np.shares_memory(first.state, second.state)
+
+
+def test_depth_and_base_arrive_where_there_are_any(ends):
+    plain = frame()
+    random = np.random.default_rng(1)
+    depths = {c.name: random.uniform(0, 9, (c.height, c.width)) for c in CAMERAS}
+    base = np.array([0.5, -0.25])
+    wanted = RobotFrame(plain.state, plain.images, plain.stamps, depths, base)
+    assert ends[1].fits(look_of(wanted, NAMES, "a"))
+
+    found = frame_of(through(ends, look_of(wanted, NAMES, "a")))
+    without = frame_of(through(ends, look_of(plain, NAMES, "a")))
+
+    assert_same(found, wanted)
+    for name in NAMES:
+        np.testing.assert_array_equal(found.depths[name], np.float32(depths[name]))
+    np.testing.assert_array_equal(found.base, base)
+    assert (without.depths, without.base) == ({}, None)
 
 
 def test_only_the_cameras_that_are_looked_at_are_sent(ends):

@@ -16,9 +16,9 @@ from fluxvla_aloha.presets import PRESETS
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 from fluxvla_core.ros2 import (
+    AUXILIARY,
     JOINT_STATE,
     ODOMETRY,
-    SIDE,
     STATE,
     TWIST,
     BadMessage,
@@ -212,7 +212,7 @@ class AlohaOperator(RosOperator):
             if self._use_depth:
                 found.append(camera_stream(camera, depth, self._camera_hz, depth=True))
         if self._use_base:
-            kind = STATE if self._policy_drives else SIDE
+            kind = STATE if self._policy_drives else AUXILIARY
             found.append(StreamSpec("base", self._base_topics[0], ODOMETRY, kind, depth=1))
         return found
 

@@ -1,4 +1,4 @@
-"""A U-Net over time whose blocks are scaled and shifted by what is known (Chi et al. 2023).
+"""A FiLM-conditioned 1D U-Net over time (Chi et al. 2023, Diffusion Policy).
 
 Parameters are named as in LeRobot's implementation of Diffusion Policy.
 """

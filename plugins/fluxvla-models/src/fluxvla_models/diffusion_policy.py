@@ -239,7 +239,7 @@ class DiffusionPolicy(VLA, nn.Module):
         return [*stages, *self.unet.fsdp_units()]
 
     def _condition(self, images: Tensor, states: Tensor, crops: Tensor | None) -> Tensor:
-        """What is known, ``(B, n_obs_steps * (S + features))``."""
+        """The U-Net's condition ``(B, n_obs_steps * (S + features))``."""
         steps = self.n_obs_steps
         if steps == 1 and states.ndim == 2:
             images, states = images[:, None], states[:, None]

@@ -1,4 +1,4 @@
-"""Diffusion Policy's eyes: a residual network and the expected positions of its features."""
+"""Image encoder of Diffusion Policy: a ResNet and a spatial softmax."""
 
 from __future__ import annotations
 

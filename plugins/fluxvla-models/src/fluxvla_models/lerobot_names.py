@@ -52,7 +52,7 @@ def published_act_name(name: str) -> str:
 
 
 def published_diffusion_name(name: str, separate: bool) -> str:
-    """Of our ``name`` LeRobot's; ``separate``: each camera has its own encoder."""
+    """LeRobot's name of our tensor ``name``; ``separate``: each camera has its own encoder."""
     part = _OWN_BACKBONE.match(name)
     if part is not None and part[2] in _PLACES:
         name = f"{part[1]}{_PLACES[part[2]]}.{name[part.end() :]}"

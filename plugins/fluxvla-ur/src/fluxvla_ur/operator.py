@@ -12,10 +12,10 @@ import numpy.typing as npt
 from fluxvla_core.errors import ConfigError, Faulted, Rejected
 from fluxvla_core.operators import Camera
 from fluxvla_core.ros2 import (
+    AUXILIARY,
     FLOAT64,
     FLOAT64_ARRAY,
     JOINT_STATE,
-    SIDE,
     BadMessage,
     CommandSpec,
     RosOperator,
@@ -176,14 +176,16 @@ class UROperator(RosOperator):
         if self._gripper_joint is None:
             # A bare number has no stamp, so it cannot be matched in time with the others.
             found.append(
-                StreamSpec("gripper", self._gripper_state, self._gripper_message, SIDE, depth=1)
+                StreamSpec(
+                    "gripper", self._gripper_state, self._gripper_message, AUXILIARY, depth=1
+                )
             )
         hint = " (drivers that have none: require_status=False)" if self._require_status else ""
         scaling = StreamSpec(
             "speed scaling",
             self._scaling_topic,
             FLOAT64,
-            SIDE,
+            AUXILIARY,
             depth=1,
             required=self._require_status,
             unheard="the driver's speed_scaling_state_broadcaster is not active, or has another "
@@ -193,7 +195,7 @@ class UROperator(RosOperator):
             "program running",
             self._running_topic,
             BOOL,
-            SIDE,
+            AUXILIARY,
             depth=1,
             required=self._require_status,
             latched=True,
@@ -232,7 +234,7 @@ class UROperator(RosOperator):
             raise BadMessage(f"the speed scaling ({self._scaling_topic}) is {percent}")
         return min(max(percent / 100.0, 0.0), 1.0)
 
-    def admit(self, action: Array) -> None:
+    def check_command(self, action: Array) -> None:
         running = self.newest("program running")
         if running is not None and not running.message.data:
             raise Faulted(

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.frame import STATE, Frame, RobotFrame
 from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.robot.robot import is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -31,7 +31,8 @@ _NUMBERS = 64
 _ALIGNED = 64
 # Room for the JSON values: names, stamps, or an error's message.
 _TEXT = 64 * 1024
-_PICTURE, _MORE, _MEASURED = "picture ", "more ", "measured"
+_PICTURE, _DEPTH, _BASE = "picture ", "depth ", "base"
+_MORE, _MEASURED = "more ", "measured"
 
 
 class FrameMemory(NamedTuple):
@@ -48,10 +49,10 @@ class FrameMemory(NamedTuple):
 
 
 def frame_bytes(embodiment: EmbodimentSpec, cameras: Iterable[str]) -> int:
-    """Bytes that a frame of a robot takes at most: its state, and a picture of each camera."""
-    sizes = {camera.name: camera.height * camera.width * 3 for camera in embodiment.cameras}
-    pictures = sum(_aligned(sizes[name]) for name in cameras)
-    return _NUMBERS + _TEXT + 2 * _aligned(8 * embodiment.state_dim) + pictures
+    """Bytes that a frame takes at most: state, base, and the image and depth of each camera."""
+    pixels = {camera.name: camera.height * camera.width for camera in embodiment.cameras}
+    images = sum(_aligned(3 * pixels[name]) + _aligned(4 * pixels[name]) for name in cameras)
+    return _NUMBERS + _TEXT + 2 * _aligned(8 * embodiment.state_dim) + _ALIGNED + images
 
 
 def make_frame_memory(size: int) -> FrameMemory:
@@ -156,7 +157,7 @@ class FrameChannel:
 
 
 def look_of(frame: Frame, cameras: Iterable[str], source: str) -> Look:
-    """State, stamps and the pictures of ``cameras`` of a frame; what it has besides is left out.
+    """State, stamps, base, and the images and depth of ``cameras`` of a frame.
 
     Args:
         frame: of the operator; a picture that is None has not come yet.
@@ -172,17 +173,24 @@ def look_of(frame: Frame, cameras: Iterable[str], source: str) -> Look:
         _PICTURE + name: _numbers(picture, f"camera {name} of {source}")
         for name, picture in pictures.items()
     }
+    if isinstance(frame, RobotFrame):
+        depths = {n: frame.depths[n] for n in cameras if frame.depths.get(n) is not None}
+        arrays |= {
+            _DEPTH + name: _numbers(depth, f"depth {name} of {source}").astype(
+                np.float32, copy=False
+            )
+            for name, depth in depths.items()
+        }
+        if frame.base is not None:
+            arrays[_BASE] = _numbers(frame.base, f"the base of {source}")
     return Look({"stamps": stamps}, arrays)
 
 
 def frame_of(look: Look) -> Frame:
     """The frame of ``look_of``."""
-    pictures = {
-        name.removeprefix(_PICTURE): array
-        for name, array in look.arrays.items()
-        if name.startswith(_PICTURE)
-    }
-    return Frame(look.arrays[STATE], pictures, look.fields["stamps"])
+    images, depths = _named(look, _PICTURE), _named(look, _DEPTH)
+    state, stamps = look.arrays[STATE], look.fields["stamps"]
+    return RobotFrame(state, images, stamps, depths, look.arrays.get(_BASE))
 
 
 def look_of_window(
@@ -218,6 +226,8 @@ def look_of_window(
     if window.get("qpos") is None:
         shown = replace(shown, state=np.empty(0))
         waits.append(STATE)
+    if isinstance(frame, RobotFrame):
+        shown = RobotFrame(shown.state, shown.images, shown.stamps, frame.depths, frame.base)
     look = look_of(shown, cameras, source)
     if frame is not None:
         arrays[_MEASURED] = _numbers(frame.state, f"the state of {source}")
@@ -231,12 +241,16 @@ def window_of(look: Look) -> tuple[dict[str, Any], Frame | None]:
     if not isinstance(values, dict):
         return {"images": values}, None
     shown = frame_of(look)
-    more = {k.removeprefix(_MORE): a for k, a in look.arrays.items() if k.startswith(_MORE)}
+    more = _named(look, _MORE)
     waits = look.fields["waits"]
     images = {**shown.images, **{name: None for name in waits if name != STATE}}
     window = {"qpos": None if STATE in waits else shown.state, "images": images, **values, **more}
     frame = replace(shown, state=look.arrays[_MEASURED]) if look.fields["frame"] else None
     return window, frame
+
+
+def _named(look: Look, kind: str) -> dict[str, AnyArray]:
+    return {k.removeprefix(kind): a for k, a in look.arrays.items() if k.startswith(kind)}
 
 
 def _is_array(value: Any) -> bool:

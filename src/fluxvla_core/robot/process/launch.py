@@ -78,7 +78,7 @@ def stop_through_new_connection(
         except (Exception, SystemExit) as error:  # noqa: BLE001 - reported by the caller
             found[:] = [f"the robot could not be stopped through a fresh connection: {error}"]
 
-    thread = threading.Thread(target=stop, name="fluxvla-stop-afresh", daemon=True)
+    thread = threading.Thread(target=stop, name="fluxvla-stop-again", daemon=True)
     thread.start()
     thread.join(patience_s)
     return "; ".join(found) or None

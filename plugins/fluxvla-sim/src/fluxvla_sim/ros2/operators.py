@@ -22,8 +22,8 @@ from fluxvla_ur.operator import UROperator
 from fluxvla_core.errors import ConfigError, NotReady
 from fluxvla_core.operators import MonotonicClock
 from fluxvla_core.ros2 import (
+    AUXILIARY,
     CAMERA,
-    SIDE,
     STATE,
     CommandSpec,
     Connection,
@@ -98,7 +98,7 @@ class InSimulation(RosOperator):
         self._judged: tuple[float, float] | None = None
 
     def streams(self) -> Sequence[StreamSpec]:
-        return [*super().streams(), StreamSpec("facts", FACTS, STRING, SIDE, depth=1)]
+        return [*super().streams(), StreamSpec("facts", FACTS, STRING, AUXILIARY, depth=1)]
 
     def commands(self) -> Sequence[CommandSpec]:
         return [*super().commands(), CommandSpec(RESET, INT64, exclusive=False)]

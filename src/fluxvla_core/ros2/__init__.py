@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.messages import message_class as message_class
     from fluxvla_core.ros2.operator import RosOperator as RosOperator
     from fluxvla_core.ros2.stop_motion import checked_action as checked_action
+    from fluxvla_core.ros2.streams import AUXILIARY as AUXILIARY
     from fluxvla_core.ros2.streams import CAMERA as CAMERA
     from fluxvla_core.ros2.streams import DEPTH as DEPTH
-    from fluxvla_core.ros2.streams import SIDE as SIDE
     from fluxvla_core.ros2.streams import STATE as STATE
     from fluxvla_core.ros2.streams import CommandSpec as CommandSpec
     from fluxvla_core.ros2.streams import StreamSpec as StreamSpec
@@ -67,10 +67,10 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.ros2.operator": ["RosOperator"],
         "fluxvla_core.ros2.qos": ["qos"],
         "fluxvla_core.ros2.streams": [
+            "AUXILIARY",
             "CAMERA",
             "CommandSpec",
             "DEPTH",
-            "SIDE",
             "STATE",
             "StreamSpec",
             "camera_stream",
@@ -78,4 +78,5 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.ros2.sync": ["Stale"],
     },
+    deprecated={"SIDE": "AUXILIARY"},
 )

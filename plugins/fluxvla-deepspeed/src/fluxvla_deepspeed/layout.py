@@ -1,4 +1,4 @@
-"""What one process keeps of a model under ZeRO, as DeepSpeed 0.19 does it.
+"""Memory of one process under ZeRO, as DeepSpeed 0.19 implements it.
 
 Weights, gradients and their sums are fp32 here in every stage, also in mixed precision.
 """
@@ -27,7 +27,7 @@ PREFETCHED = 50_000_000
 
 
 def partitioned(model: nn.Module, stage: int, processes: int) -> Layout:
-    """What one of ``processes`` keeps of ``model`` in ZeRO's ``stage``."""
+    """The layout of ``model`` on one of ``processes`` in ZeRO's ``stage``."""
     return _split(model, processes) if stage == 3 else _flat(model, stage, processes)
 
 
@@ -48,7 +48,8 @@ def _flat(model: nn.Module, stage: int, processes: int) -> Layout:
 
 
 def _split(model: nn.Module, processes: int) -> Layout:
-    """Stage 3: a part of every weight, frozen ones too; small ones are whole besides."""
+    """Stage 3: a part of every weight, frozen ones too; small ones are whole besides. Of the parts
+    that are trained the optimizer has a copy."""
 
     def part(parameter: nn.Parameter) -> int:
         return math.ceil(parameter.numel() / processes)
@@ -60,7 +61,7 @@ def _split(model: nn.Module, processes: int) -> Layout:
     units = [sum(p.numel() for m in unit for p in m.parameters()) for unit in units_of(model)]
     largest = max([*units, *(p.numel() for p in parameters)])
     return Layout(
-        parameters=sum(part(p) for p in parameters) * FP32 + nbytes(model.buffers()),
+        parameters=(sum(map(part, parameters)) + sum(own)) * FP32 + nbytes(model.buffers()),
         gradients=sum(own) * FP32,
         optimized=[[bare((count,), torch.float32)] for count in own],
         gathered=(small + largest + PREFETCHED + BUCKET) * FP32,

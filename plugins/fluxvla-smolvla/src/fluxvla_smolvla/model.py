@@ -1,9 +1,9 @@
 """SmolVLA (Shukor et al. 2025, arXiv 2506.01844), as LeRobot publishes it.
 
-Pictures, the instruction and a state token go through the first layers of SmolVLM2. An action
+Images, the instruction and a state token go through the first layers of SmolVLM2. An action
 expert of narrower layers attends to that model's keys and values, layer by layer, and predicts the
 velocity of flow matching. The language model sees nothing of the actions, so its part of a sample
-is computed once, however many draws of noise or integration steps follow.
+is computed once, however many noise samples or integration steps follow.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
 from fluxvla_smolvla.loss import masked_mean
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
-from fluxvla_smolvla.transformer import ContextLayer, Memory, Prefix, RMSNorm, Rotation
+from fluxvla_smolvla.transformer import ContextLayer, KVCache, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
 
 LOSSES = ("valid", "all")
 SMOLVLM2 = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 BLACK = -1.0
-"""What pictures are padded with, normalised."""
+"""Normalised value that images are padded with."""
 
 
 class LanguageModel(nn.Module):
@@ -46,18 +46,18 @@ class LanguageModel(nn.Module):
         self.layers = nn.ModuleList(ContextLayer(size) for _ in range(size.layers))
         self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
 
-    def forward(self, context: Tensor, seen: Tensor, state: Tensor) -> Memory:
+    def forward(self, context: Tensor, mask: Tensor, state: Tensor) -> KVCache:
         """Keys and values of the layers up to the deepest.
 
         Args:
-            context: ``(B, C, width)``; ``seen``: ``(B, C)`` bool, real ones.
+            context: ``(B, C, width)``; ``mask``: ``(B, C)`` bool, False on padding.
             state: ``(B, 1, width)``.
         """
-        count = seen.sum(1)
+        count = mask.sum(1)
         head_dim = self.size.head_dim
         prefix = Prefix(
-            seen=seen[:, None, None],
-            context=Rotation.at(seen.long().cumsum(1) - 1, head_dim),
+            mask=mask[:, None, None],
+            context=Rotation.at(mask.long().cumsum(1) - 1, head_dim),
             state=Rotation.at(count[:, None], head_dim),
         )
         keys, values = [], []
@@ -66,12 +66,12 @@ class LanguageModel(nn.Module):
             context, state, key, value = layer(context, state, prefix, last)
             keys.append(key)
             values.append(value)
-        all_seen = nn.functional.pad(prefix.seen, (0, 1), value=True)
-        return Memory(tuple(keys), tuple(values), all_seen, count + 1)
+        cache_mask = nn.functional.pad(prefix.mask, (0, 1), value=True)
+        return KVCache(tuple(keys), tuple(values), cache_mask, count + 1)
 
 
 class SmolVLA(VLA, nn.Module):
-    """Pictures, instruction and joint state in, action chunk out; 450 million parameters.
+    """Images, instruction and joint state in, action chunk out; 450 million parameters.
 
     ``forward`` and ``predict_action`` draw nothing: noise and times come in with the batch.
 
@@ -92,6 +92,9 @@ class SmolVLA(VLA, nn.Module):
         loss_mean: ``valid``, as LeRobot: the mean over the steps that are inside their episodes;
             ``all``: steps beyond the end count as 0, which several processes, each with its own
             share of a batch, compute exactly as one process does.
+        prefix_conditioning: chunks that continue another are trained for and made by holding their
+            beginning (Black et al. 2025, arXiv 2512.05964); without, they are made by guidance.
+            Training takes ``prefix_len`` of ``SamplePrefixLength`` then.
         vlm_model_name: the backbone's name on the hub, which LeRobot looks up; for exports.
         pretrained_name_or_path: weights that a training starts from, as ``runner.init_from``.
 
@@ -117,15 +120,16 @@ class SmolVLA(VLA, nn.Module):
         train_expert_only: bool = True,
         train_state_proj: bool = True,
         loss_mean: str = "valid",
+        prefix_conditioning: bool = False,
         vlm_model_name: str = SMOLVLM2,
         pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
-        seen, read = size_of(VisionSize, vision), size_of(TextSize, text)
-        experts = read.layers if num_expert_layers is None else num_expert_layers
+        vision_size, text_size = size_of(VisionSize, vision), size_of(TextSize, text)
+        experts = text_size.layers if num_expert_layers is None else num_expert_layers
         _check_counts(
             experts,
-            read.layers,
+            text_size.layers,
             n_action_steps=n_action_steps,
             num_steps=num_steps,
             max_state_dim=max_state_dim,
@@ -141,16 +145,17 @@ class SmolVLA(VLA, nn.Module):
         self.n_action_steps, self.num_steps, self.loss_mean = n_action_steps, num_steps, loss_mean
         self.max_state_dim, self.max_action_dim = max_state_dim, max_action_dim
         self.ori_action_dim = max_action_dim if ori_action_dim is None else ori_action_dim
-        self.image_size, self.width = seen.image_size, read.hidden_size
+        self.prefix_conditioning = prefix_conditioning
+        self.image_size, self.width = vision_size.image_size, text_size.hidden_size
         self.pretrained_name_or_path = pretrained_name_or_path
-        size = expert_size(read, experts, expert_width_multiplier)
-        self.vision = VisionTower(seen)
-        self.connector = Connector(seen, read.hidden_size)
-        stride = read.layers // experts
-        self.text = LanguageModel(read, deepest=(experts - 1) * stride)
+        size = expert_size(text_size, experts, expert_width_multiplier)
+        self.vision = VisionTower(vision_size)
+        self.connector = Connector(vision_size, text_size.hidden_size)
+        stride = text_size.layers // experts
+        self.text = LanguageModel(text_size, deepest=(experts - 1) * stride)
         # Of no use here; kept so that a checkpoint goes back to LeRobot as it came.
-        self.lm_head = nn.Linear(read.hidden_size, read.vocabulary, bias=False)
-        self.state_proj = nn.Linear(max_state_dim, read.hidden_size)
+        self.lm_head = nn.Linear(text_size.hidden_size, text_size.vocabulary, bias=False)
+        self.state_proj = nn.Linear(max_state_dim, text_size.hidden_size)
         self.embed_actions = ActionTimeMLP(max_action_dim, size.hidden_size, min_period, max_period)
         self.expert = Expert(size, stride, self_attn_every_n_layers)
         self.action_out_proj = nn.Linear(size.hidden_size, max_action_dim)
@@ -168,6 +173,7 @@ class SmolVLA(VLA, nn.Module):
         action_masks: Tensor,
         noise: Tensor,
         time: Tensor,
+        prefix_len: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -179,19 +185,38 @@ class SmolVLA(VLA, nn.Module):
             states: ``(B, S)`` normalised; ``actions``: ``(B, T, D)`` normalised.
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)``; ``time``: ``(B, K)`` in 0..1, 1 being the data.
+            prefix_len: ``(B, K)`` int64: so many actions at the beginning are given, without noise,
+                and their errors count as 0, for ``prefix_conditioning``.
 
         Raises:
             DataError: an input of a width that the model does not have.
+            ConfigError: ``prefix_len`` without ``prefix_conditioning``, or the reverse.
         """
-        draws, shape = noise.shape[1], self.action_shape
+        if self.prefix_conditioning != (prefix_len is not None):
+            raise ConfigError(
+                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
+                f"{'no' if prefix_len is None else 'a'} prefix_len",
+                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
+                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
+            )
+        repeats, shape = noise.shape[1], self.action_shape
         _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
         _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states).repeat(draws)
-        t = (1.0 - time)[..., None, None]
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        cache = cache.repeat_interleave(repeats)
+        t, given = 1.0 - time, None
+        if prefix_len is not None:
+            given = self._first(prefix_len)
+            t = torch.where(given, 0.0, t[..., None])
+        share = t[..., None] if t.ndim == 3 else t[..., None, None]
         clean = actions[:, None]
-        noisy, target = t * noise + (1.0 - t) * clean, noise - clean
-        found = self._velocity(noisy.flatten(0, 1), t.flatten(), memory).unflatten(0, (-1, draws))
-        errors = (found.float() - target).square()[..., : self.ori_action_dim]
+        noisy, target = share * noise + (1.0 - share) * clean, noise - clean
+        velocity = self._velocity(noisy.flatten(0, 1), t.flatten(0, 1), cache)
+        velocity = velocity.unflatten(0, (-1, repeats))
+        errors = (velocity.float() - target).square()
+        if given is not None:
+            errors = errors * ~given[..., None]
+        errors = errors[..., : self.ori_action_dim]
         loss, each = masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
@@ -213,23 +238,30 @@ class SmolVLA(VLA, nn.Module):
         Args:
             images, img_masks, lang_tokens, lang_masks, states: as of ``forward``.
             prev_actions: ``(B, T, D)`` normalised, to continue; the other three belong to it, see
-                ``fluxvla_models.guidance.Guide``.
+                ``fluxvla_models.guidance.Guide``. With ``prefix_conditioning`` ``prefix_len`` rows
+                are held, the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
 
         Raises:
             DataError: an input of a width that the model does not have.
         """
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
-        own = self.ori_action_dim
+        own = None if self.prefix_conditioning else self.ori_action_dim
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         if guide is None:
             seen = self.observe(images, img_masks, lang_tokens, lang_masks, states)
             return self.denoise(seen, noise, self.step_tables())
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        held = guide if self.prefix_conditioning else None
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return self._velocity(x, t, memory).to(x.dtype)
+            if held is not None:
+                x = held.freeze(x)
+                t = torch.where(self._first(held.frozen), 0.0, t[:, None])
+            return self._velocity(x, t, cache).to(x.dtype)
 
+        if held is not None:
+            return held.freeze(sample(velocity, noise, self.num_steps))
         return sample(velocity, noise, self.num_steps, guide)
 
     def observe(
@@ -245,8 +277,8 @@ class SmolVLA(VLA, nn.Module):
         Raises:
             DataError: an input of a width that the model does not have.
         """
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
-        return self.expert.observe(memory, self.n_action_steps)
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        return self.expert.observe(cache, self.n_action_steps)
 
     def denoise(
         self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
@@ -255,14 +287,14 @@ class SmolVLA(VLA, nn.Module):
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
         x = noise
         for step in range(self.num_steps):
-            tokens = self.embed_actions.told(x, tables["times"][step])
+            tokens = self.embed_actions.embed_at_time(x, tables["times"][step])
             x = x - self._out(self.expert.step(tokens, seen)).to(x.dtype) / self.num_steps
         return x
 
     def step_tables(self) -> dict[str, Tensor]:
-        """``times`` ``(K, W)``: what stands for the time in every step."""
+        """``times`` ``(K, W)``: sinusoidal features of the time of every step."""
         times = torch.tensor([1.0 - step / self.num_steps for step in range(self.num_steps)])
-        return {"times": self.embed_actions.waves(times.to(self.state_proj.weight.device))}
+        return {"times": self.embed_actions.time_features(times.to(self.state_proj.weight.device))}
 
     @property
     def observe_is_capturable(self) -> bool:
@@ -282,9 +314,10 @@ class SmolVLA(VLA, nn.Module):
         """The layers of the vision tower, of the language model and of the expert."""
         return [*self.vision.layers, *self.text.layers, *self.expert.layers]
 
-    def _memory(
+    def _encode_prefix(
         self, images: Tensor, img_masks: Tensor, tokens: Tensor, masks: Tensor, states: Tensor
-    ) -> Memory:
+    ) -> KVCache:
+        """The KV cache of images, instruction and state."""
         cameras, rest = divmod(images.shape[1], 3)
         if rest or cameras != img_masks.shape[1]:
             raise DataError(
@@ -292,23 +325,27 @@ class SmolVLA(VLA, nn.Module):
                 "cameras; 3 channels each are expected"
             )
         _expect("states", states.shape[1:], "max_state_dim", (self.max_state_dim,))
-        pictures = self._look(images.unflatten(1, (cameras, 3)).flatten(0, 1))
-        pictures = pictures.unflatten(0, (-1, cameras))
-        shown = img_masks.bool()[..., None].expand(-1, -1, pictures.shape[2])
-        words = self.text.embed_tokens(tokens)
-        context = torch.cat([pictures.flatten(1, 2), words.to(pictures.dtype)], dim=1)
-        seen = torch.cat([shown.flatten(1), masks.bool()], dim=1)
+        features = self._encode_images(images.unflatten(1, (cameras, 3)).flatten(0, 1))
+        features = features.unflatten(0, (-1, cameras))
+        image_mask = img_masks.bool()[..., None].expand(-1, -1, features.shape[2])
+        embeddings = self.text.embed_tokens(tokens)
+        context = torch.cat([features.flatten(1, 2), embeddings.to(features.dtype)], dim=1)
+        mask = torch.cat([image_mask.flatten(1), masks.bool()], dim=1)
         state = self.state_proj(states)[:, None]
-        # LeRobot scales pictures and words by the root of their width, but not the state.
-        return self.text(context * self.width**0.5, seen, state)
+        # LeRobot scales image and text embeddings by the root of their width, but not the state.
+        return self.text(context * self.width**0.5, mask, state)
 
-    def _look(self, pictures: Tensor) -> Tensor:
+    def _encode_images(self, images: Tensor) -> Tensor:
         """``(B, 3, H, W)`` in -1..1 -> ``(B, tokens, width)``."""
-        whole = resize_with_pad(pictures, self.image_size, self.image_size, BLACK)
+        whole = resize_with_pad(images, self.image_size, self.image_size, BLACK)
         return self.connector(self.vision(whole))
 
-    def _velocity(self, noisy: Tensor, t: Tensor, memory: Memory) -> Tensor:
-        return self._out(self.expert(self.embed_actions(noisy, t), memory))
+    def _first(self, length: Tensor) -> Tensor:
+        """``(..., T)``, True for the first ``length`` ``(...)`` actions of a chunk."""
+        return torch.arange(self.n_action_steps, device=length.device) < length[..., None]
+
+    def _velocity(self, noisy: Tensor, t: Tensor, cache: KVCache) -> Tensor:
+        return self._out(self.expert(self.embed_actions(noisy, t), cache))
 
     def _out(self, hidden: Tensor) -> Tensor:
         out = self.action_out_proj

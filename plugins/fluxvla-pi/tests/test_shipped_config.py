@@ -124,3 +124,22 @@ def test_prompts_of_any_state_fit_the_tiny_one(value):
     for text in tree["inference"]["task_descriptions"].values():
         sample = prompt({"task_description": text, "states": np.full(14, value)})
         assert tokens(sample)["lang_masks"].sum() <= tables[-2]["max_len"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_tiny_one_learns_the_demos_tasks(tmp_path):
+    """As its first lines say; a policy that has learnt nothing never succeeds."""
+    pytest.importorskip("fluxvla_sim")
+    dataset, work = tmp_path / "dataset", tmp_path / "work"
+    assert main(["collect", "aloha", "--out", str(dataset), "--episodes", "240"]) == 0
+    sets = {
+        "runner": [f"train_dataloader.dataset.data_root_path={dataset}"],
+        "eval": ["eval.episodes=20", "eval.instruction_swap=false"],
+    }
+    for section, words in sets.items():
+        asked = ["--section", section, "--nproc", "2", "--work-dir", str(work)]
+        assert main(["run", "--config", str(TINY), *asked, "--cfg-options", *words]) == 0
+    found = json.loads((work / "eval" / "results.json").read_text())["groups"]
+    assert found["untrained"]["all"]["successes"] == 0
+    assert found["policy"]["all"]["low"] > 0.3, found["policy"]

@@ -127,9 +127,9 @@ def operator(seconds: float) -> dict[str, Any]:
     try:
 
         def observe() -> float:
-            before = robot.kept("cam_high")
+            before = robot.history("cam_high")
             receipt = robot.get_frame().stamps["cam_high"]
-            stamps = {m.receipt: m.stamp for m in (*before, *robot.kept("cam_high"))}
+            stamps = {m.receipt: m.stamp for m in (*before, *robot.history("cam_high"))}
             return receipt + offset - (stamps[receipt] or 0.0)
 
         return ask(observe, seconds)

@@ -104,6 +104,13 @@ def test_another_name_is_not_there(module):
         _ = importlib.import_module(module).Nothing
 
 
+def test_a_deprecated_name_works_and_names_the_new_one():
+    training = importlib.import_module("fluxvla_core.training")
+    assert "share_buffers" not in training.__all__
+    with pytest.warns(DeprecationWarning, match=r"share_buffers is deprecated, use .*\.broadcast_"):
+        assert training.share_buffers is training.broadcast_buffers
+
+
 def python_of(path: Path) -> list[str]:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":

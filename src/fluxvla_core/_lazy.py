@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 
 def attach(
-    module: str, exports: Mapping[str, Sequence[str]]
+    module: str,
+    exports: Mapping[str, Sequence[str]],
+    deprecated: Mapping[str, str] | None = None,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a public module.
 
@@ -20,11 +23,18 @@ def attach(
     Args:
         module: ``__name__`` of the public module.
         exports: inner module -> names that it provides.
+        deprecated: old name -> the new one. An old name still works, with a DeprecationWarning; it
+            is not in ``__all__``.
     """
     sources = {name: source for source, names in exports.items() for name in names}
+    renamed = dict(deprecated or {})
     modules = {s for s, names in exports.items() if list(names) == [s.rpartition(".")[2]]}
 
     def __getattr__(name: str) -> Any:
+        if name in renamed:
+            message = f"{module}.{name} is deprecated, use {module}.{renamed[name]}"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            return getattr(sys.modules[module], renamed[name])
         source = sources.get(name)
         if source is None:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")

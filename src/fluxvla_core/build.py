@@ -11,16 +11,18 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fluxvla_core.config.resolve import INJECTED
-from fluxvla_core.config.runtime_signature import misfits, option_fields
+from fluxvla_core.config.runtime_signature import misfits, option_names
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,28 @@ def build_from_cfg(
         raise explained from error
 
 
+def bind_options(kind: type[T], given: Mapping[str, Any], name: str, context: RunContext) -> T:
+    """The settings of a class whose constructor takes ``**options``: its dataclass ``Options``.
+
+    Args:
+        kind: that dataclass.
+        given: the constructor's keywords.
+        name: the class's.
+
+    Raises:
+        ConfigError: a key is unknown, or one that is required is missing.
+    """
+    try:
+        bound = inspect.signature(kind).bind(**given)
+    except TypeError as error:
+        raise ConfigError(
+            f"{name}: {error}",
+            where=context.where(context.section),
+            next=f"fluxvla plugins show {name}",
+        ) from error
+    return kind(*bound.args, **bound.kwargs)
+
+
 def takes(cfg: Any, registry: Registry, name: str) -> bool:
     """Whether the class of the table ``cfg`` has a parameter called ``name``; an object has none.
 
@@ -133,7 +157,7 @@ def parameters(cls: type) -> set[str]:
         names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
         kwargs = [n for n, p in found.items() if p.kind is p.VAR_KEYWORD]
         if kwargs == [OPTIONS_KEYWORDS]:
-            names |= {one.name for one in option_fields(cls)}
+            names |= option_names(cls)
         if not kwargs:
             break
     return names - {"self"}

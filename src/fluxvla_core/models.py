@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fluxvla_core.checkpoints.foreign import safetensors_in as safetensors_in
     from fluxvla_core.checkpoints.foreign import torch_table as torch_table
     from fluxvla_core.checkpoints.foreign import without_cameras as without_cameras
-    from fluxvla_core.checkpoints.parts import Stored as Stored
+    from fluxvla_core.checkpoints.shards import Stored as Stored
     from fluxvla_core.contracts.checkpoint_format import CheckpointFormat as CheckpointFormat
     from fluxvla_core.contracts.checkpoint_format import ForeignCheckpoint as ForeignCheckpoint
     from fluxvla_core.contracts.frame import Observation as Observation
@@ -51,7 +51,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "torch_table",
             "without_cameras",
         ],
-        "fluxvla_core.checkpoints.parts": ["Stored"],
+        "fluxvla_core.checkpoints.shards": ["Stored"],
         "fluxvla_core.contracts.checkpoint_format": ["CheckpointFormat", "ForeignCheckpoint"],
         "fluxvla_core.contracts.frame": ["Observation"],
         "fluxvla_core.contracts.policy": ["Policy"],

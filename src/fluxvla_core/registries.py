@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 PREFIX = "fluxvla."
-"""Of every entry-point group."""
+"""Prefix of every entry-point group."""
 
 _ROBOT = "fluxvla_core.contracts.robot"
 _POLICY = "fluxvla_core.contracts.policy"

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
-from fluxvla_core.checkpoints.parts import StoredTensors
+from fluxvla_core.checkpoints.shards import StoredTensors
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names, read_tensors
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
@@ -22,7 +22,7 @@ from fluxvla_core.errors import CheckpointError
 
 def saved(tmp_path, tensors):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
-        TensorFile.whole("t.safetensors", tensors, True).write(writer)
+        TensorFile.full("t.safetensors", tensors, True).write(writer)
         return writer.commit() / "t.safetensors"
 
 

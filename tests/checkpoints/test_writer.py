@@ -28,8 +28,8 @@ def write(work_dir, step, disk=None, text=b"weights"):
         writer.write_bytes("model.safetensors", text * step)
         writer.write_json("trainer.json", {"step": step, "loss": 0.1 + 0.2})
         writer.write_bytes("rng/rank-00000.safetensors", b"r")
-        writer.fill_folder("processors", lambda folder: (folder / "t.json").write_text("{}"))
-        writer.enter_folder("processors")
+        writer.write_folder("processors", lambda folder: (folder / "t.json").write_text("{}"))
+        writer.add_folder("processors")
         return writer.commit()
 
 
@@ -40,7 +40,7 @@ def write_together(work_dir, step, disk=None):
     for writer in (second, first):
         writer.write_bytes(f"optimizer/rank-0000{writer.rank}.safetensors", b"p" * step)
     first.write_bytes("model.safetensors", b"weights")
-    first.join([first.report(), second.report()])
+    first.merge_reports([first.rank_report(), second.rank_report()])
     return first.commit()
 
 
@@ -123,7 +123,7 @@ def test_a_rank_that_does_not_see_the_folder_says_so(tmp_path):
     second = CheckpointWriter(tmp_path / "elsewhere", 5, 0, rank=1)
     first.begin("optimizer")
     second.write_bytes("optimizer/rank-00001.safetensors", b"x")
-    first.join([second.report()])
+    first.merge_reports([second.rank_report()])
     seen = "No such file or directory, on rank 1, which may not see the first rank's work dir"
     with pytest.raises(RunFailed, match=seen):
         first.commit()
@@ -271,7 +271,7 @@ def test_a_folder_that_was_removed_meanwhile_is_not_made_again(tmp_path):
     writer = CheckpointWriter(tmp_path / "work", 5, 0)
     writer.begin()
     shutil.rmtree(tmp_path / "work")
-    writer.fill_folder("processors", lambda folder: None)
+    writer.write_folder("processors", lambda folder: None)
     writer.write_bytes("random/rank-00000.safetensors", b"x")
     with pytest.raises(RunFailed, match="No such file or directory"):
         writer.commit()

@@ -141,14 +141,14 @@ def test_nothing_is_evaluated_after_a_stop_during_the_last_save(
     pytest.importorskip("torch")
     from fluxvla_core import BaseTrainRunner
 
-    settle = BaseTrainRunner.settle_saves
+    settle = BaseTrainRunner.finish_pending_save
 
     def settled(run: BaseTrainRunner, wait: bool = True) -> None:
         settle(run, wait)
         if wait:  # not after a step
             os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(BaseTrainRunner, "settle_saves", settled)
+    monkeypatch.setattr(BaseTrainRunner, "finish_pending_save", settled)
     monkeypatch.setattr(os, "execve", lambda *words: pytest.fail("it is evaluated"))
     write("tiny.py", TINY)
     config = write("t.py", TRAINS)

@@ -146,7 +146,7 @@ def going_on(place: str, steps: int, *words: str, module: tuple[str, ...] = ()) 
 
 @pytest.mark.slow
 def test_a_config_that_resumes_needs_no_option(tiny: None) -> None:
-    assert "training starts afresh" in going_on("auto", 3)
+    assert "training starts from scratch" in going_on("auto", 3)
     assert "resuming from work/checkpoints/step-000000003 (step 3)" in going_on(
         "auto", 4, "--nproc", "2"
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import ConfigError, NotReady
-from fluxvla_core.ros2 import JOINT_STATE, StreamSpec, camera_stream, qos
+from fluxvla_core.ros2 import AUXILIARY, JOINT_STATE, StreamSpec, camera_stream, qos
 from tests.ros2.arm import (
     CAM,
     COMMANDS,
@@ -195,7 +195,7 @@ def test_streams_without_stamps_are_matched_by_receipt(operators, drivers):
 
 def test_a_side_stream_that_need_not_be_there_is_not_missed(drivers, operators, monkeypatch):
     streams = Arm.streams(Arm())
-    side = StreamSpec("mode", "/mode", "std_msgs.msg:Bool", kind="side", required=False)
+    side = StreamSpec("mode", "/mode", "std_msgs.msg:Bool", kind=AUXILIARY, required=False)
     monkeypatch.setattr(Arm, "streams", lambda self: [*streams, side])
     drivers([STATE, PICTURES], [COMMANDS])
     operator = operators()

@@ -30,8 +30,8 @@ class Wired(Arm):
     def on_stop(self):
         self.called.append("on_stop")
 
-    def admit(self, action):
-        self.called.append("admit")
+    def check_command(self, action):
+        self.called.append("check_command")
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def test_both_parts_read_the_same_state_and_one_of_them_the_pictures(both):
     assert set(control._connection.streams) == {"arm"}
     assert control.pictures_after("cam", 0.0) == ([], 0)
     assert control.newest("cam") is None
-    assert control.kept("cam") == ()
+    assert control.history("cam") == ()
     with pytest.raises(NotReady, match="this part of arm has no cameras, and so no frames"):
         control.get_frame()
 
@@ -146,7 +146,7 @@ def test_the_part_without_commands_sends_nothing_and_its_hooks_are_not_called(bo
     control.wave()
     control.close()
     wait_for(lambda: len(heard(robot)) > before)
-    assert control.called == ["on_connected", "admit", "on_stop"]
+    assert control.called == ["on_connected", "check_command", "on_stop"]
 
 
 def test_a_camera_that_falls_silent_is_noticed_where_it_is_read(both, robot):
@@ -219,3 +219,17 @@ def test_a_part_does_what_it_has_and_refuses_the_rest(part):
         else:
             with pytest.raises(error, match="this part of arm"):
                 check("arm")
+
+
+def test_deprecated_names_still_work():
+    with pytest.warns(DeprecationWarning, match="Old.admit is deprecated, call it check_command"):
+
+        class Old(Wired):
+            def admit(self, action):
+                checked.append(action)
+
+    arm, checked = Old(), []
+    arm.check_command(TARGET)
+    assert checked == [TARGET]
+    with pytest.warns(DeprecationWarning, match="use history"):
+        assert arm.kept("cam") == arm.history("cam") == ()

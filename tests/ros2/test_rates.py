@@ -8,34 +8,37 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.errors import NotReady
-from fluxvla_core.ros2.startup import SEGMENT_BYTES, Reception, check_losses, large_frames_profile
+from fluxvla_core.ros2.startup import (
+    SEGMENT_BYTES,
+    ReceptionStats,
+    check_losses,
+    large_frames_profile,
+)
 
 VGA = 640 * 480 * 3
 
 
-def reception(received, lost=0, size=VGA, reliability="best_effort", expected_hz=None, fast=True):
-    return Reception("cam (/c)", reliability, 2.0, received, lost, size, expected_hz, fast)
+def stats(received, lost=0, size=VGA, reliability="best_effort", expected_hz=None, fast=True):
+    return ReceptionStats("cam (/c)", reliability, 2.0, received, lost, size, expected_hz, fast)
 
 
 def test_what_arrives_whole_is_fine():
-    assert check_losses([reception(60), reception(60, expected_hz=30.0), reception(0)]) == []
+    assert check_losses([stats(60), stats(60, expected_hz=30.0), stats(0)]) == []
 
 
 def test_some_loss_is_a_warning():
-    assert check_losses([reception(50, lost=10)]) == [
-        "cam (/c): 50 of 60 messages arrived in 2.0 s"
-    ]
+    assert check_losses([stats(50, lost=10)]) == ["cam (/c): 50 of 60 messages arrived in 2.0 s"]
 
 
 def test_a_lower_rate_than_expected_counts_as_loss():
-    assert check_losses([reception(50, expected_hz=30.0)]) == [
+    assert check_losses([stats(50, expected_hz=30.0)]) == [
         "cam (/c): 50 of 60 messages arrived in 2.0 s"
     ]
 
 
 def test_the_shared_memory_trap_is_named_with_the_file_that_mends_it():
     with pytest.raises(NotReady) as caught:
-        check_losses([reception(60), reception(1, lost=59)])
+        check_losses([stats(60), stats(1, lost=59)])
 
     error = caught.value
     assert error.what == "cam (/c): 1 of 60 messages arrived in 2.0 s"
@@ -45,14 +48,14 @@ def test_the_shared_memory_trap_is_named_with_the_file_that_mends_it():
 
 def test_the_trap_is_named_even_when_nothing_ever_arrived():
     with pytest.raises(NotReady, match="0 of 50") as caught:
-        check_losses([reception(0, lost=50, size=0)])
+        check_losses([stats(0, lost=50, size=0)])
 
     assert "512 KB" in caught.value.cause
 
 
 def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
     with pytest.raises(NotReady) as caught:
-        check_losses([reception(1, lost=59, fast=False)])
+        check_losses([stats(1, lost=59, fast=False)])
 
     error = caught.value
     assert "do not share Fast DDS's memory" in error.cause
@@ -65,9 +68,9 @@ def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
 @pytest.mark.parametrize(
     "bad",
     [
-        reception(1, lost=59, size=1000),
-        reception(1, lost=59, reliability="reliable"),
-        reception(10, expected_hz=30.0, reliability="reliable"),
+        stats(1, lost=59, size=1000),
+        stats(1, lost=59, reliability="reliable"),
+        stats(10, expected_hz=30.0, reliability="reliable"),
     ],
 )
 def test_other_losses_are_not_blamed_on_it(bad):

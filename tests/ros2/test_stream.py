@@ -8,7 +8,7 @@ from importlib import metadata, util
 import pytest
 
 from fluxvla_core.ros2 import COMPRESSED_IMAGE, IMAGE, Connection, camera_stream, message_class
-from fluxvla_core.ros2.startup import Reception, is_trap, large_frames_profile
+from fluxvla_core.ros2.startup import ReceptionStats, is_trap, large_frames_profile
 from fluxvla_core.spec.embodiment import Camera
 
 CAMERA = {"topic": "/cam", "message": IMAGE, "hz": 30, "height": 480, "width": 640}
@@ -47,14 +47,14 @@ def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(pictures, dri
 
 
 def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
-    """If this fails because all arrive, Fast DDS was mended and ``Reception`` can go."""
+    """If this fails because all arrive, Fast DDS was mended and ``ReceptionStats`` can go."""
     drivers([{**CAMERA, "height": 1536, "width": 2048, "best_effort": True}])
     wait_for(lambda: pictures.lost > 0)
     received, lost = count(pictures, 1.0)
-    reception = Reception("cam", pictures.reliability, 1.0, received, lost, 0)
+    stats = ReceptionStats("cam", pictures.reliability, 1.0, received, lost, 0)
 
     assert pictures.reliability == "best_effort"
-    assert is_trap(reception)
+    assert is_trap(stats)
 
 
 @pytest.mark.skipif(

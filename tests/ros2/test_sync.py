@@ -78,7 +78,7 @@ def test_the_clock_that_is_off_is_named_however_many_messages_are_kept(clock, ca
     }
 
     with pytest.raises(Stale) as caught:
-        match(streams, max_skew=0.1, wall=0.0)
+        match(streams, max_skew=0.1, wall_offset=0.0)
 
     assert caught.value.cause.startswith(cause)
     assert "synchronise the machines' clocks" in caught.value.next
@@ -88,7 +88,7 @@ def test_a_camera_that_is_late_is_no_matter_of_clocks():
     streams = {"cam": stream(99.3, latency=0.7), "state": stream(99.9, 99.95, 100.0)}
 
     with pytest.raises(Stale) as caught:
-        match(streams, max_skew=0.1, wall=0.0)
+        match(streams, max_skew=0.1, wall_offset=0.0)
 
     assert caught.value.cause == "cam is late, or comes in bursts"
 
@@ -96,18 +96,18 @@ def test_a_camera_that_is_late_is_no_matter_of_clocks():
 def test_two_arms_that_are_stamped_apart_are_no_one_state():
     together = [99.8, 99.9, 100.0]
     left, right = stream(*together, latency=0.01), stream(*together, latency=0.02)
-    check_together({"left": left, "right": right}, max_skew=0.1, wall=0.0)
+    check_together({"left": left, "right": right}, max_skew=0.1, wall_offset=0.0)
 
     off = stream(*together, latency=0.01, clock=-0.2)
     with pytest.raises(Stale) as caught:
-        check_together({"left": off, "right": right}, max_skew=0.1, wall=0.0)
+        check_together({"left": off, "right": right}, max_skew=0.1, wall_offset=0.0)
 
     assert caught.value.what == (
         "left is stamped 0.190 s earlier than right, although they arrive together; "
         "at most 0.1 s is allowed"
     )
     assert caught.value.cause.startswith("the clock that stamps left is 0.21 s behind this mach")
-    check_together({"left": off, "right": right}, max_skew=0.3, wall=0.0)
+    check_together({"left": off, "right": right}, max_skew=0.3, wall_offset=0.0)
 
 
 def test_a_state_that_comes_in_bursts_or_without_stamps_is_together():

@@ -12,7 +12,7 @@ import torch
 from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, RunFailed
 from fluxvla_core.testing.training import run_ranks
 from fluxvla_core.training import distributed
-from fluxvla_core.training.distributed import World, explain, on_first, start
+from fluxvla_core.training.distributed import World, explain, run_on_rank0, start
 
 ONE = World(0, 1, 0, torch.device("cpu"))
 TWO = World(1, 2, 1, torch.device("cpu"))
@@ -29,20 +29,20 @@ def fail(error):
 def talk(folder):
     world = start("cpu")
     said = {
-        "rank": (world.rank, world.size, world.first, world.owned),
-        "agree": distributed.agree(world, 3 * world.rank),
-        "total": distributed.total(world, torch.tensor([1.0, world.rank])).tolist(),
-        "text": distributed.share_text(world, "grüße" if world.first else "other"),
-        "no text": distributed.share_text(world, ""),
-        "texts": distributed.texts(world, f"r{world.rank}" * (1 + 1500 * world.rank)),
-        "first": on_first(world, lambda: f"rank {world.rank}"),
+        "rank": (world.rank, world.size, world.is_rank0, world.owned),
+        "maximum": distributed.all_reduce_max(world, 3 * world.rank),
+        "sum": distributed.all_reduce_sum(world, torch.tensor([1.0, world.rank])).tolist(),
+        "text": distributed.broadcast_text(world, "grüße" if world.is_rank0 else "other"),
+        "no text": distributed.broadcast_text(world, ""),
+        "texts": distributed.all_gather_text(world, f"r{world.rank}" * (1 + 1500 * world.rank)),
+        "first": run_on_rank0(world, lambda: f"rank {world.rank}"),
     }
     for name, error in {
         "error": CheckpointError("torn", where="here", cause="why", next="do"),
         "own error": Own("mine"),
     }.items():
         try:
-            on_first(world, lambda: fail(error))  # noqa: B023 - called at once
+            run_on_rank0(world, lambda: fail(error))  # noqa: B023 - called at once
         except FluxError as caught:
             said[name] = [type(caught).__name__, str(caught)]
     (folder / f"{world.rank}.json").write_text(json.dumps(said))
@@ -58,8 +58,8 @@ def test_two_ranks(tmp_path):
     assert first.pop("own error") == ["Own", "mine"]
     first.pop("rank"), second.pop("rank")
     assert first == second
-    assert first["agree"] == 3
-    assert first["total"] == [2.0, 1.0]
+    assert first["maximum"] == 3
+    assert first["sum"] == [2.0, 1.0]
     assert first["text"] == "grüße"
     assert first["no text"] == ""
     assert first["texts"] == ["r0", "r1" * 1501]
@@ -74,12 +74,17 @@ def test_one_process_needs_no_group():
     world = start("cpu")
     assert (world.rank, world.size, world.control, world.owned) == (0, 1, None, False)
     distributed.stop(world)
-    assert distributed.agree(ONE, 7) == 7
-    assert distributed.texts(ONE, "a") == ["a"]
-    assert distributed.share_text(ONE, "a") == "a"
-    assert on_first(ONE, lambda: "x") == "x"
+    assert distributed.all_reduce_max(ONE, 7) == 7
+    assert distributed.all_gather_text(ONE, "a") == ["a"]
+    assert distributed.broadcast_text(ONE, "a") == "a"
+    assert run_on_rank0(ONE, lambda: "x") == "x"
     with pytest.raises(CheckpointError, match="torn"):
-        on_first(ONE, lambda: fail(CheckpointError("torn")))
+        run_on_rank0(ONE, lambda: fail(CheckpointError("torn")))
+
+
+def test_the_deprecated_name_of_rank_0():
+    with pytest.warns(DeprecationWarning, match=r"use World\.is_rank0"):
+        assert (ONE.first, TWO.first) == (True, False)
 
 
 def group_of_one():

@@ -103,7 +103,7 @@ def test_what_is_kept_is_counted_by_hand() -> None:
 
 def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> None:
     kept = footprint.kept_by_fake(footprint.fake(on_meta()), BATCH, None)
-    found = layout.whole(on_meta())
+    found = layout.replicated_layout(on_meta())
     plain, again = (footprint.footprint(found, kept, 0, False, r) for r in (False, True))
     assert (plain.activations, plain.recomputed) == (kept.activations, 0)
     assert (again.activations, again.recomputed) == (kept.recomputed, kept.largest_unit)
@@ -121,7 +121,7 @@ def test_a_model_that_decides_by_numbers_cannot_be_counted() -> None:
 @pytest.mark.parametrize("settings", [AdamW(), AdamW(fused=False), SGD(), SGD(momentum=0.0)])
 def test_the_state_of_an_optimizer(settings: Any) -> None:
     model = Stack()
-    found = layout.whole(on_meta())
+    found = layout.replicated_layout(on_meta())
     groups = [{"params": [p], "weight_decay": 0.0} for p in model.parameters() if p.requires_grad]
     optimizer = settings.build(groups, 1e-3)
     model(**BATCH)["loss"].backward()
@@ -134,7 +134,7 @@ def test_the_state_of_an_optimizer(settings: Any) -> None:
 def test_what_one_process_alone_keeps() -> None:
     model = Stack()
     model(**BATCH)["loss"].backward()
-    found = layout.whole(on_meta())
+    found = layout.replicated_layout(on_meta())
     own: Mapping[str, Any] = dict(model.named_parameters())
     assert found.parameters == sum(t.nbytes for t in [*own.values(), model.scale])
     assert found.gradients == sum(p.grad.nbytes for p in own.values() if p.grad is not None)
@@ -142,7 +142,7 @@ def test_what_one_process_alone_keeps() -> None:
 
 
 def test_the_sum_and_the_averages() -> None:
-    found = layout.whole(on_meta())
+    found = layout.replicated_layout(on_meta())
     kept = footprint.Kept(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
     whole = footprint.footprint(found, kept, 13, True, False)
     assert whole.averages == found.gradients

@@ -46,7 +46,7 @@ def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
 def test_auto_starts_afresh_and_says_so(tmp_path):
     said = Said()
     run(tmp_path, resume="auto", reporter=said)
-    assert said.lines == [f"no checkpoint in {tmp_path} yet: training starts afresh"]
+    assert said.lines == [f"no checkpoint in {tmp_path} yet: training starts from scratch"]
 
 
 def test_a_path_must_exist(tmp_path):

@@ -20,6 +20,7 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
+from fluxvla_core.training import BaseTrainRunner
 from tests.training.runs import Said, make, run
 
 
@@ -371,3 +372,14 @@ def test_what_only_exists_inside_a_run_says_so(tmp_path):
     runner.run_setup(37)
     with pytest.raises(RuntimeError, match=r"a batch's arguments are known inside run\(\) only"):
         runner._training_step({})
+
+
+def test_a_strategy_that_overrides_the_deprecated_hook_is_called():
+    class Old(BaseTrainRunner):
+        def warm_up(self, batch):
+            batches.append(batch)
+
+    batches = []
+    with pytest.warns(DeprecationWarning, match="Old.warm_up is deprecated, call it before_first"):
+        object.__new__(Old).before_first_step({"images": 1})
+    assert batches == [{"images": 1}]

@@ -151,8 +151,8 @@ def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, 
         return gathered
 
     plain = run(tmp_path / "plain")
-    monkeypatch.setattr(tensors, "is_split", lambda tensor: True)
-    monkeypatch.setattr(tensors, "whole", pretended)
+    monkeypatch.setattr(tensors, "is_sharded", lambda tensor: True)
+    monkeypatch.setattr(tensors, "full_tensor", pretended)
     split = run(tmp_path / "split")
 
     assert len(most) > 10
@@ -164,9 +164,9 @@ def test_what_is_gathered_from_several_processes_is_let_go_one_by_one(tmp_path, 
 def test_copies_wait_for_nothing_without_a_job():
     world = saving.World(0, 1, 0, torch.device("cpu"))
     idle = saving.Saver(world, True)
-    idle.copied()
+    idle.wait_for_copies()
     idle.close()
-    assert idle.settle(wait=True) is None
+    assert idle.finish_pending(wait=True) is None
 
 
 SMALL = """

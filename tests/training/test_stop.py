@@ -22,9 +22,9 @@ ONE = World(0, 1, 0, torch.device("cpu"))
 def test_a_signal_asks_for_a_stop_and_handlers_come_back(number):
     before = signal.getsignal(number)
     with StopRequest(ONE) as request:
-        assert request.wanted(1) == 0
+        assert request.poll(1) == 0
         os.kill(os.getpid(), number)
-        assert request.wanted(2) == number
+        assert request.poll(2) == number
     assert signal.getsignal(number) is before
 
 
@@ -33,7 +33,7 @@ def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch):
     with StopRequest(ONE) as request:
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
-        assert request.wanted(1) == signal.SIGINT
+        assert request.poll(1) == signal.SIGINT
 
 
 def test_a_second_interrupt_ends_at_once(monkeypatch):
@@ -49,9 +49,9 @@ def test_a_forked_data_worker_ignores_what_is_meant_for_its_parent():
         pid = os.fork()
         if pid == 0:
             os.kill(os.getpid(), signal.SIGTERM)
-            os._exit(request.wanted(1))
+            os._exit(request.poll(1))
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-        assert request.wanted(1) == 0
+        assert request.poll(1) == 0
 
 
 def test_other_threads_set_no_handlers():
@@ -60,7 +60,7 @@ def test_other_threads_set_no_handlers():
 
     def run():
         with StopRequest(ONE) as request:
-            seen.append((signal.getsignal(signal.SIGINT) is before, request.wanted(1)))
+            seen.append((signal.getsignal(signal.SIGINT) is before, request.poll(1)))
 
     thread = threading.Thread(target=run)
     thread.start()
@@ -70,11 +70,11 @@ def test_other_threads_set_no_handlers():
 
 def test_ranks_compare_notes_about_twice_a_second():
     request = StopRequest(World(0, 2, 0, torch.device("cpu")))
-    request.pace(0.01)
-    assert request.wanted(49) == 0  # asks nobody: there is no process group here
-    request.pace(10.0)
+    request.set_interval(0.01)
+    assert request.poll(49) == 0  # asks nobody: there is no process group here
+    request.set_interval(10.0)
     assert request._every == 1
-    request.pace(0.0)
+    request.set_interval(0.0)
     assert request._every == 1
 
 
@@ -93,11 +93,11 @@ def test_how_a_stopped_run_ends():
 def ranks(folder):
     world = distributed.start("cpu")
     with StopRequest(world) as request:
-        seen = [request.wanted(1)]
-        request.pace(stop.NOTICE_S / 3)
+        seen = [request.poll(1)]
+        request.set_interval(stop.NOTICE_S / 3)
         if world.rank == 1:
             os.kill(os.getpid(), signal.SIGTERM)
-        seen += [request.wanted(2), request.asked(), request.wanted(3)]
+        seen += [request.poll(2), request.poll_now(), request.poll(3)]
     (folder / str(world.rank)).write_text(str(seen))
     distributed.stop(world)
 

@@ -19,7 +19,7 @@ from fluxvla_core.training.weights import (
     check_model_tensors,
     left_out,
     load_for_inference,
-    put_model_tensors,
+    load_full_tensors,
     weights_by_name,
 )
 from tests.training.runs import run
@@ -48,9 +48,9 @@ class Model(nn.Module):
 def checkpoint(tmp_path, model, without, ema=None):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
         tensors = weights_by_name(model, without.names)
-        TensorFile.whole("model.safetensors", tensors, True).write(writer)
+        TensorFile.full("model.safetensors", tensors, True).write(writer)
         if ema is not None:
-            TensorFile.whole("ema.safetensors", ema.shadow, True).write(writer)
+            TensorFile.full("ema.safetensors", ema.shadow, True).write(writer)
         writer.write_json("trainer.json", {"left_out": without.to_dict()})
         return Checkpoint.open(writer.commit())
 
@@ -160,7 +160,7 @@ def test_averages_of_another_model_are_refused():
 def test_loading_leaves_the_checkpoint_as_it_is(tmp_path):
     model = Model()
     saved = checkpoint(tmp_path, model, left_out(model))
-    put_model_tensors(model, saved.tensors("model.safetensors"))
+    load_full_tensors(model, saved.tensors("model.safetensors"))
     with torch.no_grad():
         for tensor in model.state_dict().values():
             tensor.add_(1)

@@ -62,7 +62,7 @@ _STRATEGY = (
     "backward",
     "optimizer_step",
     "clip_grad_norm",
-    "warm_up",
+    "before_first_step",
     "save_checkpoint",
     "resume",
     "_load_model_state",

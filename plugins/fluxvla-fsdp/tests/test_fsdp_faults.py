@@ -37,7 +37,7 @@ def two_ranks(work_dir):
         operations = count_operations()
         train_a_step(runner)
         save(runner, folder, 1)
-        totals = [int(t) for t in distributed.texts(runner.world, str(operations[0]))]
+        totals = [int(t) for t in distributed.all_gather_text(runner.world, str(operations[0]))]
         assert totals[0] > 50
         assert totals[1] >= 8
         # All of the second rank's; of the first one's those that are of each kind.
@@ -49,10 +49,10 @@ def two_ranks(work_dir):
                 save(runner, folder, 2)
             assert "the disk is full: the checkpoint of step 2" in str(caught.value)
             assert ("on rank 1" in str(caught.value)) == (broken == 1)
-            distributed.agree(runner.world, 0)
+            distributed.all_reduce_max(runner.world, 0)
             Checkpoint.open(folder / "checkpoints/step-000000001").verify()
             assert [p.name for p in (folder / "checkpoints").iterdir()] == ["step-000000001"]
-            distributed.agree(runner.world, 0)
+            distributed.all_reduce_max(runner.world, 0)
         operations[:] = [0, -1]
         save(runner, folder, 2)
         assert latest(folder).step == 2
@@ -60,7 +60,7 @@ def two_ranks(work_dir):
 
 def save(runner, folder, step):
     runner.save_checkpoint(folder, step, 0)
-    runner.settle_saves()
+    runner.finish_pending_save()
 
 
 def train_a_step(runner):

@@ -46,7 +46,7 @@ def reload(ranks, source, work_dir):
     runner.run_setup(len(dataset))
     Trainer(runner, dataset, StopRequest(runner.world)).close()
     runner.save_checkpoint(work_dir / "again", runner.progress.step, 0)
-    runner.settle_saves()
+    runner.finish_pending_save()
     distributed.stop(runner.world)
 
 

@@ -75,7 +75,7 @@ def joined(kind: str, name: str) -> np.ndarray:
 
 
 def tokenizer(version: str, folder: Path) -> Path:
-    """Bytes, and the marks of a chat with pictures."""
+    """Bytes, and the marks of a chat with images."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers
 
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())

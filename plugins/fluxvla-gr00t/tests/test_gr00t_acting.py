@@ -36,10 +36,10 @@ def test_the_steps_with_tables_are_those_of_any_time(version, attend_padding):
     inputs, head = to_act(batch(version, padded=True)), model.vla_head
     with torch.no_grad():
         found = model.predict_action(**inputs)
-        seen = model.vlm_backbone(
+        backbone_output = model.vlm_backbone(
             inputs["images"], inputs["lang_tokens"], inputs["lang_masks"], None
         )
-        context, ids = head.read(seen), inputs["embodiment_ids"]
+        context, ids = head.encode_context(backbone_output), inputs["embodiment_ids"]
         state, x = head.encode_states(inputs["states"], ids), inputs["noise"]
         for step in range(4):
             x = x + head.velocity(x, torch.full((2,), 250 * step), context, state, ids) / 4

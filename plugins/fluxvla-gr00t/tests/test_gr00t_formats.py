@@ -72,17 +72,17 @@ def test_an_imported_checkpoint_acts_as_the_model_does(
     policy = load_policy(out)
     policy.reset(5)
     states = np.array([0.3, -0.2, 0.1, 0.4, 0.2], np.float32)
-    pictures = {
+    images = {
         camera: fill.integers(camera, (side, side, 3), 256).astype(np.uint8) for camera in CAMERAS
     }
-    chunk = policy.predict_action({"qpos": states, "images": pictures, "task_description": TASK})
+    chunk = policy.predict_action({"qpos": states, "images": images, "task_description": TASK})
 
     # The same by hand.
     from tokenizers import Tokenizer
 
     ids = Tokenizer.from_file(str(words / "tokenizer.json")).encode(chat(version, 4)).ids
     assert ids.count(PLACE) == 8
-    planes = np.concatenate([pictures[c].transpose(2, 0, 1) for c in CAMERAS])
+    planes = np.concatenate([images[c].transpose(2, 0, 1) for c in CAMERAS])
     percentiles = (version, project) == ("n1.7", "gr00t")
     low, high = ("q01", "q99") if percentiles else ("min", "max")
     state = scaled("state", low, high, states)

@@ -48,7 +48,7 @@ def test_the_mean_of_the_rows_losses_is_the_loss(version):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_what_an_absent_picture_shows_does_not_matter(version):
+def test_what_an_absent_image_shows_does_not_matter(version):
     model, inputs = tiny(version), to_act(batch(version))
     inputs["img_masks"] = torch.tensor([[True, True], [True, False]])
     other = {**inputs, "images": inputs["images"].clone()}
@@ -61,7 +61,7 @@ def test_what_an_absent_picture_shows_does_not_matter(version):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_pictures_words_state_time_and_embodiment_all_matter(version):
+def test_images_words_state_time_and_embodiment_all_matter(version):
     model, inputs = tiny(version), to_act(batch(version))
     changes = {
         "images": inputs["images"] + 0.5,
@@ -105,10 +105,10 @@ def test_a_guided_chunk_follows_the_paper(version):
             prefix_len=torch.tensor([2, 1]),
             max_guidance_weight=torch.tensor([beta, beta]).double(),
         )
-        seen = model.vlm_backbone(
+        backbone_output = model.vlm_backbone(
             inputs["images"], inputs["lang_tokens"], inputs["lang_masks"], None
         )
-        context = head.read(seen)
+        context = head.encode_context(backbone_output)
         ids = inputs["embodiment_ids"]
         state = head.encode_states(inputs["states"], ids)
     x = inputs["noise"]
@@ -172,8 +172,16 @@ def test_sizes_of_a_backbone_that_do_not_fit_are_refused(kind, settings, words):
     [
         ("n1.5", {"images": torch.zeros(2, 6, 30, 28)}, r"\(2, 6, 30, 28\), \(B, 3N, 28, 28\)"),
         ("n1.7", {"images": torch.zeros(2, 6, 20, 16)}, "multiples of 8 expected"),
-        ("n1.5", {"images": torch.zeros(2, 3, 28, 28)}, r"have \[8\] places .* 1 pictures take 1"),
-        ("n1.7", {"images": torch.zeros(2, 3, 16, 16)}, r"have \[8\] places .* 1 pictures take 1"),
+        (
+            "n1.5",
+            {"images": torch.zeros(2, 3, 28, 28)},
+            r"\[8\] image tokens .* 1 images take 1",
+        ),
+        (
+            "n1.7",
+            {"images": torch.zeros(2, 3, 16, 16)},
+            r"\[8\] image tokens .* 1 images take 1",
+        ),
         ("n1.7", {"embodiment_ids": torch.tensor([0, 3])}, r"\[0, 3\] are not all in 0\.\.2"),
     ],
 )

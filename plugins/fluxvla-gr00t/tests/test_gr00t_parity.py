@@ -19,7 +19,7 @@ SIDES = {"n1.5": 28, "n1.7": 16}
 
 
 def batch(version, padded=False, masked=False):
-    """The oracles' inputs: two samples of two pictures; ``padded``: the second has fewer words."""
+    """The oracles' inputs: two samples of two images; ``padded``: the second has fewer words."""
     side = SIDES[version]
     words = torch.from_numpy(fill.integers("words", (2, 7), PLACE))
     places = torch.full((2, 4), PLACE)

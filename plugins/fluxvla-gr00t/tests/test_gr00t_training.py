@@ -50,7 +50,7 @@ RUNS = {
 
 
 class Samples(TinyDataset):
-    """Two pictures, words of different lengths, robots of different kinds, ends of episodes."""
+    """Two images, words of different lengths, robots of different kinds, ends of episodes."""
 
     def __init__(self, version):
         super().__init__(12)

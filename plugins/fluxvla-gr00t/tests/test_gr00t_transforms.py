@@ -1,4 +1,4 @@
-"""Pictures, prompts and normalised values as GR00T N1.7 takes them."""
+"""Images, prompts and normalised values as GR00T N1.7 takes them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fluxvla_gr00t.qwen3_vl import pictures_to_patches
+from fluxvla_gr00t.qwen3_vl import images_to_patches
 from fluxvla_gr00t.transforms import ClipNormalized, ProcessQwenPrompts, ResizeCropImages
 from safetensors.torch import load_file
 
@@ -45,24 +45,24 @@ class Cut(Letters):
         return [ord(letter) for letter in text]
 
 
-def picture(name):
+def image(name):
     made = fill.integers(f"picture {name}", (*SIZES[name], 3), 256).astype(np.uint8)
     return made.transpose(2, 0, 1)
 
 
 def patches(planes):
-    """As the model cuts normalised pictures."""
+    """As the model cuts normalised images."""
     normal = torch.from_numpy(planes).float() / 255 * 2 - 1
-    return pictures_to_patches(normal[None], 16, 2)
+    return images_to_patches(normal[None], 16, 2)
 
 
 @pytest.mark.parametrize("name", SIZES)
 @pytest.mark.parametrize("kind", ["plain", "square"])
 @pytest.mark.parametrize("method", ["bicubic", "area"])
-def test_pictures_are_the_reference_s(name, kind, method):
+def test_images_are_the_reference_s(name, kind, method):
     known = load_file(GOLDEN)
     resize = ResizeCropImages(64, crop_fraction=58 / 64, method=method, letter_box=kind == "square")
-    made = resize({"images": [picture(name)]})["images"]
+    made = resize({"images": [image(name)]})["images"]
     assert made.dtype == np.uint8
     if kind == "square" or method == "bicubic":
         assert np.array_equal(made, known[f"{name}.{kind}.{method}"].numpy())
@@ -90,7 +90,7 @@ def test_patches_are_those_of_transformers():
     torch.testing.assert_close(patches(planes), expected, rtol=0, atol=1e-6)
 
 
-def test_the_prompt_is_qwen3_s_chat_with_places_for_every_picture():
+def test_the_prompt_is_qwen3_s_chat_with_places_for_every_image():
     process = ProcessQwenPrompts(Letters(), max_len=60)
     sample = {"images": np.zeros((6, 32, 64), np.uint8), "task_description": "Lift the Cup!"}
     made = process(sample)
@@ -107,12 +107,12 @@ def test_the_prompt_is_qwen3_s_chat_with_places_for_every_picture():
     ("changes", "settings", "words"),
     [
         ({"task_description": "?!"}, {}, "there is no instruction"),
-        ({}, {"max_len": 15}, "2 x 2 places for pictures, max_len is 15"),
+        ({}, {"max_len": 15}, "2 x 2 image tokens, max_len is 15"),
         ({}, {"tokenizer": Cut()}, r"<\|image_pad\|> is not a token"),
         (
             {"task_description": "<|image_pad|>"},
             {"formalize": False},
-            "has 5 places for pictures, 2 x 2 expected",
+            "has 5 image tokens, 2 x 2 expected",
         ),
         ({"images": np.zeros((3, 30, 64), np.uint8)}, {}, "30 x 64 pixels"),
     ],

@@ -147,7 +147,7 @@ def test_states_and_actions_are_scaled_as_in_lerobot(version):
     commands = undo({"action": golden["actions"][None].numpy(), "states": raw})
     np.testing.assert_allclose(commands, golden["commands"], rtol=1e-5, atol=1e-6)
     assert golden["embodiment_id"].item() == 2
-    # Pictures of one colour each: 10 in front, 20 at the wrist.
+    # Images of one colour each: 10 in front, 20 at the wrist.
     assert golden["views"].tolist() == [10, 20]
 
 

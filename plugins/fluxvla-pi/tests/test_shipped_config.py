@@ -129,7 +129,7 @@ def test_prompts_of_any_state_fit_the_tiny_one(value):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_the_tiny_one_learns_the_demos_tasks(tmp_path):
-    """As its first lines say; a policy that has learnt nothing never succeeds."""
+    """As its first lines say, and far above what an untrained one reaches."""
     pytest.importorskip("fluxvla_sim")
     dataset, work = tmp_path / "dataset", tmp_path / "work"
     assert main(["collect", "aloha", "--out", str(dataset), "--episodes", "240"]) == 0
@@ -141,5 +141,4 @@ def test_the_tiny_one_learns_the_demos_tasks(tmp_path):
         asked = ["--section", section, "--nproc", "2", "--work-dir", str(work)]
         assert main(["run", "--config", str(TINY), *asked, "--cfg-options", *words]) == 0
     found = json.loads((work / "eval" / "results.json").read_text())["groups"]
-    assert found["untrained"]["all"]["successes"] == 0
-    assert found["policy"]["all"]["low"] > 0.3, found["policy"]
+    assert found["policy"]["all"]["low"] > max(0.3, found["untrained"]["all"]["high"]), found

@@ -258,7 +258,7 @@ def processors(source, change):
         (lambda steps: steps[5].update(state_file="../x"), r"'../x' is not a file next to it"),
         (
             lambda steps: steps[5]["config"]["norm_map"].update(VISUAL="MEAN_STD"),
-            "pictures are normalised by MEAN_STD",
+            "images are normalised by MEAN_STD",
         ),
         (
             lambda steps: steps[5]["config"]["norm_map"].update(STATE="LOG"),

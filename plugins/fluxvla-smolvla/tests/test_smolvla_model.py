@@ -50,10 +50,10 @@ def asked():
 def test_sampling_is_eulers_method():
     model, (batch, noise) = tiny_model(), asked()
     with torch.no_grad():
-        memory = model._memory(*batch.values())
+        cache = model._encode_prefix(*batch.values())
         x = noise
         for t in (1.0, 0.75, 0.5, 0.25):
-            x = x - model._velocity(x, torch.full((3,), t), memory) / 4
+            x = x - model._velocity(x, torch.full((3,), t), cache) / 4
         assert relative(model.predict_action(**batch, noise=noise), x) < 1e-6
 
 
@@ -194,7 +194,7 @@ def test_states_and_statistics_that_do_not_fit_are_refused(settings, sample, wor
         SmolVLANormalize(**settings)(whole)
 
 
-def test_pictures_that_do_not_fit_are_refused():
+def test_images_that_do_not_fit_are_refused():
     with pytest.raises(ConfigError, match="height 3 and width None are not a size"):
         SmolVLAImages(height=3)
     with pytest.raises(ConfigError, match="empty_cameras -1 is below 0"):
@@ -205,13 +205,13 @@ def test_pictures_that_do_not_fit_are_refused():
     assert "<SmolVLAImages>.height=512" in str(caught.value)
 
 
-def test_pictures_that_are_normalised_on_the_device_are_the_same():
+def test_images_that_are_normalised_on_the_device_are_the_same():
     from fluxvla_core.data import Pipeline
 
-    picture = np.random.default_rng(0).integers(0, 256, (3, 8, 12)).astype(np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (3, 8, 12)).astype(np.uint8)
     table = {"type": "SmolVLAImages", "empty_cameras": 1}
     pipeline = Pipeline([table, {"type": "SmolVLAPrompt"}])
-    sample = {"images": [picture], "img_masks": np.array([True]), "task_description": "wave"}
+    sample = {"images": [image], "img_masks": np.array([True]), "task_description": "wave"}
     here, deferred = pipeline(sample), pipeline.deferring()(sample)
     assert deferred["images"].dtype == np.uint8
     divide, multiply, subtract, again = deferred["image_scale"][..., None, None]

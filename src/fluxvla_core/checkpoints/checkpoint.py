@@ -43,13 +43,13 @@ from fluxvla_core.untrusted import parse_json, read_bytes
 if TYPE_CHECKING:
     import torch
 
-    from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.checkpoints.shards import Stored
     from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 MODEL = "model.safetensors"
 EMA = "ema.safetensors"
 OPTIMIZER = "optimizer.safetensors"
-OPTIMIZER_PARTS = "optimizer"
+OPTIMIZER_SHARDS = "optimizer"
 RANDOM = "rng"
 OPTIMIZER_META = "optimizer.json"
 TRAINER = "trainer.json"
@@ -214,9 +214,9 @@ class Checkpoint:
         Raises:
             CheckpointError: there is none, or it cannot be read.
         """
-        from fluxvla_core.checkpoints.parts import StoredTensors
+        from fluxvla_core.checkpoints.shards import StoredTensors
 
-        names = sorted(n for n in self.manifest.files if n.startswith(OPTIMIZER_PARTS + "/"))
+        names = sorted(n for n in self.manifest.files if n.startswith(OPTIMIZER_SHARDS + "/"))
         if not names and not self.has(OPTIMIZER):
             raise CheckpointError(f"the checkpoint has no {OPTIMIZER}", where=str(self.path))
         return StoredTensors([self.path / name for name in names or [OPTIMIZER]])

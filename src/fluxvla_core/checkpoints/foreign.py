@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fluxvla_core.checkpoints.parts import Stored, StoredTensors
+from fluxvla_core.checkpoints.shards import Stored, StoredTensors
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.errors import CheckpointError, UsageError, nearest
 from fluxvla_core.untrusted import read_json

@@ -1,4 +1,4 @@
-"""Named tensors to and from safetensors files, whole whatever way they are sharded in memory.
+"""Named tensors to and from safetensors files: full tensors, however they are sharded in memory.
 
 The format (https://huggingface.co/docs/safetensors, 'Format'): eight bytes little-endian header
 length, a JSON header ``{name: {dtype, shape, data_offsets}}``, then the raw little-endian bytes.
@@ -18,15 +18,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fluxvla_core.checkpoints.parts import (
-    Region,
+from fluxvla_core.checkpoints.shards import (
+    Block,
     Stored,
-    describe_parts,
     is_dtensor,
-    is_split,
-    local,
+    is_sharded,
     open_tensors,
     reading,
+    shard_metadata,
+    to_local,
 )
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
@@ -47,26 +47,26 @@ _DTYPES: Mapping[torch.dtype, str] = {
 _ALIASES = "aliases"
 
 
-def whole(tensor: Tensor) -> Tensor:
-    """The full tensor, gathered from all ranks if it is sharded: every rank must call this."""
+def full_tensor(tensor: Tensor) -> Tensor:
+    """The full tensor, gathered from all ranks if it is a DTensor; every rank must call this."""
     tensor = tensor.detach()
     return tensor.full_tensor() if is_dtensor(tensor) else tensor
 
 
-def copy_whole(target: Tensor, source: Tensor) -> None:
-    """Copy the full ``source`` into ``target``, into this rank's part of it if it is sharded."""
+def copy_full(target: Tensor, source: Tensor) -> None:
+    """Copy the full ``source`` into ``target``, into this rank's shard of it if it is sharded."""
     with torch.no_grad():
-        target.copy_(like(target, source))
+        target.copy_(shard_like(target, source))
 
 
-def like(target: Tensor, source: Tensor | Stored) -> Tensor:
-    """The full ``source`` on the device of ``target``, sharded as it is; nothing is sent."""
-    # Each rank cuts its own part: all have read the same verified files.
-    part = source[Region.of(target).slices].to(target.device)
+def shard_like(target: Tensor, source: Tensor | Stored) -> Tensor:
+    """The full ``source``, sharded and placed like ``target``, without communication."""
+    # Each rank cuts out its own shard: all have read the same verified files.
+    shard = source[Block.of(target).slices].to(target.device)
     if not is_dtensor(target):
-        return part
+        return shard
     return type(target).from_local(
-        part.contiguous(),
+        shard.contiguous(),
         target.device_mesh,
         target.placements,
         run_check=False,
@@ -82,8 +82,8 @@ class TensorFile:
     Args:
         name: in the checkpoint's folder.
         header: what stands before the data.
-        tensors: in the order of the header. Those that are split are gathered when they are
-            written or held, in which all ranks take part.
+        tensors: in the order of the header. Sharded ones are gathered when they are written or
+            copied, in which all ranks take part.
         mine: whether this rank writes the file.
     """
 
@@ -93,7 +93,7 @@ class TensorFile:
     mine: bool
 
     @classmethod
-    def whole(cls, name: str, tensors: Mapping[str, Tensor], mine: bool) -> TensorFile:
+    def full(cls, name: str, tensors: Mapping[str, Tensor], mine: bool) -> TensorFile:
         """One file with all of ``tensors``; all ranks make it, one of them writes it.
 
         Two names for one tensor (tied weights) are stored once, with the other name in the header.
@@ -107,45 +107,45 @@ class TensorFile:
             first = owner.setdefault(id(tensor), key)
             if first != key:
                 aliases[key] = first
-        kept = {key: tensors[key] for key in _ordered(owner.values(), tensors)}
-        header = _header(kept, {_ALIASES: json.dumps(aliases)})
-        return cls(name, header, tuple(kept.values()), mine)
+        stored = {key: tensors[key] for key in _ordered(owner.values(), tensors)}
+        header = _header(stored, {_ALIASES: json.dumps(aliases)})
+        return cls(name, header, tuple(stored.values()), mine)
 
     @classmethod
-    def parts(cls, name: str, tensors: Mapping[str, Tensor]) -> TensorFile:
-        """A file of this rank with its parts of ``tensors``.
+    def shards(cls, name: str, tensors: Mapping[str, Tensor]) -> TensorFile:
+        """A file of this rank with its shards of ``tensors``.
 
         Raises:
             CheckpointError: a dtype that the format does not have.
         """
         named = {key: tensors[key] for key in _ordered(tensors, tensors)}
-        kept = {key: local(tensor) for key, tensor in named.items()}
-        return cls(name, _header(kept, describe_parts(named)), tuple(kept.values()), True)
+        shards = {key: to_local(tensor) for key, tensor in named.items()}
+        return cls(name, _header(shards, shard_metadata(named)), tuple(shards.values()), True)
 
     def gathered(self, keep: Callable[[int, Tensor], Tensor]) -> TensorFile:
         """This file with full tensors instead of shards; all ranks call it, writers get tensors.
 
         Args:
-            keep: given the place of each tensor that had to be gathered and the whole of it, before
-                the next is gathered; what it returns is held instead.
+            keep: called with the index of each tensor that had to be gathered and the full tensor,
+                before the next is gathered; what it returns is held instead.
         """
-        found: list[Tensor] = []
-        for place, tensor in enumerate(self.tensors):
-            split = is_split(tensor)
-            full = whole(tensor) if self.mine or split else tensor
+        held: list[Tensor] = []
+        for index, tensor in enumerate(self.tensors):
+            sharded = is_sharded(tensor)
+            full = full_tensor(tensor) if self.mine or sharded else tensor
             if self.mine:
-                found.append(keep(place, full) if split else full)
-        return replace(self, tensors=tuple(found))
+                held.append(keep(index, full) if sharded else full)
+        return replace(self, tensors=tuple(held))
 
     def write(self, writer: CheckpointWriter) -> None:
         """Write it, one tensor at a time in memory."""
         if not self.mine:
-            self.gathered(lambda place, tensor: tensor)
+            self.gathered(lambda index, tensor: tensor)
             return
         with writer.open(self.name) as file:
             file.write(struct.pack("<Q", len(self.header)) + self.header)
             for tensor in self.tensors:
-                file.write(_bytes(whole(tensor)))
+                file.write(_bytes(full_tensor(tensor)))
 
 
 def _ordered(keys: Iterable[str], tensors: Mapping[str, Tensor]) -> list[str]:

@@ -43,7 +43,7 @@ class CheckpointWriter:
         step, epoch: what the checkpoint says of itself.
         disk: the file operations.
         rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
-            by :meth:`report` and :meth:`join`.
+            by :meth:`rank_report` and :meth:`merge_reports`.
         final: another folder than that of the step.
         what, go_on: what is written, and how to continue where it cannot be, for the message; by
             default a training's checkpoint.
@@ -100,7 +100,7 @@ class CheckpointWriter:
                 self._error = error
         return None
 
-    def refuse(self, error: Exception) -> None:
+    def set_error(self, error: Exception) -> None:
         """Let :meth:`commit` fail with ``error``, unless something before it failed."""
         if self._error is None:
             described = OSError(f"{type(error).__name__}: {error}")
@@ -128,36 +128,36 @@ class CheckpointWriter:
         """
         self.write_bytes(name, json_bytes(name, value))
 
-    def fill_folder(self, name: str, save: Callable[[Path], Any]) -> None:
+    def write_folder(self, name: str, save: Callable[[Path], Any]) -> None:
         """A folder that ``save`` fills by itself, as ``save_pretrained`` does.
 
-        Its files are entered by :meth:`enter_folder`.
+        :meth:`add_folder` adds its files to the manifest.
         """
-        self.attempt(self._fill_folder, self.folder / name, save)
+        self.attempt(self._write_folder, self.folder / name, save)
 
-    def _fill_folder(self, folder: Path, save: Callable[[Path], Any]) -> None:
+    def _write_folder(self, folder: Path, save: Callable[[Path], Any]) -> None:
         self.disk.make_folder(folder)
         save(folder)
 
-    def enter_folder(self, name: str) -> None:
-        """Flush what :meth:`fill_folder` brought to the device, and enter it in the manifest."""
-        self.attempt(self._enter_folder, self.folder / name)
+    def add_folder(self, name: str) -> None:
+        """Flush the files of :meth:`write_folder` to the device and add them to the manifest."""
+        self.attempt(self._add_folder, self.folder / name)
 
-    def _enter_folder(self, folder: Path) -> None:
+    def _add_folder(self, folder: Path) -> None:
         for path in files_below(folder):
             self.disk.finish(path.open("rb+"))
             self.files[path.relative_to(self.folder).as_posix()] = FileEntry(
                 path.stat().st_size, hash_file(path)
             )
 
-    def report(self) -> str:
-        """This rank's files, or its error, for :meth:`join` on the first rank."""
+    def rank_report(self) -> str:
+        """This rank's files, or its error, for :meth:`merge_reports` on rank 0."""
         files = {name: [entry.size, entry.sha256] for name, entry in self.files.items()}
         error = self._error and [self._error.errno, self._error.strerror or str(self._error)]
         return json.dumps({"rank": self.rank, "files": files, "error": error})
 
-    def join(self, reports: Iterable[str]) -> None:
-        """Take in what other ranks report of their files."""
+    def merge_reports(self, reports: Iterable[str]) -> None:
+        """Add the files and errors that other ranks report, on rank 0."""
         for report in map(json.loads, reports):
             if report["rank"] == self.rank:
                 continue

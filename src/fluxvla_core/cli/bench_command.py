@@ -42,9 +42,17 @@ class BenchPolicy:
         parser.once("--task", default="pick up the cube", metavar="TEXT", help="the instruction")
         parser.once("--device", default="cpu", help="a torch device, default cpu")
         parser.once(
-            "--precision", default="float32", choices=("float32", "bf16"), help="default float32"
+            "--precision",
+            default="float32",
+            choices=("float32", "bf16"),
+            help="dtype of the model, default float32",
         )
-        parser.once("--threads", type=positive, metavar="N", help="of torch; its own choice")
+        parser.once(
+            "--threads",
+            type=positive,
+            metavar="N",
+            help="CPU threads of torch (default: torch's own)",
+        )
         parser.once(
             "--modes",
             default="eager",
@@ -57,9 +65,13 @@ class BenchPolicy:
             choices=("int8", "fp8", "fp8_dynamic"),
             help="of the blocks' linear layers, by torchao",
         )
-        parser.once("--calls", type=positive, default=50, metavar="N", help="default 50")
-        parser.once("--warmup", type=natural, default=5, metavar="N", help="default 5")
-        parser.once("--seed", type=natural, default=0, metavar="N", help="default 0")
+        parser.once(
+            "--calls", type=positive, default=50, metavar="N", help="measured calls, default 50"
+        )
+        parser.once(
+            "--warmup", type=natural, default=5, metavar="N", help="calls before, default 5"
+        )
+        parser.once("--seed", type=natural, default=0, metavar="N", help="random seed, default 0")
         parser.once(
             "--peak-tflops", type=float, metavar="X", help="of the device, to compute its share"
         )

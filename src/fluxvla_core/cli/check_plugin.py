@@ -105,8 +105,11 @@ class CheckPlugin:
         found = list(_run(args, kit))
         if not found:
             raise UsageError(f"--kit {args.kit}: it has no kit whose entry_point is {args.name!r}")
+        said: dict[str, str] = {}  # words -> the first check that said them
         for outcome in found:
-            say("\n".join(_lines(outcome)))
+            first = said.setdefault(outcome.words, outcome.check)
+            again = outcome.state == "FAILED" and first != outcome.check
+            say("\n".join(_lines(outcome._replace(words=f"as {first}") if again else outcome)))
         counts = {state: sum(o.state == state for o in found) for state in _STATES}
         say(f"{args.name}: {', '.join(f'{n} {state}' for state, n in counts.items() if n)}")
         return EXIT_FAILED if counts["FAILED"] else EXIT_DONE
@@ -210,7 +213,7 @@ def _agree(args: argparse.Namespace, registry: str) -> None:
     say(f"{moves}. Clear its space, and keep a hand on the emergency stop.")
     say(f"Type {args.name} to let it move:")
     if sys.stdin.readline().strip() != args.name:
-        raise UsageError("nobody agreed, and nothing was moved")
+        raise UsageError("not confirmed; nothing was moved")
 
 
 def _arguments(words: list[str]) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class Diff:
     def add_arguments(self, parser: Parser) -> None:
         takes = "a .py, .toml or config.resolved.json; or a work dir or checkpoint, which has one"
         parser.add_argument("old", metavar="A", help=takes)
-        parser.add_argument("new", metavar="B", help="likewise")
+        parser.add_argument("new", metavar="B", help="the same, to compare with A")
 
     def run(self, args: argparse.Namespace) -> int:
         changes = differences(load_config(config_of(args.old)), load_config(config_of(args.new)))

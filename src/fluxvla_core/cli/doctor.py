@@ -75,7 +75,7 @@ class Doctor:
             metavar="SECONDS",
             help=f"how long one import may take (default {IMPORT_LIMIT_S})",
         )
-        parser.add_argument("--json", action="store_true", help="for machines")
+        parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.cli import machine

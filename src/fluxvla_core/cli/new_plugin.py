@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 ROBOT = "operator"
 JOINTS, CAMERAS = 7, 2
-"""Of a robot of which nothing else is said."""
+"""Default sizes of a robot."""
 BASE = """(
     Joint.base("base_forward", "m/s", speed=0.5, acceleration=1.0),
     Joint.base("base_turn", "rad/s", speed=1.0, acceleration=2.0),

@@ -23,7 +23,7 @@ class List:
     help = "List everything that is installed for FluxVLA, without importing it."
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("--json", action="store_true", help="for machines")
+        parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(self, args: argparse.Namespace) -> int:
         found = index()
@@ -57,7 +57,7 @@ class Show:
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument("name", help="a class's name, or distribution:name")
-        parser.add_argument("--json", action="store_true", help="for machines")
+        parser.add_argument("--json", action="store_true", help="print JSON")
 
     def run(self, args: argparse.Namespace) -> int:
         found = providers(args.name)
@@ -116,7 +116,7 @@ def describe(plugin: Plugin) -> str:
 
 
 def record(plugin: Plugin) -> dict[str, Any]:
-    """JSON values for ``plugins show --json``; docs/writing-a-plugin.md has its keys."""
+    """JSON values for ``plugins show --json``; docs/files.md has its keys."""
     from fluxvla_core.config.resolve import INJECTED
 
     signature, problem = _signature(plugin)

@@ -47,38 +47,38 @@ class Run:
         parser.once(
             "--resume", metavar="auto|PATH", help="resume from the newest checkpoint, or from PATH"
         )
-        parser.once("--task", metavar="ID|TEXT", help="what a robot is to do")
-        parser.once("--tasks", metavar="FILE", help="what it is to do one after the other")
+        parser.once("--task", metavar="ID|TEXT", help="task id or instruction for the robot")
+        parser.once("--tasks", metavar="FILE", help="file of tasks, done in order")
         parser.add_argument(
             "--free-task",
             action="store_true",
             help="also take instructions that the config does not know",
         )
-        parser.once("--record", metavar="DIR", help="record all of a robot's run, to be replayed")
+        parser.once("--record", metavar="DIR", help="record the robot's run to DIR, for replay")
         parser.once(
             "--nproc",
             type=positive,
             metavar="N",
-            help="processes that train (default 1), or workers that evaluate (default: its own)",
+            help="processes that train (default 1), or evaluation workers (default: as configured)",
         )
         parser.once(
             "--max-restarts",
             type=natural,
             default=0,
             metavar="N",
-            help="when a process of a training ends, start all again from the newest checkpoint",
+            help="how often to restart all processes from the newest checkpoint when one fails",
         )
         parser.once(
             "--grace",
             type=positive,
             metavar="SECONDS",
-            help="for processes to save when they are stopped, before they are killed "
+            help="time that processes have to save when they are stopped, before they are killed "
             f"(default {ranks.GRACE_S})",
         )
         parser.add_argument(
             "--eval-after-train",
             action="store_true",
-            help="then run the section 'eval', in a fresh process",
+            help="after training, run the section 'eval' in a new process",
         )
         add_plugin_files(parser)
         parser.add_argument(
@@ -88,7 +88,7 @@ class Run:
             "--log-format",
             choices=("text", "json"),
             default="text",
-            help="for people (default) or one JSON object a line",
+            help="text (default), or one JSON object per line",
         )
 
     def run(self, args: argparse.Namespace) -> int:
@@ -104,7 +104,10 @@ class Run:
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
 
-            say(outline(plan, args.log_format, args.nproc))
+            text, refused = outline(plan, args.log_format, args.nproc)
+            say(text)
+            if refused is not None:
+                raise refused
             return 0
         if plan.trains:
             ranks.refuse_lost_work_dir()

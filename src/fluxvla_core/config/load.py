@@ -23,7 +23,7 @@ SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100
 """Levels of tables and lists in a config; this project's own have fewer than 10."""
 MOST_KEYS = 5_000
-"""Of all tables together; this project's own configs have fewer than 500."""
+"""Most keys of all tables together; this project's own configs have fewer than 500."""
 _LONGEST_CHAIN = 50  # files
 _LONGEST_FILE = 1 << 20  # bytes
 
@@ -49,17 +49,17 @@ def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Co
     read 16 million times.
     """
     _check_there(path)
-    real = Path(os.path.realpath(path))
-    if real in chain:
-        names = " -> ".join(shown(p) for p in (*chain[chain.index(real) :], real))
+    resolved = Path(os.path.realpath(path))
+    if resolved in chain:
+        names = " -> ".join(shown(p) for p in (*chain[chain.index(resolved) :], resolved))
         raise ConfigError(f"circular {BASE}: {names}", where=shown(chain[-1]))
     if len(chain) >= _LONGEST_CHAIN:
         raise ConfigError(
             f"a chain of more than {_LONGEST_CHAIN} files by {BASE}", where=shown(chain[0])
         )
-    if real not in loaded:
-        loaded[real] = _load_file(path, (*chain, real), loaded)
-    return loaded[real]
+    if resolved not in loaded:
+        loaded[resolved] = _load_file(path, (*chain, resolved), loaded)
+    return loaded[resolved]
 
 
 def _load_file(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:

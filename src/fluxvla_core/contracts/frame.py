@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypedDict
 
 if TYPE_CHECKING:
@@ -27,6 +27,19 @@ class Frame:
     state: npt.NDArray[np.float64]
     images: Mapping[str, npt.NDArray[np.uint8]]
     stamps: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RobotFrame(Frame):
+    """A frame with what else the robot measures.
+
+    Args:
+        depths: camera name -> ``(height, width)`` float32 metres, NaN where nothing was measured.
+        base: ``(2,)`` forward speed in m/s and turning speed in rad/s of a mobile base, or None.
+    """
+
+    depths: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    base: npt.NDArray[np.float64] | None = None
 
 
 class Observation(TypedDict):

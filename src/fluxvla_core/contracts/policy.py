@@ -93,7 +93,7 @@ class Actor(Contract):
         self, observation: Observation, rest: Continuation
     ) -> npt.NDArray[np.float64]:
         """Real-time chunking: ``(horizon, dim)`` actions in physical units that fit ``rest``."""
-        raise NotImplementedError(f"{type(self).__name__} cannot go on from a chunk")
+        raise NotImplementedError(f"{type(self).__name__} cannot continue a chunk")
 
 
 class Policy(Actor):

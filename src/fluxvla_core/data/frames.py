@@ -25,7 +25,7 @@ AT_ONCE = 128
 MAX_THREADS = 4
 """Decoder threads of a process: each keeps files open; to use more cores, load with workers."""
 MAX_OPEN_FILES = 32
-"""Of all decoder threads of a dataset together."""
+"""Open video files of all decoder threads of a dataset together."""
 
 
 class Frames:

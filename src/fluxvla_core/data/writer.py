@@ -172,7 +172,7 @@ class LeRobotWriter:
                 next="call save_episode() or discard_episode() first",
             )
         if not self._saved:
-            raise DataError(f"{self.root}: no episode was saved, so there is not dataset to write")
+            raise DataError(f"{self.root}: no episode was saved, so there is no dataset to write")
         built = self._staging / "dataset"
         shutil.rmtree(built, ignore_errors=True)
         try:
@@ -195,8 +195,11 @@ class LeRobotWriter:
     ) -> None:
         if kind is None:
             self.finalize()
-        else:
-            self.discard_episode()
+            return
+        self.discard_episode()
+        # Frames of the first episode were refused: there is nothing to continue with.
+        if isinstance(error, DataError) and not any(self._staging.rglob("episode-*")):
+            shutil.rmtree(self._staging, ignore_errors=True)
 
     def _continue_recording(self, recover: bool) -> None:
         saved = sorted(self._staging.glob("episode-*"))

@@ -26,7 +26,7 @@ def unmet_requirements(plugin: Plugin) -> Iterator[str]:
 def _unmet(
     requires: tuple[str, ...], extras: frozenset[str], whose: str, seen: set[tuple[str, str]]
 ) -> Iterator[str]:
-    """Those of ``requires`` whose markers hold with one of ``extras``."""
+    """Requirements of ``requires`` whose markers hold with one of ``extras``."""
     for text in requires:
         try:
             wanted = Requirement(text)

@@ -300,7 +300,7 @@ def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
     table = section.get("operator") if isinstance(section, Mapping) else None
     if table is None:
         raise UsageError(
-            "the config has no inference.operator: for which robot its actions are is unknown",
+            "the config has no inference.operator, so the robot of its actions is unknown",
             next="--embodiment FILE",
         )
     operator = Operator.adapt(build_operator_from_cfg(table))

@@ -17,7 +17,7 @@ class Clock(Protocol):
 
 
 class HostClock:
-    """Of a device that has done an operation when the call returns."""
+    """Clock of a device that has done an operation when the call returns."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
@@ -33,8 +33,8 @@ class HostClock:
 
 
 class CudaClock:
-    """Of a GPU, by events in its stream: a part that waits for the host to launch operations takes
-    as long as that does."""
+    """Clock of a GPU, by CUDA events: a part that waits for the host to launch operations takes as
+    long as that does."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[str, Any]] = [("", _event())]

@@ -174,7 +174,7 @@ class Parts:
 
     @classmethod
     def of(cls, model: Any) -> Parts | None:
-        """None if the model does not divide its answer."""
+        """The parameters of ``model.observe``; None if it has no ``observe`` and ``denoise``."""
         if not (implements(model, VLA, "observe") and implements(model, VLA, "denoise")):
             return None
         return cls(frozenset(inspect.signature(model.observe).parameters))

@@ -46,7 +46,7 @@ class Work:
 
     @property
     def flops(self) -> int:
-        """Of all; a multiplication and an addition are two."""
+        """Floating-point operations of all kernels; a multiply-add counts as two."""
         return sum(flops for flops, _ in self.kernels)
 
     @property
@@ -99,7 +99,7 @@ class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def _bytes(tensor: Tensor) -> int:
-    """Those that are different: what is expanded is read once."""
+    """Bytes of the tensor's distinct elements: expanded ones are read once."""
     sizes = zip(tensor.shape, tensor.stride(), strict=True)
     count = 1
     for size, stride in sizes:

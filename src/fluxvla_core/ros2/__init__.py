@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from fluxvla_core import _lazy
 
 if TYPE_CHECKING:
+    from fluxvla_core.contracts.frame import RobotFrame as RobotFrame
     from fluxvla_core.ros2 import images as images
     from fluxvla_core.ros2 import joints as joints
     from fluxvla_core.ros2 import qos as qos
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.faults import Fault as Fault
     from fluxvla_core.ros2.faults import Faults as Faults
     from fluxvla_core.ros2.faults import Outbox as Outbox
-    from fluxvla_core.ros2.frames import RobotFrame as RobotFrame
     from fluxvla_core.ros2.messages import COMPRESSED_IMAGE as COMPRESSED_IMAGE
     from fluxvla_core.ros2.messages import FLOAT64 as FLOAT64
     from fluxvla_core.ros2.messages import FLOAT64_ARRAY as FLOAT64_ARRAY
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.messages import message_class as message_class
     from fluxvla_core.ros2.operator import RosOperator as RosOperator
     from fluxvla_core.ros2.stop_motion import checked_action as checked_action
+    from fluxvla_core.ros2.streams import AUXILIARY as AUXILIARY
     from fluxvla_core.ros2.streams import CAMERA as CAMERA
     from fluxvla_core.ros2.streams import DEPTH as DEPTH
-    from fluxvla_core.ros2.streams import SIDE as SIDE
     from fluxvla_core.ros2.streams import STATE as STATE
     from fluxvla_core.ros2.streams import CommandSpec as CommandSpec
     from fluxvla_core.ros2.streams import StreamSpec as StreamSpec
@@ -50,7 +50,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.ros2.stop_motion": ["checked_action"],
         "fluxvla_core.ros2.connection": ["Connection", "require_rclpy"],
         "fluxvla_core.ros2.faults": ["AMOUNTS", "Fault", "Faults", "MODES", "Outbox"],
-        "fluxvla_core.ros2.frames": ["RobotFrame"],
+        "fluxvla_core.contracts.frame": ["RobotFrame"],
         "fluxvla_core.ros2.images": ["images"],
         "fluxvla_core.ros2.joints": ["joints"],
         "fluxvla_core.ros2.messages": [
@@ -67,10 +67,10 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.ros2.operator": ["RosOperator"],
         "fluxvla_core.ros2.qos": ["qos"],
         "fluxvla_core.ros2.streams": [
+            "AUXILIARY",
             "CAMERA",
             "CommandSpec",
             "DEPTH",
-            "SIDE",
             "STATE",
             "StreamSpec",
             "camera_stream",
@@ -78,4 +78,5 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.ros2.sync": ["Stale"],
     },
+    deprecated={"SIDE": "AUXILIARY"},
 )

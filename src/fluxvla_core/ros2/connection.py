@@ -13,11 +13,13 @@ import ctypes
 import functools
 import importlib
 import importlib.util
+import math
 import os
 import re
 import secrets
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -242,7 +244,13 @@ class Connection:
         try:
             # The watch timer wakes this at least every WATCH_S, so a main thread that ends without
             # close() is noticed, and the process does not hang on a thread that it must join.
-            while not self._closing.is_set() and main.is_alive() and self._context.ok():
+            checked_at = -math.inf
+            while not self._closing.is_set():
+                # Both take locks; this loop turns at every message.
+                if (now := time.monotonic()) - checked_at >= WATCH_S:
+                    if not main.is_alive() or not self._context.ok():
+                        break
+                    checked_at = now
                 self._executor.spin_once(timeout_sec=WATCH_S)
         except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error

@@ -1,32 +1,15 @@
-"""Frames of a ROS 2 robot, and the pictures of its cameras."""
+"""Images of a ROS 2 robot's cameras, for its frames."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.ros2 import images
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, Received, StreamSpec
-
-Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class RobotFrame(Frame):
-    """A frame with what else the robot has.
-
-    Args:
-        depths: camera name -> ``(height, width)`` float32 metres, NaN where nothing was measured.
-        base: ``(2,)`` forward speed in m/s and turning speed in rad/s of a mobile base, or None.
-    """
-
-    depths: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
-    base: Array | None = None
 
 
 def pictures(

@@ -13,6 +13,7 @@ import itertools
 import logging
 import threading
 import time
+import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -21,16 +22,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
+from fluxvla_core.contracts.frame import RobotFrame
 from fluxvla_core.contracts.part import Part
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.frames import RobotFrame
 from fluxvla_core.ros2.messages import message_class
-from fluxvla_core.ros2.readings import POLL_S, Readings
-from fluxvla_core.ros2.startup import Startup
+from fluxvla_core.ros2.startup import StartupChecks
 from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action
+from fluxvla_core.ros2.stream_reader import POLL_S, StreamReader
 from fluxvla_core.ros2.streams import (
     CAMERA,
     DEPTH,
@@ -106,7 +107,7 @@ class RosOperator(Operator):
         self._motion = Motion()
         self._fault: FluxError | None = None
 
-    # What a subclass defines.
+    # Methods that a subclass implements or overrides.
 
     @abstractmethod
     def streams(self) -> Sequence[StreamSpec]:
@@ -125,7 +126,7 @@ class RosOperator(Operator):
         """Send a ``(dim,)`` action that was checked, with :meth:`publish`."""
 
     def read_base(self, messages: Mapping[str, Any]) -> Array | None:
-        """``(2,)`` speeds of a mobile base of the ``side`` streams' messages; None without one.
+        """``(2,)`` speeds of a mobile base of the auxiliary streams' messages; None without one.
 
         Raises:
             Faulted: a speed is not finite.
@@ -140,10 +141,21 @@ class RosOperator(Operator):
         """Called in every ``stop``, once the arm brakes: stop what else can move."""
         return
 
-    def admit(self, action: Array) -> None:
-        """Called before each command; raises Faulted where the robot says that it takes none, and
-        Rejected where it would not take this one."""
+    def check_command(self, action: Array) -> None:
+        """Called before each command is published, after its own checks; does nothing here.
+
+        Raises:
+            Faulted: the robot does not take commands now (protective stop, wrong mode).
+            Rejected: the robot would not take this one.
+        """
         return
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "admit" in vars(cls):
+            message = f"{cls.__name__}.admit is deprecated, call it check_command"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            cls.check_command = vars(cls)["admit"]  # type: ignore[method-assign]
 
     # The contract.
 
@@ -206,14 +218,14 @@ class RosOperator(Operator):
             BadMessage: a message is not what the embodiment describes.
             Faulted: the connection broke.
         """
-        readings = self._readings
+        reader = self._reader
         self._part.check_cameras(self.embodiment.name)
-        matched = readings.matched()
+        matched = reader.matched()
         states = {spec.name: matched[spec.name] for spec in self._specs if spec.kind == STATE}
         state, stamp = self._state_of(states)
         stamps = {name: found.receipt for name, found in matched.items() if name not in states}
         colours, depths = frames.pictures(self._specs, matched)
-        newest = {name: received.message for name, received in readings.newest().items()}
+        newest = {name: received.message for name, received in reader.newest().items()}
         return RobotFrame(
             state, colours, {**stamps, STATE_STREAM: stamp}, depths, self.read_base(newest)
         )
@@ -229,10 +241,10 @@ class RosOperator(Operator):
             BadMessage: the joint states are not what the embodiment describes.
             Faulted: the connection broke.
         """
-        readings = self._readings
-        readings.newest()
-        readings.check_states_together()
-        return self._state_of(readings.states())[0]
+        reader = self._reader
+        reader.newest()
+        reader.check_states_together()
+        return self._state_of(reader.states())[0]
 
     def state_stamp(self) -> float:
         """Receipt of the oldest message that :meth:`get_state` reads now, on the monotonic clock.
@@ -240,7 +252,7 @@ class RosOperator(Operator):
         Raises:
             NotReady: not connected.
         """
-        return min(received.receipt for received in self._readings.states().values())
+        return min(received.receipt for received in self._reader.states().values())
 
     def pictures_after(
         self, camera: str, after: float
@@ -277,7 +289,7 @@ class RosOperator(Operator):
             self._connected().check()
             if self._fault is not None:
                 raise self._fault
-            self.admit(checked)
+            self.check_command(checked)
             self.publish_action(checked)
             self._motion.sent(checked)
             self._last, self._moving = checked, True
@@ -343,11 +355,17 @@ class RosOperator(Operator):
         """``(dim,)`` the command that holds the arm; None before any, or if another node's does."""
         return None if self._last is None else self._last.copy()
 
-    def kept(self, name: str) -> tuple[Received, ...]:
-        """The messages of a stream that are kept, newest last; none without a connection, and of a
-        camera in the part without cameras."""
+    def history(self, name: str) -> tuple[Received, ...]:
+        """The last messages of a stream, at most its ``depth``, newest last; none without a
+        connection, and of a camera in the part without cameras."""
         stream = self._stream(name)
         return stream.ring.items() if stream is not None else ()
+
+    def kept(self, name: str) -> tuple[Received, ...]:
+        """Deprecated name of :meth:`history`."""
+        message = "RosOperator.kept is deprecated, use history"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return self.history(name)
 
     def newest(self, name: str) -> Received | None:
         """The newest message of a stream, None before the first, without a connection, and of a
@@ -355,7 +373,7 @@ class RosOperator(Operator):
         stream = self._stream(name)
         return stream.newest() if stream is not None else None
 
-    # Pieces of the above.
+    # Private methods.
 
     def _divided(self, part: Part) -> RosOperator:
         # Itself, not a copy: what a subclass made in its constructor may refer to this object.
@@ -382,7 +400,7 @@ class RosOperator(Operator):
             command.topic: connection.publisher(command.topic, message_class(command.message))
             for command in commands
         }
-        startup = Startup(connection, self._specs, commands, self._publishers)
+        startup = StartupChecks(connection, self._specs, commands, self._publishers)
         startup.wait(self.connect_timeout_s)
         for warning in [*startup.count(self.rate_window_s), *startup.missing_optional()]:
             log.warning("%s", warning)
@@ -392,10 +410,7 @@ class RosOperator(Operator):
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
 
     def _first_reading(self) -> None:
-        """See that frames can be made, or states in the part without cameras.
-
-        Drivers that only now get going are given time.
-        """
+        """Wait until a frame can be read, or a state in the part without cameras."""
         read = self.get_frame if self._part.cameras else self.get_state
         until = time.monotonic() + self.connect_timeout_s
         while True:
@@ -428,10 +443,10 @@ class RosOperator(Operator):
         return self._connection
 
     @property
-    def _readings(self) -> Readings:
-        """The streams' readings; raises NotReady without a connection."""
+    def _reader(self) -> StreamReader:
+        """Reader of the streams; raises NotReady without a connection."""
         connection = self._connected()
-        return Readings(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
+        return StreamReader(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
 
     def _state_of(self, messages: Mapping[str, Received]) -> tuple[Array, float]:
         """The ``(state_dim,)`` state, and the receipt of the oldest message in it."""
@@ -443,9 +458,9 @@ class RosOperator(Operator):
         if not self._moving or self._last is None:
             return []
         try:
-            readings = self._readings
-            readings.newest()
-            measured = self._state_of(readings.states(-1)), self._state_of(readings.states(-2))
+            reader = self._reader
+            reader.newest()
+            measured = self._state_of(reader.states(-1)), self._state_of(reader.states(-2))
         except FluxError:
             measured = None  # Its last command is where it goes or stays.
         return self._motion.stop_commands(self.embodiment, self._last, measured)

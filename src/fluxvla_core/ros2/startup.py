@@ -36,7 +36,7 @@ GOOD = 0.9
 """Share below which somebody should know."""
 
 
-class Startup:
+class StartupChecks:
     """Looks at one connection until everything that is needed is there.
 
     Args:
@@ -98,7 +98,7 @@ class Startup:
         time.sleep(seconds)
         span = time.monotonic() - start
         warnings = check_losses(
-            Reception(
+            ReceptionStats(
                 stream.label,
                 stream.reliability,
                 span,
@@ -149,7 +149,7 @@ class Startup:
         span = time.monotonic() - self._since
         return losses_error(
             [
-                Reception(s.label, s.reliability, span, 0, s.lost, 0, None, s.from_fast_dds)
+                ReceptionStats(s.label, s.reliability, span, 0, s.lost, 0, None, s.from_fast_dds)
                 for s in lost
             ]
         )
@@ -211,7 +211,7 @@ def _size(stream: Stream) -> int:
 
 
 @dataclass(frozen=True)
-class Reception:
+class ReceptionStats:
     """Statistics of what one stream received in some time.
 
     Args:
@@ -249,20 +249,20 @@ class Reception:
         return f"{self.label}: {self.received} of {self.wanted:.0f} messages arrived"
 
 
-def check_losses(receptions: Iterable[Reception]) -> list[str]:
+def check_losses(streams: Iterable[ReceptionStats]) -> list[str]:
     """Warnings for streams that lose some messages.
 
     Raises:
         NotReady: a stream loses most; names all of them, and the shared-memory trap if it is one.
     """
-    everything = list(receptions)
+    everything = list(streams)
     bad = [r for r in everything if r.share < ENOUGH]
     if bad:
         raise losses_error(bad)
     return [f"{r} in {r.seconds:.1f} s" for r in everything if r.share < GOOD]
 
 
-def losses_error(bad: list[Reception]) -> NotReady:
+def losses_error(bad: list[ReceptionStats]) -> NotReady:
     """The error for streams that lose most of their messages."""
     what = "; ".join(f"{r} in {r.seconds:.1f} s" for r in bad)
     if any(is_trap(r) and r.from_fast_dds for r in bad):
@@ -302,14 +302,14 @@ def vendor_warning(origins: Sequence[str]) -> str:
     )
 
 
-def is_trap(reception: Reception) -> bool:
+def is_trap(stats: ReceptionStats) -> bool:
     """Whether large best-effort messages are lost: with Fast DDS, the shared-memory trap.
 
     Where no message ever arrived its size is unknown, and losses that the middleware reports for a
     best-effort stream are enough.
     """
-    large = reception.size > SEGMENT_BYTES or (reception.size == 0 and reception.lost > 0)
-    return reception.reliability == BEST_EFFORT and large and reception.share < ENOUGH
+    large = stats.size > SEGMENT_BYTES or (stats.size == 0 and stats.lost > 0)
+    return stats.reliability == BEST_EFFORT and large and stats.share < ENOUGH
 
 
 def large_frames_profile() -> str:

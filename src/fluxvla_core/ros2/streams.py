@@ -13,9 +13,9 @@ from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.messages import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, stamp_of
 from fluxvla_core.spec.embodiment import Camera
 
-STATE, CAMERA, DEPTH, SIDE = "state", "camera", "depth", "side"
-"""What a stream is for. ``side`` streams (a robot's mode, its base) are kept and must be fresh, but
-are not matched in time with the others."""
+STATE, CAMERA, DEPTH, AUXILIARY = "state", "camera", "depth", "auxiliary"
+"""Kinds of streams. Auxiliary ones (a robot's mode, its base) must be fresh, but their messages are
+not matched in time with the others."""
 
 # Long enough to find the state that belongs to a picture that took 0.2 s, at 500 Hz.
 _STATE_DEPTH = 128
@@ -36,15 +36,16 @@ class StreamSpec:
         name: the stream's name in frames and messages; a camera's name for pictures.
         topic: the topic.
         message: its type, as ``sensor_msgs.msg:JointState``.
-        kind: ``state``, ``camera``, ``depth`` or ``side``.
+        kind: ``STATE``, ``CAMERA``, ``DEPTH`` or ``AUXILIARY``.
         depth: how many messages are kept.
         expected_hz: messages a second that should come; None: as many as are sent.
         camera: size of the pictures, for ``camera`` and ``depth``.
-        required: whether ``connect`` waits for it; only ``side`` streams need not be. Otherwise it
+        required: whether ``connect`` waits for it; only auxiliary streams need not be. Otherwise it
             warns if nobody publishes it. Once a message arrived, more must come in either case.
-        latched: ask for the last message that was sent before, where publishers keep it. It is sent
-            when something changes, so that silence means nothing.
-        unheard: the likely cause where it is not heard, for messages.
+        latched: a topic with ``transient_local`` durability (``latched`` in ROS 1), whose last
+            message is sent to late subscribers too. It is published when something changes, so
+            silence is no error.
+        unheard: likely cause if the stream is silent, for the error message.
     """
 
     name: str

@@ -45,8 +45,8 @@ class Matched:
     slowest: str
 
 
-def wall() -> float:
-    """The offset from receipt times to this machine's wall clock, in seconds."""
+def wall_offset() -> float:
+    """Seconds to add to a receipt time (monotonic) for this machine's wall clock."""
     return time.time() - time.monotonic()
 
 
@@ -62,7 +62,7 @@ def silent(
 
 
 def match(
-    streams: Streams, max_skew: float, by: str = "stamp", wall: float | None = None
+    streams: Streams, max_skew: float, by: str = "stamp", wall_offset: float | None = None
 ) -> Matched:
     """The messages that belong together, one of each stream.
 
@@ -71,7 +71,7 @@ def match(
         max_skew: seconds that the chosen messages may be apart.
         by: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived (for senders
             whose clocks differ). Where any stream has no stamps, ``receipt`` is used.
-        wall: what to add to receipts for this machine's wall clock, to find which clock is off.
+        wall_offset: see :func:`wall_offset`; tells which sender's clock is off.
 
     Raises:
         Stale: they are further apart; names the first and the last stream, and whether the
@@ -91,12 +91,12 @@ def match(
             first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
             delays = {name: _delay(streams[name]) for name in (first, last)}
             if abs(delays[first] - delays[last]) > STEP:
-                error.cause, error.next = _wrong_clock(delays, wall), _CLOCKS
+                error.cause, error.next = _wrong_clock(delays, wall_offset), _CLOCKS
         raise error
     return Matched(chosen, skew, slowest)
 
 
-def check_together(streams: Streams, max_skew: float, wall: float | None = None) -> None:
+def check_together(streams: Streams, max_skew: float, wall_offset: float | None = None) -> None:
     """Refuse parts of one state whose stamps say that they are of different times.
 
     What arrives at the same time and is stamped apart is a difference of clocks, or one sender is
@@ -105,7 +105,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
 
     Args:
         streams: those that make up the state; where one has no stamps, nothing is checked.
-        max_skew, wall: see ``match``.
+        max_skew, wall_offset: see ``match``.
 
     Raises:
         Stale: names the two that are furthest apart, and whose clock is off.
@@ -119,7 +119,7 @@ def check_together(streams: Streams, max_skew: float, wall: float | None = None)
         raise Stale(
             f"{first} is stamped {apart:.3f} s earlier than {last}, although they arrive together; "
             f"at most {max_skew:g} s is allowed",
-            cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall),
+            cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall_offset),
             next=f"{_CLOCKS}; max_skew_s sets what is allowed",
         )
 
@@ -149,12 +149,12 @@ def _delay(items: Sequence[Received]) -> float:
     return min((m.receipt - m.stamp for m in items[-_FEW:] if m.stamp is not None), default=0.0)
 
 
-def _wrong_clock(delays: Mapping[str, float], wall: float | None) -> str:
+def _wrong_clock(delays: Mapping[str, float], wall_offset: float | None) -> str:
     """Text: which of the streams has a wrong clock."""
     slow, fast = max(delays, key=delays.__getitem__), min(delays, key=delays.__getitem__)
     # By this machine's wall clock; a stamp in the future cannot be a message that is late.
-    behind = {name: delay + (wall or 0.0) for name, delay in delays.items()}
-    if wall is None or min(map(abs, behind.values())) > STEP:
+    behind = {name: delay + (wall_offset or 0.0) for name, delay in delays.items()}
+    if wall_offset is None or min(map(abs, behind.values())) > STEP:
         return "they arrive together, so the clocks that stamp them differ"
     if abs(behind[fast]) > abs(behind[slow]):
         return f"the clock that stamps {fast} is {-behind[fast]:.2f} s ahead of this machine's"

@@ -20,7 +20,7 @@ VELOCITY = "velocity"
 JOINT_KINDS = ("revolute", "prismatic", "gripper", VELOCITY)
 UNITS = ("rad", "m", "normalized")
 SPEED_UNITS = ("m/s", "rad/s")
-"""Of joints of kind ``velocity``."""
+"""Units of joints of kind ``velocity``."""
 ACTION_MODES = ("absolute", "delta")
 # A joint of such a unit or kind is commanded by its speed.
 _SPEED_UNITS = re.compile(r".+/\s*s(ec)?(ond)?s?|rpm|hz", re.IGNORECASE)

@@ -162,7 +162,7 @@ class InferenceRunnerConformance(Conformance):
         )
 
     def test_commands_keep_the_limits(self, tmp_path: Path) -> None:
-        """Of a policy that wants more speed than there is, and to go a little too far."""
+        """With a policy that asks for more than the velocity and position limits."""
         robot, policy = self.robot(), StandInPolicy(self.spec, within(self.spec, 1.1), _HASTE)
         self.drive(tmp_path, robot, policy)
         self._sane(robot)

@@ -78,7 +78,7 @@ class Driver:
 
     @property
     def exit_code(self) -> int | None:
-        """Of the process; None while it runs."""
+        """Exit code of the process; None while it runs."""
         return self._process.poll()
 
     def kill(self) -> None:

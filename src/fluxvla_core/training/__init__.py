@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from fluxvla_core import _lazy
 
 if TYPE_CHECKING:
-    from fluxvla_core.checkpoints.parts import Stored as Stored
+    from fluxvla_core.checkpoints.shards import Stored as Stored
     from fluxvla_core.contracts.runner import TrainRunner as TrainRunner
     from fluxvla_core.contracts.training import VLA as VLA
     from fluxvla_core.contracts.training import Collator as Collator
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.training import Transform as Transform
     from fluxvla_core.training.base_runner import BaseTrainRunner as BaseTrainRunner
     from fluxvla_core.training.distributed import World as World
-    from fluxvla_core.training.distributed import share_buffers as share_buffers
+    from fluxvla_core.training.distributed import broadcast_buffers as broadcast_buffers
     from fluxvla_core.training.layout import Layout as Layout
     from fluxvla_core.training.layout import bare as bare
     from fluxvla_core.training.layout import nbytes as nbytes
-    from fluxvla_core.training.layout import whole as whole
+    from fluxvla_core.training.layout import replicated_layout as replicated_layout
     from fluxvla_core.training.model import units_of as units_of
     from fluxvla_core.training.parameters import decay_groups as decay_groups
     from fluxvla_core.training.parameters import refuse_scalars as refuse_scalars
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
     {
-        "fluxvla_core.checkpoints.parts": ["Stored"],
+        "fluxvla_core.checkpoints.shards": ["Stored"],
         "fluxvla_core.contracts.runner": ["TrainRunner"],
         "fluxvla_core.contracts.training": [
             "Collator",
@@ -52,11 +52,12 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "VLA",
         ],
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
-        "fluxvla_core.training.distributed": ["World", "share_buffers"],
-        "fluxvla_core.training.layout": ["Layout", "bare", "nbytes", "whole"],
+        "fluxvla_core.training.distributed": ["World", "broadcast_buffers"],
+        "fluxvla_core.training.layout": ["Layout", "bare", "nbytes", "replicated_layout"],
         "fluxvla_core.training.model": ["units_of"],
         "fluxvla_core.training.parameters": ["decay_groups", "refuse_scalars", "trainable"],
         "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },
+    deprecated={"share_buffers": "broadcast_buffers", "whole": "replicated_layout"},
 )

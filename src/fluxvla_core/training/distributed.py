@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -49,7 +50,7 @@ _LOST = (
 
 @dataclass(frozen=True)
 class World:
-    """This process among those that train together.
+    """The rank of this process, and the size and device of its process group.
 
     Args:
         rank, size: global rank and number of processes.
@@ -67,9 +68,16 @@ class World:
     control: Any = None
 
     @property
-    def first(self) -> bool:
-        """Whether this is the process that writes and talks."""
+    def is_rank0(self) -> bool:
+        """Whether this is global rank 0, which writes files and reports progress."""
         return self.rank == 0
+
+    @property
+    def first(self) -> bool:
+        """Deprecated name of :attr:`is_rank0`."""
+        message = "World.first is deprecated, use World.is_rank0"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return self.is_rank0
 
 
 def start(device: str = "auto", group_of_one: bool = False) -> World:
@@ -112,7 +120,7 @@ def _stay_inside() -> None:
 
 
 def _attempts_store() -> Any:
-    """Where ranks find each other, with names that no earlier attempt has used.
+    """The rendezvous store, with a prefix that no earlier attempt has used.
 
     torchrun keeps one store over all restarts of a job; by the names of the last attempt ranks
     would find addresses of processes that have ended.
@@ -163,8 +171,8 @@ def stop(world: World, failed: bool = False) -> None:
     dist.destroy_process_group()
 
 
-def agree(world: World, value: int) -> int:
-    """The largest ``value`` of all ranks: every rank leaves with the same."""
+def all_reduce_max(world: World, value: int) -> int:
+    """The largest ``value`` of all ranks, on every rank (all-reduce with MAX)."""
     if world.size == 1:
         return value
     box = torch.tensor([value], dtype=torch.int64)
@@ -172,28 +180,30 @@ def agree(world: World, value: int) -> int:
     return int(box)
 
 
-def total(world: World, values: Tensor) -> Tensor:
-    """Sum of CPU ``values`` over all ranks, in place."""
+def all_reduce_sum(world: World, values: Tensor) -> Tensor:
+    """Sum of CPU ``values`` over all ranks, in place (all-reduce with SUM)."""
     if world.size > 1:
         dist.all_reduce(values, group=world.control)
     return values
 
 
-def share_text(world: World, text: str) -> str:
-    """The first rank's ``text`` on every rank."""
+def broadcast_text(world: World, text: str) -> str:
+    """Rank 0's ``text`` on every rank (broadcast)."""
     if world.size == 1:
         return text
     data = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8) if text else None
     length = torch.tensor([0 if data is None else len(data)])
     dist.broadcast(length, 0, group=world.control)
-    box = data if world.first and data is not None else torch.empty(int(length), dtype=torch.uint8)
+    box = (
+        data if world.is_rank0 and data is not None else torch.empty(int(length), dtype=torch.uint8)
+    )
     if length:
         dist.broadcast(box, 0, group=world.control)
     return bytes(box.tolist()).decode()
 
 
-def texts(world: World, text: str) -> list[str]:
-    """Every rank's ``text`` on every rank."""
+def all_gather_text(world: World, text: str) -> list[str]:
+    """Every rank's ``text`` on every rank, in the order of ranks (all-gather)."""
     if world.size == 1:
         return [text]
     data = text.encode()
@@ -208,21 +218,21 @@ def texts(world: World, text: str) -> list[str]:
     return [bytes(box[: int(n)].tolist()).decode() for box, n in zip(boxes, lengths, strict=True)]
 
 
-def on_first(world: World, work: Callable[[], str]) -> str:
-    """Do ``work`` on the first rank only; every rank gets its answer, or raises its error.
+def run_on_rank0(world: World, work: Callable[[], str]) -> str:
+    """Call ``work`` on rank 0 only; every rank gets its result, or raises its error.
 
     Without this a rank whose peer failed would wait for it in the next collective operation.
     """
     failure: FluxError | None = None
     answer = ""
-    if world.first:
+    if world.is_rank0:
         try:
             answer = json.dumps({"answer": work()})
         except FluxError as error:
             failure = error
             fields = [error.what, error.where, error.cause, error.next]
             answer = json.dumps({"error": type(error).__name__, "fields": fields})
-    reply = json.loads(share_text(world, answer))
+    reply = json.loads(broadcast_text(world, answer))
     if failure is not None:
         raise failure
     if "error" in reply:
@@ -233,12 +243,12 @@ def on_first(world: World, work: Callable[[], str]) -> str:
     return str(reply["answer"])
 
 
-def share_buffers(world: World, model: nn.Module) -> None:
-    """Copy the first rank's saved buffers to all; a strategy's ``optimizer_step`` ends with it.
+def broadcast_buffers(world: World, model: nn.Module) -> None:
+    """Broadcast rank 0's saved buffers to all; a strategy's ``optimizer_step`` ends with it.
 
     Each rank changes them by its own batches (batch-norm statistics, a running normaliser), and a
-    run continues with the first one's. Once the step is done they are the same for what may come
-    next: another step, a validation, a checkpoint. DDP does so by itself.
+    run continues with rank 0's. So they are equal on all ranks in what may come next: another
+    step, a validation, a checkpoint. DDP does so by itself.
     """
     if world.size == 1:
         return

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.checkpoints.parts import local
-from fluxvla_core.checkpoints.tensors import check_names, copy_whole
+from fluxvla_core.checkpoints.shards import to_local
+from fluxvla_core.checkpoints.tensors import check_names, copy_full
 
 
 class Ema:
@@ -29,8 +29,8 @@ class Ema:
         decay = min(self.decay, (1 + step) / (10 + step))
         with torch.no_grad():
             torch._foreach_lerp_(
-                [local(t) for t in self.shadow.values()],
-                [local(p) for p in self._parameters.values()],
+                [to_local(t) for t in self.shadow.values()],
+                [to_local(p) for p in self._parameters.values()],
                 1.0 - decay,
             )
 
@@ -46,10 +46,10 @@ class Ema:
     def _swap(self) -> None:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
-                ours, theirs = local(self.shadow[name]), local(parameter)
-                kept = theirs.clone()
-                theirs.copy_(ours)
-                ours.copy_(kept)
+                average, weight = to_local(self.shadow[name]), to_local(parameter)
+                saved = weight.clone()
+                weight.copy_(average)
+                average.copy_(saved)
 
     def load(self, tensors: Mapping[str, Tensor], where: str) -> None:
         """Take the full averages in ``tensors``.
@@ -59,4 +59,4 @@ class Ema:
         """
         check_names(tensors, self.shadow, "the averaged weights", where)
         for name, average in self.shadow.items():
-            copy_whole(average, tensors[name])
+            copy_full(average, tensors[name])

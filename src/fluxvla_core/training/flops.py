@@ -92,7 +92,7 @@ class Meter:
         dtype: torch.dtype | None,
         peak_tflops: float | None,
     ) -> Meter | None:
-        """None where no peak is known: on CPUs, and on GPUs that are not in the table."""
+        """A meter for ``model``; None on CPUs and on GPUs whose peak FLOP/s are not known."""
         if peak_tflops is None and device.type == "cuda":
             peak_tflops = known_peak(torch.cuda.get_device_name(device), dtype)
         return None if peak_tflops is None else cls(on_meta(model), peak_tflops)

@@ -57,7 +57,7 @@ class Kept:
 
 
 NOTHING = Kept(0, 0, 0, 0, 0)
-"""Where the batch is not known."""
+"""The footprint if the batch is not known."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     @contextmanager
     def in_units(self, model: nn.Module) -> Iterator[None]:
-        """Inside, it is known what each of the model's units keeps, and what goes into it."""
+        """Context manager: records inputs and saved tensors of each of the model's units."""
         blocks = blocks_of(model)
         before = [block.__dict__.get("forward") for block in blocks]
         for number, block in enumerate(blocks):

@@ -16,7 +16,7 @@ from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.parts import Stored
+from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names
 from fluxvla_core.checkpoints.writer import PARTIAL, CheckpointWriter
 from fluxvla_core.config.load import FORMAT
@@ -31,7 +31,12 @@ from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER
-from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
+from fluxvla_core.training.weights import (
+    LeftOut,
+    load_for_inference,
+    model_of,
+    weights_by_name,
+)
 from fluxvla_core.untrusted import read_json
 
 _ORIGIN = "import-checkpoint"
@@ -89,7 +94,7 @@ def import_checkpoint(
         what="the import",
         go_on="import again, or name a folder on another disk; the source is as it was",
     ) as writer:
-        TensorFile.whole(ckpt.MODEL, tensors, True).write(writer)
+        TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
         writer.write_json(ckpt.CONFIG, _config(found))
         writer.write_json(ckpt.ENVIRONMENT, environment())
@@ -99,8 +104,8 @@ def import_checkpoint(
         if found.embodiment is not None:
             writer.write_json(ckpt.EMBODIMENT, found.embodiment.to_dict())
         pipeline = Pipeline(found.transforms)
-        writer.fill_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
-        writer.enter_folder(ckpt.PROCESSORS)
+        writer.write_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
+        writer.add_folder(ckpt.PROCESSORS)
         return writer.commit(), found
 
 
@@ -172,13 +177,13 @@ def _as_foreign(checkpoint: Checkpoint) -> ForeignCheckpoint:
     dataset = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
     facts = checkpoint.policy()
     if checkpoint.has(ckpt.EMA) or checkpoint.has(ADAPTER):
-        model = build_vla_from_cfg(config["model"])
+        model = model_of(checkpoint)
         load_for_inference(model, checkpoint)
         tensors: dict[str, Tensor] = {n: t.detach() for n, t in weights_by_name(model).items()}
     else:  # as they were saved, in the dtype that they have there
         tensors = checkpoint.tensors(ckpt.MODEL)
     return ForeignCheckpoint(
-        model=config["model"],
+        model=redirected([config["model"]], checkpoint.processors)[0],
         tensors=tensors,
         img_keys=tuple(camera_name(key) for key in dataset.get("img_keys", ())),
         transforms=redirected(dataset.get("transforms", ()), checkpoint.processors),

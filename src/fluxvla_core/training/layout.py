@@ -1,4 +1,4 @@
-"""What a process keeps of a model while it trains, by the way in which a strategy divides it.
+"""Memory layout: what one process keeps of a model while it trains under a strategy.
 
 A strategy says so by ``memory_layout``. Nothing here allocates: tensors stand for their shapes.
 """
@@ -35,8 +35,8 @@ class Layout:
     gathered_as: Mapping[str, torch.dtype] = field(default_factory=dict)
 
 
-def whole(model: nn.Module) -> Layout:
-    """Everything on every process, as data parallelism has it, and one process alone."""
+def replicated_layout(model: nn.Module) -> Layout:
+    """The layout of data parallelism, and of one process: everything on every process."""
     groups = decay_groups(model, 0.0)
     return Layout(
         parameters=nbytes([*model.parameters(), *model.buffers()]),

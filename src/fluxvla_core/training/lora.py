@@ -1,4 +1,4 @@
-"""Low-rank adapters (LoRA, Hu et al. 2021) by way of peft, for every strategy.
+"""Low-rank adapters (LoRA, Hu et al. 2021) with peft, for every strategy.
 
 peft puts its layers into the model in place, so that it stays the class that it is. What is
 trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the base stays where

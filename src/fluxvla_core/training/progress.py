@@ -53,8 +53,8 @@ class Progress:
         loss: mean loss of the last step that was fetched.
         saved: the step of the last checkpoint, -1 when there is none.
         best, best_step: lowest validation loss, and its step.
-        worse: validations since then.
-        unvalidated: the record of the present step, which a stop left without its validation.
+        bad_validations: validations since then.
+        pending_validation: record of the last step, if a stop left it without its validation.
     """
 
     step: int = 0
@@ -63,19 +63,21 @@ class Progress:
     saved: int = -1
     best: float | None = None
     best_step: int = -1
-    worse: int = 0
-    unvalidated: dict[str, Any] | None = None
+    bad_validations: int = 0
+    pending_validation: dict[str, Any] | None = None
 
     def validated(self, loss: float) -> bool:
         """Take the validation loss of the present step; whether it is the best so far."""
         if self.best is None or loss < self.best:
-            self.best, self.best_step, self.worse = loss, self.step, 0
+            self.best, self.best_step, self.bad_validations = loss, self.step, 0
             return True
-        self.worse += 1
+        self.bad_validations += 1
         return False
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; :meth:`from_dict` is the inverse."""
+        pending = self.pending_validation
+        owed = {} if pending is None else {"owed": pending}
         return {
             "global_step": self.step,
             "epoch": self.cursor.epoch,
@@ -84,8 +86,8 @@ class Progress:
             "validation": {
                 "best": self.best,
                 "best_step": self.best_step,
-                "worse": self.worse,
-                **({"owed": self.unvalidated} if self.unvalidated is not None else {}),
+                "worse": self.bad_validations,
+                **owed,
             },
         }
 
@@ -102,6 +104,6 @@ class Progress:
             saved=step,
             best=validation.get("best"),
             best_step=validation.get("best_step", -1),
-            worse=validation.get("worse", 0),
-            unvalidated=validation.get("owed"),
+            bad_validations=validation.get("worse", 0),
+            pending_validation=validation.get("owed"),
         )

@@ -28,7 +28,7 @@ from fluxvla_core.checkpoints.retention import clear_leftovers, name_best, set_a
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.training.batches import StepPlan
-from fluxvla_core.training.distributed import World, agree, on_first
+from fluxvla_core.training.distributed import World, all_reduce_max, run_on_rank0
 from fluxvla_core.training.lora import LoraOptions, adapter_tensors
 from fluxvla_core.training.progress import Progress, SavedTrainer
 from fluxvla_core.training.rng import rank_seed, seed_all, seeds_of, set_rng_state
@@ -56,14 +56,14 @@ def lock_on_first(world: World, context: RunContext) -> WorkDirLock | None:
         locks.append(lock_work_dir(context.work_dir, context.reporter.warn))
         return ""
 
-    on_first(world, take)
+    run_on_rank0(world, take)
     return locks[0] if locks else None
 
 
 def choose_checkpoint(
     world: World, context: RunContext, resume: str | None, first: str | None = None
 ) -> Checkpoint | None:
-    """The verified checkpoint to resume from, None to start afresh; the same on every rank.
+    """The verified checkpoint to resume from, None to start from scratch; the same on every rank.
 
     Also clears what killed saves left in the work dir, which :func:`lock_on_first` made this run's.
 
@@ -77,7 +77,7 @@ def choose_checkpoint(
         CheckpointError: the one at the path is missing or damaged.
         UsageError: the work dir has checkpoints of another run.
     """
-    found = on_first(world, lambda: _choose(context, resume, first))
+    found = run_on_rank0(world, lambda: _choose(context, resume, first))
     return Checkpoint.open(found) if found else None
 
 
@@ -91,7 +91,7 @@ def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
     if checkpoint is None:
         place = first if resume == AUTO else resume
         if place is None or place == AUTO:
-            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts afresh")
+            reporter.info(f"no checkpoint in {context.work_dir} yet: training starts from scratch")
             return ""
         checkpoint = Checkpoint.open(place)
         checkpoint.verify()
@@ -305,13 +305,13 @@ def forget_missing(
     checkpoint from elsewhere, neither itself nor the best one before it is here.
     """
     elsewhere = lost = False
-    if world.first:
+    if world.is_rank0:
         here = work_dir / FOLDER / step_name(progress.step)
         elsewhere = resumed is None or resumed.path.resolve() != here.resolve()
         lost = not name_best(work_dir, -1 if elsewhere else progress.best_step)
-    if agree(world, elsewhere):
+    if all_reduce_max(world, elsewhere):
         progress.saved = -1
-    if agree(world, lost):
+    if all_reduce_max(world, lost):
         progress.best, progress.best_step = None, -1
 
 
@@ -400,19 +400,19 @@ def _leaves(name: str, value: Any, harmless: Set[str]) -> Iterator[tuple[str, st
             yield from _leaves(f"{name}.{key}", item, harmless)
 
 
-def changed_statistics(saved: Any, ours: Any, name: str = "") -> list[str]:
+def changed_statistics(saved: Any, present: Any, name: str = "") -> list[str]:
     """Dotted names of statistics that differ by more than another machine's rounding does."""
-    if isinstance(saved, Mapping) and isinstance(ours, Mapping):
+    if isinstance(saved, Mapping) and isinstance(present, Mapping):
         return [
-            found
-            for key in {**saved, **ours}
-            for found in changed_statistics(
-                saved.get(key), ours.get(key), f"{name}.{key}".strip(".")
+            change
+            for key in {**saved, **present}
+            for change in changed_statistics(
+                saved.get(key), present.get(key), f"{name}.{key}".strip(".")
             )
         ]
-    if isinstance(saved, list) and isinstance(ours, list) and len(saved) == len(ours):
-        pairs = zip(saved, ours, strict=True)
+    if isinstance(saved, list) and isinstance(present, list) and len(saved) == len(present):
+        pairs = zip(saved, present, strict=True)
         return [name] if any(changed_statistics(a, b, name) for a, b in pairs) else []
-    numbers = all(isinstance(v, int | float) for v in (saved, ours))
-    same = math.isclose(saved, ours, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == ours
+    numbers = all(isinstance(v, int | float) for v in (saved, present))
+    same = math.isclose(saved, present, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == present
     return [] if same else [name]

@@ -18,15 +18,15 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
-from fluxvla_core.checkpoints.parts import is_split, own_parts
 from fluxvla_core.checkpoints.retention import rotate
+from fluxvla_core.checkpoints.shards import is_sharded, local_shards
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
 from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
-from fluxvla_core.training.distributed import World, agree, on_first, texts
+from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_max, run_on_rank0
 from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.rng import rng_state
 
@@ -66,7 +66,7 @@ def save_snapshot(
     keep: int,
     spare: int | None = None,
 ) -> Path:
-    """Begin the checkpoint of ``step``; ``saver.settle`` says when it is complete.
+    """Begin the checkpoint of ``step``; ``saver.finish_pending`` says when it is complete.
 
     Every rank calls this. When it is there all but the ``keep`` newest are removed (0 keeps all),
     but for that of step ``spare``; old ones that cannot be removed are only warned of.
@@ -80,45 +80,45 @@ def save_snapshot(
     world = saver.world
     writer = CheckpointWriter(work_dir, step, epoch, rank=world.rank)
     tensors = snapshot.optimizer
-    split = any(map(is_split, tensors.values()))
+    sharded = any(map(is_sharded, tensors.values()))
     values = {ckpt.OPTIMIZER_META: snapshot.described, ckpt.TRAINER: snapshot.trainer}
     documents: dict[str, bytes] = {}
 
     def prepare() -> str:
         for name, value in {**values, **snapshot.documents}.items():
             documents[name] = json_bytes(name, value)
-        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_PARTS] if split else []))
+        writer.begin(ckpt.RANDOM, *([ckpt.OPTIMIZER_SHARDS] if sharded else []))
         # Now rather than in the thread: the training may use the same tokenizer meanwhile.
         for name, fill in snapshot.folders.items():
-            writer.fill_folder(name, fill)
+            writer.write_folder(name, fill)
         return ""
 
-    on_first(world, prepare)
+    run_on_rank0(world, prepare)
     files = [
         *_model_files(saver, snapshot),
-        TensorFile.whole(rng_file(world.rank), rng_state(), True),
+        TensorFile.full(rng_file(world.rank), rng_state(), True),
     ]
-    if split:
-        parts = own_parts(tensors, world.first)
-        if parts:
-            files.append(TensorFile.parts(part_file(world.rank), parts))
+    if sharded:
+        shards = local_shards(tensors, world.is_rank0)
+        if shards:
+            files.append(TensorFile.shards(shard_file(world.rank), shards))
     else:
-        files.append(TensorFile.whole(ckpt.OPTIMIZER, tensors, world.first))
+        files.append(TensorFile.full(ckpt.OPTIMIZER, tensors, world.is_rank0))
 
     def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
         try:
             for file in held:
                 file.write(writer)
         except Exception as error:  # noqa: BLE001 - the other ranks wait to hear of it
-            writer.refuse(error)
-        reports = texts(group, writer.report())
+            writer.set_error(error)
+        reports = all_gather_text(group, writer.rank_report())
 
         def finish() -> str:
-            writer.join(reports)
+            writer.merge_reports(reports)
             for name, data in documents.items():
                 writer.write_bytes(name, data)
             for name in snapshot.folders:
-                writer.enter_folder(name)
+                writer.add_folder(name)
             path = writer.commit()
             try:
                 rotate(work_dir, keep, spare=spare)
@@ -126,7 +126,7 @@ def save_snapshot(
                 warn(f"old checkpoints could not be removed: {error}")
             return str(path)
 
-        return Path(on_first(group, finish))
+        return Path(run_on_rank0(group, finish))
 
     saver.start(step, files, write)
     return writer.final
@@ -138,12 +138,12 @@ def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
         # The next forward pass may change buffers, while weights stay until the optimizer's step.
         copies = {id(t): t.clone() for t in model.values() if not isinstance(t, nn.Parameter)}
         model = {name: copies.get(id(t), t) for name, t in model.items()}
-    first = saver.world.first
-    files = [TensorFile.whole(ckpt.MODEL, model, first)]
+    first = saver.world.is_rank0
+    files = [TensorFile.full(ckpt.MODEL, model, first)]
     if snapshot.adapter:
-        files.append(TensorFile.whole(lora.WEIGHTS, snapshot.adapter, first))
+        files.append(TensorFile.full(lora.WEIGHTS, snapshot.adapter, first))
     if snapshot.ema is not None:
-        files.append(TensorFile.whole(ckpt.EMA, snapshot.ema.shadow, first))
+        files.append(TensorFile.full(ckpt.EMA, snapshot.ema.shadow, first))
     return files
 
 
@@ -152,9 +152,9 @@ def rng_file(rank: int) -> str:
     return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
 
 
-def part_file(rank: int) -> str:
-    """Name of a rank's file with its parts of the optimizer's state."""
-    return f"{ckpt.OPTIMIZER_PARTS}/rank-{rank:05d}.safetensors"
+def shard_file(rank: int) -> str:
+    """Name of a rank's file with its shards of the optimizer's state."""
+    return f"{ckpt.OPTIMIZER_SHARDS}/rank-{rank:05d}.safetensors"
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
@@ -255,35 +255,38 @@ class Saver:
     ) -> None:
         """Let ``write(world, files, warn)`` make the checkpoint of ``step``; all ranks call it.
 
-        The one before must have been settled.
+        The one before must have been finished with :meth:`finish_pending`.
         """
         job = self._job = _Job(step)
         warn = job.warnings.append
         if not self.background:
             self._run(job, lambda: write(self.world, files, warn))
             return
-        gathered = [file.gathered(partial(self._copy_of, file.name)) for file in files]
-        ready = _reached(self.world.device)
+        gathered = [file.gathered(partial(self._host_copy, file.name)) for file in files]
+        stream = _copy_stream(self.world.device)
         job.thread = threading.Thread(
             target=self._run,
-            args=(job, lambda: write(self._threads, self._held(job, gathered, ready), warn)),
+            args=(
+                job,
+                lambda: write(self._threads, self._host_copies(job, gathered, stream), warn),
+            ),
             name=f"checkpoint-{step}",
             daemon=True,
         )
         job.thread.start()
         if self._before_step is None:
-            self.copied()
+            self.wait_for_copies()
         else:
             # Only while there is something to wait for: each hook costs every step its time.
-            self._hook = self._before_step(lambda *_: self.copied())
+            self._hook = self._before_step(lambda *_: self.wait_for_copies())
 
-    def copied(self) -> None:
-        """Wait until weights and optimizer may change; needed before anything but a step does."""
+    def wait_for_copies(self) -> None:
+        """Wait until weights and optimizer may change. The optimizer's step does so by itself."""
         if self._job is not None and self._job.thread is not None:
             self._job.copied.wait()
 
-    def settle(self, wait: bool) -> Saved | None:
-        """The outcome of the save under way; all ranks call it at the same step.
+    def finish_pending(self, wait: bool) -> Saved | None:
+        """Finish the pending save, if there is one; all ranks call it at the same step.
 
         Args:
             wait: for its end; otherwise None is returned while some rank still writes.
@@ -295,7 +298,7 @@ class Saver:
         if job is None:
             return None
         if job.thread is not None:
-            if not wait and agree(self.world, int(job.thread.is_alive())):
+            if not wait and all_reduce_max(self.world, int(job.thread.is_alive())):
                 return None
             job.thread.join()
         if self._hook is not None:
@@ -307,27 +310,27 @@ class Saver:
         return Saved(job.step, job.path, tuple(job.warnings))
 
     def close(self) -> None:
-        """Let the checkpoint on its way be finished, whatever becomes of it."""
+        """Wait for the pending save, whether it succeeds or not."""
         if self._job is not None and self._job.thread is not None:
             self._job.thread.join()
 
     def _run(self, job: _Job, work: Callable[[], Path]) -> None:
         try:
             job.path = work()
-        except BaseException as error:  # noqa: BLE001 - raised by settle, in the training's thread
+        except BaseException as error:  # noqa: BLE001 - finish_pending raises it
             job.error = error
 
-    def _held(
-        self, job: _Job, files: Sequence[TensorFile], ready: AbstractContextManager[object]
+    def _host_copies(
+        self, job: _Job, files: Sequence[TensorFile], stream: AbstractContextManager[object]
     ) -> Iterator[TensorFile]:
         """Copies of ``files``; all are made before the first is written."""
         try:
-            with ready:
+            with stream:
                 held = [
                     replace(
                         file,
                         tensors=tuple(
-                            self._copy_of(file.name, i, t) for i, t in enumerate(file.tensors)
+                            self._host_copy(file.name, i, t) for i, t in enumerate(file.tensors)
                         ),
                     )
                     for file in files
@@ -336,23 +339,23 @@ class Saver:
             job.copied.set()
         yield from held
 
-    def _copy_of(self, file: str, index: int, tensor: Tensor) -> Tensor:
+    def _host_copy(self, file: str, index: int, tensor: Tensor) -> Tensor:
         return self._copy((file, index), tensor)
 
     def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
-        """``tensor`` in host memory that is kept from save to save, pinned if it is on a GPU."""
-        kept = self._memory.get(place)
-        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
-            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
-            self._memory[place] = kept
-        if kept is tensor:
-            return kept
+        """``tensor`` in a host buffer that is reused by every save, pinned if it is on a GPU."""
+        buffer = self._memory.get(place)
+        if buffer is None or buffer.shape != tensor.shape or buffer.dtype != tensor.dtype:
+            buffer = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+            self._memory[place] = buffer
+        if buffer is tensor:
+            return buffer
         with torch.no_grad():
-            return kept.copy_(tensor)
+            return buffer.copy_(tensor)
 
 
-def _reached(device: torch.device) -> AbstractContextManager[object]:
-    """Inside, a GPU copies on another stream, after what has been enqueued up to now."""
+def _copy_stream(device: torch.device) -> AbstractContextManager[object]:
+    """Context manager: CUDA stream for the copies, which waits for all work enqueued so far."""
     if device.type != "cuda":
         return nullcontext()
     stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]

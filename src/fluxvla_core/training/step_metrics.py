@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.training.distributed import World, texts, total
+from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_sum
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class StepMetrics:
         # Only now has the device done the steps.
         times, waits = self._clocked(steps, time.perf_counter())
         mean = torch.tensor([losses, norms, times, waits], dtype=torch.float64)
-        total(self.world, mean)
+        all_reduce_sum(self.world, mean)
         mean /= self.world.size
         if not bool(torch.isfinite(mean[:2]).all()):
             raise self._not_finite(steps, mean)
@@ -157,7 +157,7 @@ class StepMetrics:
                 part = torch.bucketize(ids.cpu(), ends, right=True).clamp(max=len(ends) - 1)
                 sums[0, row].index_add_(0, part, losses.double().cpu())
                 sums[1, row].index_add_(0, part, torch.ones(len(part), dtype=torch.float64))
-        summed, counts = total(self.world, sums)
+        summed, counts = all_reduce_sum(self.world, sums)
         means = summed / counts
         return [
             {name: m for name, m, n in zip(self.parts, row, count, strict=True) if n}
@@ -181,7 +181,7 @@ class StepMetrics:
                 ),
                 "",
             )
-        lines = [text for text in texts(self.world, named) if text]
+        lines = [text for text in all_gather_text(self.world, named) if text]
         return RunFailed(
             "\n".join([what, *(f"    {line}" for line in lines)]),
             cause="a learning rate that is too high, or samples with wrong or huge values",

@@ -11,12 +11,12 @@ from types import FrameType, TracebackType
 
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
-from fluxvla_core.training.distributed import World, agree, on_first
+from fluxvla_core.training.distributed import World, all_reduce_max, run_on_rank0
 
 NOTICE_S = 0.5
 """Seconds within which ranks hear of each other's signals, if steps are shorter."""
 _SECOND_S = 1.0
-_TROUBLE = 1 << 16  # no signal's number
+_CHECK_FAILED = 1 << 16  # no signal's number
 
 
 class StopRequest:
@@ -24,8 +24,8 @@ class StopRequest:
 
     The first signal asks for a stop at the end of a step, or of a batch that is validated; a second
     SIGINT more than a second later ends at once (a terminal and a launcher may both pass on the
-    first one). Ranks compare notes every few steps, often enough to notice within about half a
-    second.
+    first one). Ranks exchange their signals every few steps, often enough to notice within about
+    half a second.
 
     Args:
         check: on the first rank, raises a FluxError where all are to stop at once, with nothing
@@ -63,35 +63,35 @@ class StopRequest:
         if not self._signal:
             self._signal, self._since = number, time.monotonic()
 
-    def pace(self, step_time: float) -> None:
-        """Choose how often ranks compare notes; ``step_time`` (s) must be equal on all ranks."""
+    def set_interval(self, step_time: float) -> None:
+        """Choose every how many steps ranks synchronise; ``step_time`` (s), equal on all ranks."""
         self._every = max(1, int(NOTICE_S / step_time)) if step_time > 0 else 1
 
-    def due(self, step: int) -> bool:
-        """Whether ranks compare notes after ``step``."""
+    def is_sync_step(self, step: int) -> bool:
+        """Whether ranks exchange their signals after ``step``."""
         return self._world.size == 1 or step % self._every == 0
 
-    def wanted(self, step: int) -> int:
+    def poll(self, step: int) -> int:
         """The signal that some rank got, or 0; every rank gets the same answer."""
-        return self.asked() if self.due(step) else 0
+        return self.poll_now() if self.is_sync_step(step) else 0
 
-    def asked(self, now: bool = False) -> int:
-        """As :meth:`wanted`, at once: all ranks call it at the same place.
+    def poll_now(self, check: bool = False) -> int:
+        """As :meth:`poll`, at any step: all ranks call it at the same place.
 
         Args:
-            now: check even if that was done a moment ago.
+            check: call ``check`` even if that was done a moment ago.
 
         Raises:
             FluxError: the first rank's check failed; on every rank.
         """
-        trouble = self._trouble(now)
-        number = agree(self._world, self._signal if trouble is None else _TROUBLE)
-        if number == _TROUBLE:
-            on_first(self._world, lambda: _raise(trouble))
+        error = self._check_error(check)
+        number = all_reduce_max(self._world, self._signal if error is None else _CHECK_FAILED)
+        if number == _CHECK_FAILED:
+            run_on_rank0(self._world, lambda: _raise(error))
         return number
 
-    def _trouble(self, now: bool) -> FluxError | None:
-        if self._check is None or not (now or time.monotonic() - self._checked >= NOTICE_S):
+    def _check_error(self, force: bool) -> FluxError | None:
+        if self._check is None or not (force or time.monotonic() - self._checked >= NOTICE_S):
             return None
         self._checked = time.monotonic()
         try:
@@ -101,9 +101,9 @@ class StopRequest:
         return None
 
 
-def _raise(trouble: FluxError | None) -> str:
-    assert trouble is not None, "only the first rank checks"
-    raise trouble
+def _raise(error: FluxError | None) -> str:
+    assert error is not None, "only the first rank checks"
+    raise error
 
 
 def stopped(number: int, place: str) -> BaseException:

@@ -6,6 +6,7 @@ inherits them. Nothing here imports torch before it is used: a config is checked
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.checkpoints.lock import WorkDirLock
-    from fluxvla_core.checkpoints.parts import Stored
+    from fluxvla_core.checkpoints.shards import Stored
     from fluxvla_core.data.sampler import EpisodeShards
     from fluxvla_core.training.batches import StepPlan
     from fluxvla_core.training.distributed import World
@@ -110,9 +111,9 @@ class Strategy(TrainRunner):
             processes: that train, all on one machine.
             device_type: ``cuda`` or ``cpu``.
         """
-        from fluxvla_core.training.layout import whole
+        from fluxvla_core.training.layout import replicated_layout
 
-        return whole(model)
+        return replicated_layout(model)
 
     def unwrap_model(self, vla: nn.Module) -> nn.Module:
         """The model inside what ``_wrap_model`` returned, with the names that are saved."""
@@ -155,7 +156,7 @@ class Strategy(TrainRunner):
         Where ``clip_grad_norm`` returns None it is computed here: gradients that are not finite
         must not go unseen.
         """
-        from fluxvla_core.training.gradients import gradient_norm
+        from fluxvla_core.training.parameters import gradient_norm
 
         norm = self.clip_grad_norm()
         if norm is None:
@@ -163,15 +164,22 @@ class Strategy(TrainRunner):
         self.optimizer.step()
         return norm
 
-    def warm_up(self, batch: dict[str, Any]) -> None:
+    def before_first_step(self, batch: dict[str, Any]) -> None:
         """Called with the first batch, before the first step; must leave no trace."""
+        if type(self).warm_up is not Strategy.warm_up:
+            message = f"{type(self).__name__}.warm_up is deprecated, call it before_first_step"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            self.warm_up(batch)
+
+    def warm_up(self, batch: dict[str, Any]) -> None:
+        """Deprecated name of :meth:`before_first_step`."""
 
     def clip_grad_norm(self) -> Tensor | None:
         """Scale the gradients down to ``max_grad_norm``; their norm before, on the device.
 
         None says nothing of the norm, as where there is no ``max_grad_norm``.
         """
-        from fluxvla_core.training.gradients import clip_
+        from fluxvla_core.training.parameters import clip_
 
         return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
 
@@ -190,7 +198,7 @@ class Strategy(TrainRunner):
     ) -> Path | None:
         """Begin to save ``run_dir/checkpoints/step-…``; called on every rank.
 
-        With ``async_save`` it is there, and known to be, after :meth:`settle_saves`.
+        With ``async_save`` it is there, and known to be, after :meth:`finish_pending_save`.
 
         Args:
             run_dir: the work dir.
@@ -216,11 +224,11 @@ class Strategy(TrainRunner):
             self.progress.best_step,
         )
         if not self.saver.background:
-            self.settle_saves()
+            self.finish_pending_save()
         return path
 
-    def settle_saves(self, wait: bool = True) -> None:
-        """Learn what became of the checkpoint that is being written; called on every rank.
+    def finish_pending_save(self, wait: bool = True) -> None:
+        """Finish the pending checkpoint, if there is one: report it or raise; called on every rank.
 
         Args:
             wait: for its end; otherwise nothing happens while some rank still writes.
@@ -228,8 +236,8 @@ class Strategy(TrainRunner):
         Raises:
             RunFailed: it could not be written; the earlier ones are as they were.
         """
-        saved = self.saver.settle(wait) if self.saver is not None else None
-        if saved is None or not self.world.first:
+        saved = self.saver.finish_pending(wait) if self.saver is not None else None
+        if saved is None or not self.world.is_rank0:
             return
         from fluxvla_core.checkpoints.retention import name_best
 
@@ -252,7 +260,7 @@ class Strategy(TrainRunner):
         adapter = lora.adapter_names(self.model)
         elsewhere = {*brings.names, *adapter}
         documents: dict[str, Mapping[str, Any]] = {}
-        if self.world.first:
+        if self.world.is_rank0:
             documents |= run_documents(self.context, self.dataset, self.model)
         if self.lora is not None:
             documents[lora.CONFIG] = self.lora.for_peft(self.adapter_base)
@@ -293,11 +301,11 @@ class Strategy(TrainRunner):
         if checkpoint is None:
             return 0
         where = str(checkpoint.path)
-        saved, warnings = resuming.check_settings(
+        saved, notes = resuming.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
-        for warning in warnings if self.world.first else ():
-            self.context.reporter.warn(warning)
+        for note in notes if self.world.is_rank0 else ():
+            self.context.reporter.warn(note)
         self._load_model_state(resuming.load_weights(checkpoint, self.model, self.left_out))
         described = checkpoint.json(ckpt.OPTIMIZER_META, SavedOptimizer)
         optimizer = checkpoint.optimizer_tensors()
@@ -315,7 +323,7 @@ class Strategy(TrainRunner):
         return self.progress.step
 
     def _schedule_state(self, saved: Mapping[str, Any]) -> Any:
-        """Where the schedule goes on: of epochs, at the same sample if steps are larger or smaller.
+        """State of the schedule at resuming; if the step size changed, at the same sample.
 
         The rate follows the part of the run that is done. A count of the old steps would be past
         the end of fewer, larger ones, and train the rest at a rate of 0.
@@ -330,9 +338,9 @@ class Strategy(TrainRunner):
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
         """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
-        from fluxvla_core.training.weights import put_model_tensors
+        from fluxvla_core.training.weights import load_full_tensors
 
-        put_model_tensors(self.model, state)
+        load_full_tensors(self.model, state)
 
     def _load_optimizer_state(self, state: dict[str, Any]) -> bool:
         """Take an optimizer's state in the form of its ``state_dict``; whether it was taken."""
@@ -354,13 +362,13 @@ class Strategy(TrainRunner):
     def load_optimizer_tensors(
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
-        """The inverse of :meth:`optimizer_tensors`, by way of :meth:`_load_optimizer_state`."""
+        """The inverse of :meth:`optimizer_tensors`, with :meth:`_load_optimizer_state`."""
         from fluxvla_core.training.optimizer_state import torch_state
 
         state = torch_state(self.model, self.optimizer, tensors, described, where)
         return self._load_optimizer_state(state)
 
-    # What the run knows of itself.
+    # Properties of the run.
 
     @property
     def world(self) -> World:

@@ -61,12 +61,12 @@ class Trainer:
         """Give the runner what its steps and its checkpoints need, and the dataset its seed."""
         runner = self._runner
         options, world, context = runner.options, runner.world, runner.context
-        if not world.first:
+        if not world.is_rank0:
             runner.hooks = HookCaller(context)
         runner.dataset = dataset
         take_seed(dataset, options.seed)
         warnings = Dataset.adapt(dataset).warnings()
-        for warning in warnings if world.first else ():
+        for warning in warnings if world.is_rank0 else ():
             context.reporter.warn(warning)
         where = context.where("train_dataloader.shuffle_episodes")
         shards = episode_shards(dataset, runner.loader_options.shuffle_episodes, where)
@@ -102,9 +102,9 @@ class Trainer:
 
     def _start_metrics(self, dataset: Any) -> None:
         runner = self._runner
-        if runner.world.first:
+        if runner.world.is_rank0:
             progress = runner.progress
-            reported = progress.step - (progress.unvalidated is not None)
+            reported = progress.step - (progress.pending_validation is not None)
             runner.metric.start(reported, runner.context.config)
         self._window = StepMetrics(runner.world, Dataset.adapt(dataset).parts)
 
@@ -119,7 +119,7 @@ class Trainer:
             sampler,
             runner.loader_options.per_device_num_workers,
             pin_memory=world.device.type == "cuda",
-            reporter=runner.context.reporter if world.first else None,
+            reporter=runner.context.reporter if world.is_rank0 else None,
             seed=runner.options.seed,
         )
         return iter(loader)
@@ -131,16 +131,16 @@ class Trainer:
             The signal that asked for a stop, 0 if none did.
         """
         runner, every = self._runner, self._runner.options.log_iter_interval
-        stopped = self._catch_up()
+        stopped = self._run_pending_validation()
         over = stopped or finished() or self._stops_early()
         if not over:
-            self._look_ahead()
+            self._peek_first_batch()
         self._window.restart_clock()
         while not over:
             step = runner.progress.step + 1
             runner.hooks.call("before_step", step=step)
             self._step(step)
-            stopped, last = self._stop.wanted(step), finished()
+            stopped, last = self._stop.poll(step), finished()
             save = due() or last
             validate = self._validates(save, last)
             log = step == 1 or step % every == 0
@@ -151,13 +151,13 @@ class Trainer:
                 if validate and stopped:
                     # A stop request is often followed by a kill. The resumed run makes up for the
                     # validation, and reports this step then.
-                    runner.progress.unvalidated = records.pop()
+                    runner.progress.pending_validation = records.pop()
                 self._report(records)
                 save = save or better or bool(stopped) or self._stops_early()
             if save:
                 self.save()
-            elif self._stop.due(step):
-                runner.settle_saves(wait=False)
+            elif self._stop.is_sync_step(step):
+                runner.finish_pending_save(wait=False)
             over = stopped or last or self._stops_early()
         return stopped
 
@@ -192,7 +192,7 @@ class Trainer:
         runner = self._runner
         steps = self._window.fetch()
         runner.progress.loss = steps[-1].loss
-        self._stop.pace(sum(s.step_time for s in steps) / len(steps))
+        self._stop.set_interval(sum(s.step_time for s in steps) / len(steps))
         records = [as_metrics(step) for step in steps]
         if runner.flops is not None:
             for record in records:
@@ -205,7 +205,7 @@ class Trainer:
     def _report(self, records: list[dict[str, Any]]) -> None:
         """Give the records to the metric, and the newest one to people and hooks."""
         runner = self._runner
-        if not (runner.world.first and records):
+        if not (runner.world.is_rank0 and records):
             return
         for record in records:
             runner.metric.commit(**record)
@@ -220,9 +220,9 @@ class Trainer:
         runner, progress = self._runner, self._runner.progress
         if progress.saved == progress.step:
             return
-        runner.settle_saves()
-        self._stop.asked(now=True)
-        if runner.world.first:
+        runner.finish_pending_save()
+        self._stop.poll_now(check=True)
+        if runner.world.is_rank0:
             runner.metric.sync()
         runner.save_checkpoint(
             runner.context.work_dir, progress.step, progress.cursor.epoch, progress.loss
@@ -237,17 +237,17 @@ class Trainer:
         if close is not None:
             close()
 
-    def _look_ahead(self) -> None:
-        """Pass the first batch to what needs one before the first step."""
+    def _peek_first_batch(self) -> None:
+        """Show the first batch to the FLOP counter and to the strategy, before the first step."""
         runner = self._runner
         first = next(self._batches)
         self._batches = chain([first], self._batches)
         shown = to_device(first, runner.world.device)
         if runner.flops is not None and runner.forward_arguments is not None:
             trouble = runner.flops.count(runner.forward_arguments(shown))
-            if trouble is not None and runner.world.first:
+            if trouble is not None and runner.world.is_rank0:
                 runner.context.reporter.warn(f"mfu is not reported: {trouble}")
-        runner.warm_up(shown)
+        runner.before_first_step(shown)
 
     # Validation, and what follows from it.
 
@@ -259,11 +259,11 @@ class Trainer:
 
     def _stops_early(self) -> bool:
         patience = self._runner.options.early_stop_patience
-        return patience is not None and self._runner.progress.worse >= patience
+        return patience is not None and self._runner.progress.bad_validations >= patience
 
-    def _catch_up(self) -> int:
-        """Make up for the validation that a stop left out; the signal that ended it, 0 if none."""
-        runner, record = self._runner, self._runner.progress.unvalidated
+    def _run_pending_validation(self) -> int:
+        """Run the validation that a stop left out; the signal that ended it, 0 if none."""
+        runner, record = self._runner, self._runner.progress.pending_validation
         if record is None:
             return 0
         better = False
@@ -271,12 +271,12 @@ class Trainer:
             stopped, better = self._validate(record)
             if stopped:
                 return stopped
-        runner.progress.unvalidated = None
+        runner.progress.pending_validation = None
         self._report([record])
         if better:
             # There already, unless it was another work dir's.
             self.save()
-            if runner.world.first:
+            if runner.world.is_rank0:
                 name_best(runner.context.work_dir, runner.progress.step)
         return 0
 
@@ -289,10 +289,10 @@ class Trainer:
             # In a process group the other ranks may know nothing of it, or wait in an exchange,
             # and sharding may have left the model half gathered.
             if save and (isinstance(error, NotFinite) or not dist.is_initialized()):
-                runner.progress.unvalidated = records.pop()
+                runner.progress.pending_validation = records.pop()
                 self._report(records)
                 self.save()
-                runner.settle_saves()
+                runner.finish_pending_save()
             raise
 
     def _validate(self, record: dict[str, Any]) -> tuple[int, bool]:
@@ -307,14 +307,14 @@ class Trainer:
             runner.vla, runner._training_step, runner.ema, runner.progress.step
         )
         if loss is None:
-            return self._stop.asked(), False
+            return self._stop.poll_now(), False
         record["val_loss"] = loss
         better = runner.progress.validated(loss)
-        if self._stops_early() and runner.world.first:
+        if self._stops_early() and runner.world.is_rank0:
             progress = runner.progress
             runner.context.reporter.info(
                 f"no better validation loss than {progress.best:.6g} (step "
-                f"{progress.best_step}) in {progress.worse} validations: training ends"
+                f"{progress.best_step}) in {progress.bad_validations} validations: training ends"
             )
         self._window.restart_clock()
         return 0, better

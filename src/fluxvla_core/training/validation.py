@@ -16,7 +16,7 @@ from fluxvla_core.data.loader import make_loader
 from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.errors import ConfigError, RunFailed
 from fluxvla_core.training.batches import loader_source, to_device
-from fluxvla_core.training.distributed import World, total
+from fluxvla_core.training.distributed import World, all_reduce_sum
 from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.options import LoaderOptions
 from fluxvla_core.training.rng import rank_seed, rng_state, seed_all, set_rng_state, take_seed
@@ -96,10 +96,12 @@ class Validation:
             # Every rank has as many batches, so all ask equally often.
             for batch in self._loader:
                 losses.append(loss_of_batch(to_device(batch, self._world.device)))
-                if self._stop.asked():
+                if self._stop.poll_now():
                     return None
             found = torch.stack(losses).double().cpu()
-        summed = total(self._world, torch.stack([found.sum(), torch.tensor(float(len(found)))]))
+        summed = all_reduce_sum(
+            self._world, torch.stack([found.sum(), torch.tensor(float(len(found)))])
+        )
         mean = float(summed[0] / summed[1])
         if not torch.isfinite(summed).all():
             raise NotFinite(
@@ -112,7 +114,7 @@ class Validation:
 
 @contextmanager
 def evaluating(model: nn.Module, ema: Ema | None, seed: int) -> Iterator[None]:
-    """Inside, the model evaluates: with averaged weights if kept, and the same draws every time."""
+    """Context manager: the model in eval mode, with EMA weights if kept and a fixed seed."""
     drawn = rng_state()
     seed_all(seed)
     model.eval()

@@ -12,13 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
 from fluxvla_core.checkpoints.foreign import foreign_folder
-from fluxvla_core.checkpoints.parts import Stored
-from fluxvla_core.checkpoints.tensors import check_names, like, read_tensors
+from fluxvla_core.checkpoints.shards import Stored
+from fluxvla_core.checkpoints.tensors import check_names, read_tensors, shard_like
+from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
-from fluxvla_core.training.distributed import World, on_first
+from fluxvla_core.training.distributed import World, run_on_rank0
 from fluxvla_core.training.formats import is_foreign, read_foreign
 from fluxvla_core.training.model import frozen_sources, set_frozen_source
 
@@ -91,12 +93,12 @@ def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, 
     return {name: tensor for name, tensor in state.items() if name not in skipped}
 
 
-def put_model_tensors(model: nn.Module, tensors: Mapping[str, Tensor | Stored]) -> None:
-    """Put full ``tensors``, which fit, into ``model``: each rank's part where it is sharded."""
+def load_full_tensors(model: nn.Module, tensors: Mapping[str, Tensor | Stored]) -> None:
+    """Load full ``tensors`` of the right names and sizes into ``model``, which may be sharded."""
     state = weights_by_name(model)
     # strict=False only for what is left out of checkpoints: names and sizes have been checked.
     model.load_state_dict(
-        {name: like(state[name].detach(), tensor) for name, tensor in tensors.items()},
+        {name: shard_like(state[name].detach(), tensor) for name, tensor in tensors.items()},
         strict=False,
     )
 
@@ -155,6 +157,25 @@ def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
         )
 
 
+def model_of(checkpoint: Checkpoint) -> nn.Module:
+    """The model that a checkpoint's config describes, without the checkpoint's weights.
+
+    A tokenizer of the model's own is that of the checkpoint's processors.
+
+    Raises:
+        CheckpointError: the config has no section ``model``.
+        ConfigError, PluginError: the model cannot be built here.
+    """
+    config = checkpoint.config()
+    if "model" not in config:
+        raise CheckpointError(
+            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
+        )
+    (table,) = redirected([config["model"]], checkpoint.processors)
+    built: nn.Module = build_vla_from_cfg(table)
+    return built
+
+
 def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     """Put a checkpoint's weights (the averaged ones if kept) into a freshly built ``model``.
 
@@ -176,7 +197,7 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     if checkpoint.has(EMA):
         tensors |= _by_all_names(model, checkpoint.tensors(EMA))
     check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
-    put_model_tensors(model, tensors)
+    load_full_tensors(model, tensors)
     if options is not None:
         lora.merge_(model)
         set_frozen_source(model, None)
@@ -276,7 +297,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
 def _put_all(model: nn.Module, tensors: Mapping[str, Tensor | Stored], path: Path) -> Path:
     brings = left_out(model).names - set(tensors)
     check_names(tensors, weights_by_name(model, brings), "the weights", str(path))
-    put_model_tensors(model, tensors)
+    load_full_tensors(model, tensors)
     return path
 
 
@@ -293,7 +314,7 @@ def start_training_from(
     if place is None:
         return
     # Found once: ranks that looked one after the other could find different ones.
-    found = start_from(model, on_first(world, lambda: exact_place(place)))
+    found = start_from(model, run_on_rank0(world, lambda: exact_place(place)))
     if adapter:
         set_frozen_source(model, str(found))
 

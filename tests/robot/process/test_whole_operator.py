@@ -17,6 +17,7 @@ import pytest
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, FluxError, NotReady, SafetyStop
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
+from fluxvla_core.robot.recording.recorded import find_recordings, open_recording
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.contracts.frame import Frame, RobotFrame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady
 from fluxvla_core.robot.runner import BaseInferenceRunner
@@ -71,8 +72,14 @@ class OldArm(Operator):
 
     def _frame(self, image):
         now = time.monotonic()
-        return Frame(self._state.copy(), {"front": image, "unused": image},
-                     {"state": now, "front": now})
+        images, stamps = {"front": image, "unused": image}, {"state": now, "front": now}
+        if self._fault != "rover":
+            return Frame(self._state.copy(), images, stamps)
+        depth = np.full((24, 32), self._frames * 0.01, np.float32)
+        depth[0, 0] = np.nan
+        base = np.array([self._frames * 0.1, -0.5])
+        return RobotFrame(self._state.copy(), images, {**stamps, "front_depth": now},
+                          {"front": depth, "unused": depth}, base)
 
     def send_action(self, action):
         self._log("sent", time.monotonic(), *action)
@@ -284,6 +291,30 @@ def test_an_episode_with_pictures_of_the_process_that_commands(tmp_path, module)
     assert counts == sorted(set(counts))
     assert run.runner.episode_facts()["frames"] == counts[-1]
     assert len(run.log("sent")) >= 60
+
+
+def test_depth_and_base_speed_are_recorded(tmp_path, module):
+    run = Run(tmp_path, fault="rover", record=str(tmp_path / "records"))
+    assert run.runner.divided
+
+    run.runner.run()
+
+    (place,) = find_recordings(tmp_path / "records")
+    recorded = open_recording(place)
+    seen = [event for event in recorded.events if event["event"] == "observation"]
+    assert set(recorded.depths) == {"front"}
+    assert len(seen) >= len(run.policy.seen) > 2
+    for event in seen:
+        stamps, images, depths = (
+            event["stamps"],
+            recorded.pictures["front"],
+            recorded.depths["front"],
+        )
+        count = int(images.read(images.newest(stamps["front"]))[0, 0, 0])
+        assert event["base"] == [count * 0.1, -0.5]
+        metres = depths.read(depths.newest(stamps["front_depth"]))
+        assert np.isnan(metres[0, 0])
+        np.testing.assert_allclose(metres[1:], count * 0.01, atol=1e-6)
 
 
 def test_a_constructor_that_connects_is_called_in_the_control_process_alone(tmp_path, module):

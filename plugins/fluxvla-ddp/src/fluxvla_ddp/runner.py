@@ -70,11 +70,11 @@ class DDPTrainRunner(BaseTrainRunner):
 
     def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
         """Everything on every process; the buckets that gradients are exchanged in are theirs."""
-        from fluxvla_core.training import whole
+        from fluxvla_core.training import replicated_layout
 
-        return whole(model)
+        return replicated_layout(model)
 
-    def warm_up(self, batch: dict[str, Any]) -> None:
+    def before_first_step(self, batch: dict[str, Any]) -> None:
         """Let torch rearrange its buckets, and learn a static graph, before the first step.
 
         DistributedDataParallel orders its buckets by how gradients arrived in its first backward

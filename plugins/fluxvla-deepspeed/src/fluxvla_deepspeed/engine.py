@@ -63,7 +63,7 @@ def start(
 
 
 def gathered(parameters: Iterable[nn.Parameter], stage: int) -> AbstractContextManager[object]:
-    """Inside, the parameters are whole, and what the first rank changes is everybody's after it."""
+    """Context manager: gathers the parameters; what rank 0 changes is then scattered to all."""
     if stage < 3:
         return nullcontext()
     import deepspeed

@@ -1,4 +1,4 @@
-"""What one process keeps of a model under ZeRO, as DeepSpeed 0.19 does it.
+"""Memory of one process under ZeRO, as DeepSpeed 0.19 implements it.
 
 Weights, gradients and their sums are fp32 here in every stage, also in mixed precision.
 """
@@ -27,7 +27,7 @@ PREFETCHED = 50_000_000
 
 
 def partitioned(model: nn.Module, stage: int, processes: int) -> Layout:
-    """What one of ``processes`` keeps of ``model`` in ZeRO's ``stage``."""
+    """The layout of ``model`` on one of ``processes`` in ZeRO's ``stage``."""
     return _split(model, processes) if stage == 3 else _flat(model, stage, processes)
 
 

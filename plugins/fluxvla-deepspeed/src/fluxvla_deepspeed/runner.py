@@ -107,11 +107,11 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         """
         import torch
 
-        from fluxvla_core.training import share_buffers
+        from fluxvla_core.training import broadcast_buffers
 
         self.vla.step()
         # DeepSpeed leaves buffers to every process.
-        share_buffers(self.world, self.model)
+        broadcast_buffers(self.world, self.model)
         return torch.as_tensor(self.vla.get_global_grad_norm(), device=self.world.device).float()
 
     def _trained(self) -> dict[str, nn.Parameter]:
@@ -127,12 +127,12 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
             return super().model_tensors()
         with gathered(self.model.parameters(), self.zero_stage):
             state = super().model_tensors()
-            return {name: on_host(tensor, self.world.first) for name, tensor in state.items()}
+            return {name: on_host(tensor, self.world.is_rank0) for name, tensor in state.items()}
 
     def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         from fluxvla_deepspeed.engine import read_state
 
-        tensors = read_state(self.vla, self.optimizer, self._trained(), self.world.first)
+        tensors = read_state(self.vla, self.optimizer, self._trained(), self.world.is_rank0)
         groups = [
             {**{k: v for k, v in group.items() if k != "params"}, "params": names}
             for group, names in zip(self.optimizer.param_groups, self._groups, strict=True)

@@ -1,4 +1,4 @@
-"""What one process keeps of a model that is split by ``fully_shard``, as torch 2.13 does it."""
+"""Memory of one process under ``fully_shard``, as torch 2.13 implements it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def sharded(
     compute_dtype: torch.dtype | None,
     accumulates: bool,
 ) -> Layout:
-    """What the first of ``parts`` processes keeps, which has the largest shards.
+    """The layout of the first of ``parts`` processes, which has the largest shards.
 
     A weight is cut along its first dimension, which is filled up to a multiple of ``parts``. While
     gradients are accumulated, they are kept whole: they are exchanged once.

@@ -128,9 +128,9 @@ class FSDPTrainRunner(BaseTrainRunner):
         return super().sync_gradients(last)
 
     def optimizer_step(self) -> Tensor | None:
-        from fluxvla_core.training import share_buffers
+        from fluxvla_core.training import broadcast_buffers
 
         norm = super().optimizer_step()
         # fully_shard leaves buffers to every process.
-        share_buffers(self.world, self.model)
+        broadcast_buffers(self.world, self.model)
         return norm

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError
 from fluxvla_gr00t.context import Context
 from fluxvla_gr00t.embodiments import ActionEncoder, EmbodimentMLP
-from fluxvla_gr00t.transformer import ContextBlock, DiT, Kept
+from fluxvla_gr00t.transformer import ContextBlock, DiT, KVCache
 
 _BUCKETS = 1000
 _CHOSEN = {"action_encoder": ("actions", "joined", "out"), "action_decoder": ("hidden", "out")}
@@ -43,8 +43,8 @@ class GR00TActionHead(nn.Module):
         hidden_dim: width inside the encoder of states and the decoder of actions.
         context_layers, context_heads: of the transformer over the context.
         future_tokens: learned tokens between state and actions; 0 in N1.7.
-        attend_text_every: of the blocks that attend to the context every so-many-th sees the words,
-            beginning with the first, and the others the pictures; 2 in N1.7. None: all see all.
+        attend_text_every: of the blocks that attend to the context, every so-many-th attends to the
+            text, beginning with the first, the others to the images; 2 in N1.7. None: all to all.
         max_steps: longest chunk that there are positions for.
         num_steps: Euler steps from noise to actions.
         dropout: 0.2, as published.
@@ -125,20 +125,20 @@ class GR00TActionHead(nn.Module):
             if table is not None:
                 nn.init.normal_(table.weight, std=0.02)
 
-    def read(self, context: Context) -> Context:
-        """The context with its features as the diffusion transformer attends to them."""
+    def encode_context(self, context: Context) -> Context:
+        """The context with the features that the diffusion transformer attends to."""
         features = self.context_norm(context.features)
         mask = None if self.attend_padding else context.mask
         for block in self.context_blocks:
             features = block(features, mask)
-        return Context(features, context.mask, context.pictures)
+        return Context(features, context.mask, context.image_mask)
 
     def encode_states(self, states: Tensor, ids: Tensor) -> Tensor:
         """``(B, S)`` and ``ids`` ``(B,)`` -> tokens ``(B, 1, W)``."""
         tokens = self.state_encoder(states[:, None], ids)
         if self.training and self.state_dropout > 0:
-            kept = torch.rand(len(tokens), 1, 1, device=tokens.device) >= self.state_dropout
-            tokens = tokens * kept.to(tokens.dtype)
+            keep = torch.rand(len(tokens), 1, 1, device=tokens.device) >= self.state_dropout
+            tokens = tokens * keep.to(tokens.dtype)
         return tokens
 
     def velocity(
@@ -148,14 +148,14 @@ class GR00TActionHead(nn.Module):
         context: Context,
         state: Tensor,
         ids: Tensor,
-        kept: list[Kept] | None = None,
+        cache: list[KVCache] | None = None,
     ) -> Tensor:
         """The velocity ``(B, T, D)`` at ``x`` ``(B, T, D)``.
 
         Args:
             steps: ``(B,)`` int64, the time in thousandths.
-            context: what ``read`` gave; state: what ``encode_states`` gave; ids: ``(B,)`` int64.
-            kept: what the blocks keep of the context from one step to the next.
+            context: of ``encode_context``; state: of ``encode_states``; ids: ``(B,)`` int64.
+            cache: the blocks' KV caches of the context, shared by all steps.
         """
         actions = self.action_encoder(x, steps, ids)
         actions = actions + self.positions.weight[: x.shape[1]].to(actions.dtype)
@@ -164,8 +164,8 @@ class GR00TActionHead(nn.Module):
             future = self.future_tokens.weight.to(actions.dtype)
             tokens.insert(1, future.expand(len(x), -1, -1))
         joined = torch.cat(tokens, dim=1)
-        found = self.dit(joined, steps, context.features, self._masks(context), kept)
-        return self.action_decoder(found[:, -x.shape[1] :], ids)
+        hidden = self.dit(joined, steps, context.features, self._masks(context), cache)
+        return self.action_decoder(hidden[:, -x.shape[1] :], ids)
 
     def errors(
         self,
@@ -176,22 +176,22 @@ class GR00TActionHead(nn.Module):
         noise: Tensor,
         time: Tensor,
     ) -> Tensor:
-        """Squared errors of the velocity ``(B * K, T, ori_action_dim)``, a sample's draws in a row.
+        """Squared errors of the velocity, ``(B * K, T, ori_action_dim)``, K noise samples each.
 
         Args:
             states: ``(B, S)``; ids: ``(B,)`` int64; actions: ``(B, T, D)`` normalised.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1.
         """
-        draws = noise.shape[1]
-        read = self.read(context).repeated(draws)
-        state = self.encode_states(states, ids).repeat_interleave(draws, 0)
+        repeats = noise.shape[1]
+        encoded = self.encode_context(context).repeat_interleave(repeats)
+        state = self.encode_states(states, ids).repeat_interleave(repeats, 0)
         clean = actions[:, None].expand_as(noise)
         t = time[..., None, None]
         mixed = ((1 - t) * noise + t * clean).flatten(0, 1)
         target = (clean - noise).flatten(0, 1)
         steps = (time.flatten() * _BUCKETS).long()
-        found = self.velocity(mixed, steps, read, state, ids.repeat_interleave(draws, 0))
-        return (found - target)[..., : self.loss_dim].float().square()
+        velocity = self.velocity(mixed, steps, encoded, state, ids.repeat_interleave(repeats, 0))
+        return (velocity - target)[..., : self.loss_dim].float().square()
 
     def loss(self, errors: Tensor, masks: Tensor) -> Tensor:
         """The mean of ``errors`` ``(B * K, T, D)``, where ``masks`` ``(B, T)`` is 0 counted as 0.
@@ -213,54 +213,55 @@ class GR00TActionHead(nn.Module):
     ) -> Tensor:
         """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps.
 
-        With ``guide`` to one that goes on from another; that takes a backward pass for each step.
+        ``guide`` makes it continue another chunk; that takes a backward pass for each step.
         """
         if guide is None:
             return self.denoise(self.observe(context, states, ids), noise, self.step_tables())
-        read = self.read(context)
+        encoded = self.encode_context(context)
         state = self.encode_states(states, ids)
-        kept = [Kept() for _ in range(len(self.dit.blocks) // 2)]
+        cache = [KVCache() for _ in range(len(self.dit.blocks) // 2)]
         x = noise
         for step in range(self.num_steps):
-            share = step / self.num_steps
-            steps = torch.full((len(x),), int(share * _BUCKETS), device=x.device)
-            at = partial(self.velocity, steps=steps, context=read, state=state, ids=ids, kept=kept)
-            found, pull = guide.pull(partial(_estimate, at, share), x, share)
-            x = x + (found - x) / (self.num_steps - step) + pull / self.num_steps
+            t = step / self.num_steps
+            steps = torch.full((len(x),), int(t * _BUCKETS), device=x.device)
+            velocity = partial(
+                self.velocity, steps=steps, context=encoded, state=state, ids=ids, cache=cache
+            )
+            clean, pull = guide.pull(partial(_estimate, velocity, t), x, t)
+            x = x + (clean - x) / (self.num_steps - step) + pull / self.num_steps
         return guide.freeze(x)
 
     def observe(self, context: Context, states: Tensor, ids: Tensor) -> dict[str, Tensor]:
-        """What every integration step needs: the state's token, and those between it and the
-        actions (``before``), the blocks' keys and values of the context, masks, and the weights of
-        the embodiments ``ids`` ``(B,)`` int64.
+        """What every integration step needs: state and future tokens (``before``), the KV cache of
+        the context, masks, and the weights of the embodiments ``ids`` ``(B,)`` int64.
         """
-        read = self.read(context)
+        encoded = self.encode_context(context)
         before = self.encode_states(states, ids)
         if self.future_tokens is not None:
             future = self.future_tokens.weight.to(before.dtype)
             before = torch.cat([before, future.expand(len(before), -1, -1)], dim=1)
-        found = {"before": before}
-        for pair, mask in enumerate(self._masks(read)):
-            kept = self.dit.blocks[2 * pair].attention.keep(read.features)
-            assert kept.key is not None
-            assert kept.value is not None
-            found |= {f"key.{pair}": kept.key, f"value.{pair}": kept.value}
+        tensors = {"before": before}
+        for pair, mask in enumerate(self._masks(encoded)):
+            cache = self.dit.blocks[2 * pair].attention.cache_context(encoded.features)
+            assert cache.key is not None
+            assert cache.value is not None
+            tensors |= {f"key.{pair}": cache.key, f"value.{pair}": cache.value}
             if mask is not None:
-                free = torch.zeros(mask.shape, dtype=kept.key.dtype, device=mask.device)
-                found[f"mask.{pair}"] = free.masked_fill(~mask, float("-inf"))
+                zeros = torch.zeros(mask.shape, dtype=cache.key.dtype, device=mask.device)
+                tensors[f"mask.{pair}"] = zeros.masked_fill(~mask, float("-inf"))
         for part, names in _CHOSEN.items():
             module = self.get_submodule(part)
             for name in names:
                 weight, bias = module.get_submodule(name).chosen(ids)
-                found |= {f"{part}.{name}.weight": weight, f"{part}.{name}.bias": bias}
-        return found
+                tensors |= {f"{part}.{name}.weight": weight, f"{part}.{name}.bias": bias}
+        return tensors
 
     def denoise(
         self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
     ) -> Tensor:
         """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
         pairs = len(self.dit.blocks) // 2
-        kept = [Kept(seen[f"key.{pair}"], seen[f"value.{pair}"]) for pair in range(pairs)]
+        cache = [KVCache(seen[f"key.{pair}"], seen[f"value.{pair}"]) for pair in range(pairs)]
         masks = [seen.get(f"mask.{pair}") for pair in range(pairs)]
         encode, decode = (
             {n: (seen[f"{part}.{n}.weight"], seen[f"{part}.{n}.bias"]) for n in _CHOSEN[part]}
@@ -271,14 +272,14 @@ class GR00TActionHead(nn.Module):
             actions = self.action_encoder.of(x, tables["waves"][step], encode)
             actions = actions + self.positions.weight[:count].to(actions.dtype)
             joined = torch.cat([seen["before"], actions], dim=1)
-            found = self.dit.step(joined, tables, step, kept, masks)
-            x = x + self.action_decoder.of(found[:, -count:], decode) / self.num_steps
+            hidden = self.dit.step(joined, tables, step, cache, masks)
+            x = x + self.action_decoder.of(hidden[:, -count:], decode) / self.num_steps
         return x
 
     def step_tables(self) -> dict[str, Tensor]:
         """``waves`` ``(K, W)``, and what ``DiT.step_tables`` has: of the times of all steps."""
-        shares = [int(step / self.num_steps * _BUCKETS) for step in range(self.num_steps)]
-        steps = torch.tensor(shares).to(self.positions.weight.device)
+        thousandths = [int(step / self.num_steps * _BUCKETS) for step in range(self.num_steps)]
+        steps = torch.tensor(thousandths).to(self.positions.weight.device)
         return {"waves": self.action_encoder.waves(steps), **self.dit.step_tables(steps)}
 
     def fsdp_units(self) -> list[nn.Module]:
@@ -286,18 +287,18 @@ class GR00TActionHead(nn.Module):
         return [*self.context_blocks, *self.dit.blocks]
 
     def _masks(self, context: Context) -> list[Tensor | None]:
-        """What of the context each block sees that attends to it."""
+        """The attention mask of each block that attends to the context."""
         pairs = len(self.dit.blocks) // 2
         if self.attend_text_every is None:
             return [None if self.attend_padding else context.mask] * pairs
-        words, pictures = context.mask & ~context.pictures, context.mask & context.pictures
+        text, images = context.mask & ~context.image_mask, context.mask & context.image_mask
         every = self.attend_text_every
-        return [pictures if pair % every else words for pair in range(pairs)]
+        return [images if pair % every else text for pair in range(pairs)]
 
 
-def _estimate(velocity: Any, share: float, x: Tensor) -> Tensor:
-    """The clean chunk behind ``x`` at time ``share``."""
-    return x + (1 - share) * velocity(x)
+def _estimate(velocity: Any, t: float, x: Tensor) -> Tensor:
+    """The clean chunk behind ``x`` at time ``t``."""
+    return x + (1 - t) * velocity(x)
 
 
 def _check(**numbers: tuple[int, int, int | None]) -> None:

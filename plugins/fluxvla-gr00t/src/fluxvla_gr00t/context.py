@@ -1,4 +1,4 @@
-"""What a backbone hands to the action head."""
+"""``Context``: the hidden states that a backbone hands to the action head."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Context:
-    """Features of pictures and words.
+    """Hidden states of image and text tokens.
 
     Args:
         features: ``(B, L, C)``.
-        mask: ``(B, L)`` bool, False on padding and on the places of absent pictures.
-        pictures: ``(B, L)`` bool, True on the places of pictures.
+        mask: ``(B, L)`` bool, False on padding and on the tokens of absent images.
+        image_mask: ``(B, L)`` bool, True on image tokens.
     """
 
     features: Tensor
     mask: Tensor
-    pictures: Tensor
+    image_mask: Tensor
 
-    def repeated(self, times: int) -> Context:
-        """Every row ``times`` times, one after the other."""
+    def repeat_interleave(self, repeats: int) -> Context:
+        """Each sample ``repeats`` times in a row."""
         return Context(
-            self.features.repeat_interleave(times, 0),
-            self.mask.repeat_interleave(times, 0),
-            self.pictures.repeat_interleave(times, 0),
+            self.features.repeat_interleave(repeats, 0),
+            self.mask.repeat_interleave(repeats, 0),
+            self.image_mask.repeat_interleave(repeats, 0),
         )

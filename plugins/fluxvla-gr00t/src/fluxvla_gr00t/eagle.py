@@ -1,4 +1,4 @@
-"""Eagle 2.5, what GR00T N1.5 sees and reads with: SigLIP2, a linear layer and layers of Qwen3."""
+"""Eagle 2.5, the vision-language model of GR00T N1.5: SigLIP2, a linear layer, layers of Qwen3."""
 
 from __future__ import annotations
 
@@ -7,24 +7,28 @@ from transformers import Qwen3Config, Qwen3Model, SiglipVisionConfig, SiglipVisi
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_gr00t.context import Context
-from fluxvla_gr00t.places import check_tokens, fill_places, seen_places
+from fluxvla_gr00t.image_tokens import (
+    check_image_token,
+    image_token_positions,
+    merge_image_features,
+)
 
 
 class EagleBackbone(nn.Module):
-    """Pictures and tokens to features; the defaults are those of GR00T N1.5.
+    """Images and tokens to hidden states; the defaults are those of GR00T N1.5.
 
     The vision tower is SigLIP2's without its pooling head, the language model Qwen3-1.7B's first
     layers and its last norm. Weights of the published model that nothing here reads (the pooling
     head, the output layer over words) are not in it.
 
     Args:
-        image_size, patch_size: pixels of a picture's side and of a patch's; a picture takes
-            ``(image_size / patch_size)^2`` places between the words: 256.
+        image_size, patch_size: pixels of an image's side and of a patch's; an image takes
+            ``(image_size / patch_size)^2`` tokens of the prompt: 256.
         vision_dim, vision_layers, vision_heads, vision_mlp: the vision tower.
         text_dim, text_layers, text_heads, text_kv_heads, text_head_dim, text_mlp, vocabulary: the
             language model; ``text_layers`` is the published ``select_layer``.
         rope_theta: base of its rotary positions.
-        picture_token: the token that stands for a part of a picture, ``<IMG_CONTEXT>``.
+        picture_token: the token that stands for a part of an image, ``<IMG_CONTEXT>``.
     """
 
     def __init__(
@@ -51,11 +55,11 @@ class EagleBackbone(nn.Module):
                 f"EagleBackbone: image_size {image_size} is not a multiple of patch_size "
                 f"{patch_size}"
             )
-        check_tokens("EagleBackbone", picture_token, vocabulary)
+        check_image_token("EagleBackbone", picture_token, vocabulary)
         self.out_dim = text_dim
         self.image_size = image_size
         self.picture_token = picture_token
-        self.places = (image_size // patch_size) ** 2
+        self.tokens_per_image = (image_size // patch_size) ** 2
         self.vision = SiglipVisionModel(
             SiglipVisionConfig(
                 image_size=image_size,
@@ -88,33 +92,33 @@ class EagleBackbone(nn.Module):
     def forward(
         self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor, img_masks: Tensor | None
     ) -> Context:
-        """What is seen and read, as it is behind the last layer and its norm.
+        """Hidden states of the language model after its final norm.
 
         Args:
             images: ``(B, 3N, H, W)`` normalised.
-            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the places of N pictures.
-            img_masks: ``(B, N)`` bool, False where a camera's picture is absent; None: all there.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the image tokens of N images.
+            img_masks: ``(B, N)`` bool, False where a camera's image is absent; None: all there.
 
         Raises:
-            ConfigError: pictures of another size, or tokens with places for another number.
+            ConfigError: images of another size, or image tokens of another number.
         """
         count = _count(images, self.image_size)
-        where, mask = seen_places(
-            lang_tokens, lang_masks, img_masks, self.picture_token, count, self.places
+        image_mask, mask = image_token_positions(
+            lang_tokens, lang_masks, img_masks, self.picture_token, count, self.tokens_per_image
         )
-        pictures = images.unflatten(1, (count, 3)).flatten(0, 1)
-        seen = self.connect(self.vision(pixel_values=pictures).last_hidden_state)
-        words = self.text.embed_tokens(lang_tokens)
-        embedded = fill_places(words, where, seen.flatten(0, 1))
+        pixels = images.unflatten(1, (count, 3)).flatten(0, 1)
+        features = self.connect(self.vision(pixel_values=pixels).last_hidden_state)
+        embeddings = self.text.embed_tokens(lang_tokens)
+        embeddings = merge_image_features(embeddings, image_mask, features.flatten(0, 1))
         # Positions count real tokens alone, so that padding shifts nothing.
         positions = (lang_masks.long().cumsum(1) - 1).clamp(min=0)
-        read = self.text(
-            inputs_embeds=embedded,
+        output = self.text(
+            inputs_embeds=embeddings,
             attention_mask=mask.long(),
             position_ids=positions,
             use_cache=False,
         )
-        return Context(read.last_hidden_state, mask, where)
+        return Context(output.last_hidden_state, mask, image_mask)
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
@@ -122,7 +126,7 @@ class EagleBackbone(nn.Module):
 
 
 def _count(images: Tensor, size: int) -> int:
-    """How many pictures there are in ``images`` ``(B, 3N, H, W)``."""
+    """Number of images N in ``images`` ``(B, 3N, H, W)``."""
     planes, height, width = images.shape[1:]
     if planes % 3 or (height, width) != (size, size):
         raise ConfigError(

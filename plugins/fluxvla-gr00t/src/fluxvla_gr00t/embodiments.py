@@ -1,4 +1,4 @@
-"""Layers with weights for each kind of robot: what reads states and actions, and writes actions."""
+"""Layers with weights for each embodiment: encoders of states and actions, action decoder."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ActionEncoder(nn.Module):
         return applied(functional.silu(applied(joined, chosen["joined"])), chosen["out"])
 
     def waves(self, steps: Tensor) -> Tensor:
-        """What stands for the time steps ``(B,)``: ``(B, W)`` float32."""
+        """Sinusoidal features ``(B, W)`` float32 of the time steps ``(B,)``."""
         half = self.width // 2
         powers = torch.arange(half, device=steps.device, dtype=torch.float32)
         angles = steps[:, None].float() * torch.exp(-powers * (math.log(10000.0) / half))

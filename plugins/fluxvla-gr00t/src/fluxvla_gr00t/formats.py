@@ -57,7 +57,7 @@ class GR00TN15Format(CheckpointFormat):
         Args:
             tokenizer: the folder of Eagle's tokenizer.
             robot: its embodiment tag.
-            absent: cameras without pictures; NVIDIA's takes as many as there are.
+            absent: cameras without images; NVIDIA's takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.
@@ -106,7 +106,7 @@ class GR00TN17Format(CheckpointFormat):
         Args:
             tokenizer: the folder of Qwen3-VL's tokenizer.
             robot: its embodiment tag.
-            absent: cameras without pictures; NVIDIA's takes as many as there are.
+            absent: cameras without images; NVIDIA's takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or does something that GR00T here does not.
@@ -184,7 +184,7 @@ class _Settings:
 
 
 def _head(settings: _Settings) -> dict[str, Any]:
-    """What both versions say of the head in the same words."""
+    """Settings of the head that both versions name alike."""
     dit, context = settings.table("diffusion_model_cfg"), settings.table("vl_self_attention_cfg")
     settings.require(_FIXED)
     dit.require({**_FIXED_DIT, "output_dim": settings.count("hidden_size")})

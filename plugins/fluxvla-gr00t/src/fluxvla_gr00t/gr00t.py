@@ -16,13 +16,13 @@ from fluxvla_gr00t.context import Context
 
 
 class GR00T(VLA, nn.Module):
-    """Pictures, instruction and joint state in, action chunk out: GR00T N1.5 and N1.7.
+    """Images, instruction and joint state in, action chunk out: GR00T N1.5 and N1.7.
 
     N1.5 is ``EagleBackbone`` and ``GR00TActionHead`` as they are; N1.7 is ``Qwen3VLBackbone`` and
     a ``GR00TActionHead`` with N1.7's numbers (configs/gr00t has both).
 
     Args:
-        vlm_backbone: table or module; pictures and tokens -> ``Context``.
+        vlm_backbone: table or module; images and tokens -> ``Context``.
         vla_head: table or module; its ``context_dim`` is filled in here.
         freeze_vlm_backbone: train the head alone, as NVIDIA's fine-tuning does by default.
         embodiment_id: the embodiment of batches that do not say theirs.
@@ -68,10 +68,10 @@ class GR00T(VLA, nn.Module):
 
         Args:
             images: ``(B, 3N, H, W)`` normalised; img_masks: ``(B, N)`` bool.
-            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the places of N pictures.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the image tokens of N images.
             states: ``(B, S)`` normalised; actions: ``(B, T, D)`` normalised.
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
-            noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1: K draws for each sample.
+            noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1: K noise samples each.
             embodiment_ids: ``(B,)`` int64; ``embodiment_id`` without.
         """
         context = self._context(images, lang_tokens, lang_masks, img_masks)
@@ -121,7 +121,7 @@ class GR00T(VLA, nn.Module):
     ) -> dict[str, Tensor]:
         """What the steps need of an observation, arguments as of ``predict_action``.
 
-        It checks the places of pictures and the embodiments on the host.
+        It checks image tokens and embodiments on the host.
         """
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         return self.vla_head.observe(context, states, self._ids(states, embodiment_ids))

@@ -83,7 +83,7 @@ class LeRobotGR00TFormat(CheckpointFormat):
 
         Args:
             tokenizer: the folder of the backbone's tokenizer.
-            absent: cameras without pictures; LeRobot takes as many as there are.
+            absent: cameras without images; LeRobot takes as many as there are.
 
         Raises:
             CheckpointError: it is damaged, or has steps that are not LeRobot's for GR00T.

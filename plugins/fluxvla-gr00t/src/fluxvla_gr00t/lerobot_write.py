@@ -66,7 +66,7 @@ _ACTING = {
 
 @dataclass(frozen=True)
 class Facts:
-    """What LeRobot's config and processors say of a checkpoint.
+    """Facts of a checkpoint that LeRobot's config and processors hold.
 
     Args:
         version: ``n1.5`` or ``n1.7``.
@@ -218,7 +218,7 @@ def _config(checkpoint: ForeignCheckpoint, facts: Facts) -> dict[str, Any]:
 
 
 def _packing(checkpoint: ForeignCheckpoint, facts: Facts) -> dict[str, Any]:
-    """What the steps that pack inputs of both versions have in common."""
+    """Settings that the packing steps of both versions share."""
     return {
         "state_horizon": 1,
         "action_horizon": checkpoint.horizon,
@@ -261,8 +261,8 @@ def _n15_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step],
 
 
 def _n17_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step], list[Step]]:
-    pictures, prompts = (facts.tables[n] for n in ("ResizeCropImages", "ProcessQwenPrompts"))
-    size = int(pictures.get("size", 256))
+    images, prompts = (facts.tables[n] for n in ("ResizeCropImages", "ProcessQwenPrompts"))
+    size = int(images.get("size", 256))
     pack = {
         **_packing(checkpoint, facts),
         "valid_action_horizon": checkpoint.horizon,
@@ -279,10 +279,10 @@ def _n17_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step],
         "model_name": TOKENIZERS["n1.7"],
         "image_crop_size": None,
         "image_target_size": [size, size],
-        "shortest_image_edge": pictures.get("shortest_edge"),
-        "crop_fraction": float(pictures.get("crop_fraction", 230 / 256)),
-        "use_albumentations": pictures.get("method", "bicubic") == "area",
-        "letter_box_transform": bool(pictures.get("letter_box", False)),
+        "shortest_image_edge": images.get("shortest_edge"),
+        "crop_fraction": float(images.get("crop_fraction", 230 / 256)),
+        "use_albumentations": images.get("method", "bicubic") == "area",
+        "letter_box_transform": bool(images.get("letter_box", False)),
         "device": "cpu",
     }
     before: list[Step] = [
@@ -303,20 +303,20 @@ def _n17_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step],
 
 def _tensors(checkpoint: ForeignCheckpoint, version: str) -> dict[str, Tensor]:
     """All weights under LeRobot's names, with those that nothing reads."""
-    found = {
+    tensors = {
         published_name(name, version): whole(tensor).contiguous()
         for name, tensor in checkpoint.tensors.items()
     }
     if version == "n1.7":
         text = "backbone.model.model.language_model."
-        embedding = found[f"{text}embed_tokens.weight"]
-        found[f"{text}norm.weight"] = torch.ones(embedding.shape[1], dtype=embedding.dtype)
+        embedding = tensors[f"{text}embed_tokens.weight"]
+        tensors[f"{text}norm.weight"] = torch.ones(embedding.shape[1], dtype=embedding.dtype)
     else:
         language = "backbone.eagle_model.language_model."
-        embedding = found[f"{language}model.embed_tokens.weight"]
-        found[f"{language}lm_head.weight"] = embedding.clone()
-        found |= _pooling(found)
-    return {PREFIX + name: tensor for name, tensor in found.items()}
+        embedding = tensors[f"{language}model.embed_tokens.weight"]
+        tensors[f"{language}lm_head.weight"] = embedding.clone()
+        tensors |= _pooling(tensors)
+    return {PREFIX + name: tensor for name, tensor in tensors.items()}
 
 
 def _pooling(found: Mapping[str, Tensor]) -> dict[str, Tensor]:

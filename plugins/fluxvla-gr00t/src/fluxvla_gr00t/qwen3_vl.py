@@ -1,4 +1,4 @@
-"""Qwen3-VL, what GR00T N1.7 sees and reads with (as Cosmos-Reason2-2B), cut to its first layers."""
+"""Qwen3-VL, the vision-language model of GR00T N1.7 (Cosmos-Reason2-2B): its first layers."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from transformers import Qwen3VLConfig, Qwen3VLModel
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import has_values
 from fluxvla_gr00t.context import Context
-from fluxvla_gr00t.places import check_tokens, seen_places
+from fluxvla_gr00t.image_tokens import check_image_token, image_token_positions
 
 
 class Qwen3VLBackbone(nn.Module):
-    """Pictures and tokens to features; the defaults are those of GR00T N1.7.
+    """Images and tokens to hidden states; the defaults are those of GR00T N1.7.
 
     The features are what the last layer gives, before the model's last norm, which is not in it;
     nor is the output layer over words.
 
     Args:
-        patch_size, merge: pixels of a patch's side, and patches of a place's; 16 and 2: a picture
-            of 256 x 256 pixels takes 8 x 8 places between the words.
+        patch_size, merge: pixels of a patch's side, and patches of a token's; 16 and 2: an image
+            of 256 x 256 pixels takes 8 x 8 tokens of the prompt.
         vision_dim, vision_layers, vision_heads, vision_mlp: the vision tower.
         vision_positions: learned positions of patches, a square's.
         deepstack: layers of the vision tower whose features are added to those of the language
@@ -30,7 +30,7 @@ class Qwen3VLBackbone(nn.Module):
         text_dim, text_layers, text_heads, text_kv_heads, text_head_dim, text_mlp, vocabulary: the
             language model; ``text_layers`` is the published ``select_layer``.
         rope_theta, rope_sections: its rotary positions, in time, height and width.
-        picture_token: the token that stands for a part of a picture, ``<|image_pad|>``.
+        picture_token: the token that stands for a part of an image, ``<|image_pad|>``.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Qwen3VLBackbone(nn.Module):
         picture_token: int = 151655,
     ) -> None:
         super().__init__()
-        check_tokens("Qwen3VLBackbone", picture_token, vocabulary)
+        check_image_token("Qwen3VLBackbone", picture_token, vocabulary)
         if max(deepstack, default=0) >= vision_layers or len(deepstack) > text_layers:
             raise ConfigError(
                 f"Qwen3VLBackbone: deepstack {list(deepstack)} names layers that "
@@ -111,16 +111,15 @@ class Qwen3VLBackbone(nn.Module):
     def forward(
         self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor, img_masks: Tensor | None
     ) -> Context:
-        """What is seen and read, as the last layer gives it.
+        """Hidden states of the language model's last layer.
 
         Args:
             images: ``(B, 3N, H, W)`` normalised; H and W multiples of ``patch_size * merge``.
-            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the places of N pictures.
-            img_masks: ``(B, N)`` bool, False where a camera's picture is absent; None: all there.
+            lang_tokens, lang_masks: ``(B, L)`` int64 and bool, with the image tokens of N images.
+            img_masks: ``(B, N)`` bool, False where a camera's image is absent; None: all there.
 
         Raises:
-            ConfigError: pictures of a size that does not fit, or tokens with places for another
-                number of them.
+            ConfigError: images of a size that does not fit, or image tokens of another number.
         """
         side = self.patch_size * self.merge
         planes, height, width = images.shape[1:]
@@ -129,53 +128,53 @@ class Qwen3VLBackbone(nn.Module):
                 f"Qwen3VLBackbone: images have shape {tuple(images.shape)}, (B, 3N, H, W) with H "
                 f"and W multiples of {side} expected"
             )
-        count, places = planes // 3, (height // side) * (width // side)
-        where, mask = seen_places(
-            lang_tokens, lang_masks, img_masks, self.picture_token, count, places
+        count, tokens_per_image = planes // 3, (height // side) * (width // side)
+        image_mask, mask = image_token_positions(
+            lang_tokens, lang_masks, img_masks, self.picture_token, count, tokens_per_image
         )
         if not has_values(images) and not any(p.requires_grad for p in self.parameters()):
-            # transformers places pictures by the values of tokens; of what is frozen the shape will
-            # do where there are none.
-            return Context(images.new_empty((*lang_tokens.shape, self.out_dim)), mask, where)
-        pictures = images.unflatten(1, (count, 3)).flatten(0, 1)
-        patches = pictures_to_patches(pictures, self.patch_size, self.merge)
+            # transformers finds image tokens by their values, which meta tensors do not have; for a
+            # frozen model the shape is enough.
+            return Context(images.new_empty((*lang_tokens.shape, self.out_dim)), mask, image_mask)
+        flat = images.unflatten(1, (count, 3)).flatten(0, 1)
+        patches = images_to_patches(flat, self.patch_size, self.merge)
         grid = torch.tensor([[1, height // self.patch_size, width // self.patch_size]])
-        grids = grid.expand(len(pictures), 3).to(images.device)
+        grids = grid.expand(len(flat), 3).to(images.device)
         positions, _ = self.model.get_rope_index(
             lang_tokens,
-            mm_token_type_ids=where.int(),
+            mm_token_type_ids=image_mask.int(),
             image_grid_thw=grids,
             attention_mask=lang_masks.long(),
         )
-        read = self.model(
+        output = self.model(
             input_ids=lang_tokens,
             attention_mask=mask.long(),
             position_ids=positions,
             pixel_values=patches,
             image_grid_thw=grids,
-            mm_token_type_ids=where.int(),
+            mm_token_type_ids=image_mask.int(),
             use_cache=False,
         )
-        return Context(read.last_hidden_state, mask, where)
+        return Context(output.last_hidden_state, mask, image_mask)
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         return [*self.model.visual.blocks, *self.model.language_model.layers]
 
 
-# A picture is a film of this many equal frames.
+# An image is a film of this many equal frames.
 _FRAMES = 2
 
 
-def pictures_to_patches(pictures: Tensor, patch: int, merge: int) -> Tensor:
+def images_to_patches(images: Tensor, patch: int, merge: int) -> Tensor:
     """``(M, 3, H, W)`` -> ``(M * H/patch * W/patch, 3 * 2 * patch * patch)``.
 
-    The order is that of Qwen's image processor: pictures, places, patches of a place; within one
-    colours, the two frames that a picture is a film of, rows and columns.
+    The order is that of Qwen's image processor: images, places, patches of a place; within one
+    colours, the two frames that an image is a film of, rows and columns.
     """
-    many, colours, height, width = pictures.shape
+    many, colours, height, width = images.shape
     side = patch * merge
-    cut = pictures.reshape(
+    cut = images.reshape(
         many, colours, height // side, merge, patch, width // side, merge, patch
     ).permute(0, 2, 5, 3, 6, 1, 4, 7)
     films = cut.unsqueeze(6).expand(*cut.shape[:6], _FRAMES, patch, patch)

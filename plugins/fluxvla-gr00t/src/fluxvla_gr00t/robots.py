@@ -1,4 +1,4 @@
-"""What published checkpoints of GR00T know of robots: cameras, statistics, numbers of embodiments.
+"""Robots of published GR00T checkpoints: cameras, statistics, embodiment ids.
 
 A checkpoint may know several robots by their tags. N1.5 has ``experiment_cfg/metadata.json``:
 ``{tag: {"statistics": {"state" | "action": {group: {min, max, mean, std, q01, q99}}}, "modalities":
@@ -98,7 +98,7 @@ def n15_robot(folder: Path, wanted: str | None = None) -> Robot:
         rate=rates.pop() or None if len(rates) == 1 else None,
         notes=(
             "its groups of joints are in the order of metadata.json; a data config of NVIDIA's "
-            "may have had another, or have cut pictures first",
+            "may have had another, or have cut images first",
         ),
     )
 

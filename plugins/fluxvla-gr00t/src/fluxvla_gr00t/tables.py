@@ -1,4 +1,4 @@
-"""What published checkpoints become here: tables of model and transforms, weights, statistics."""
+"""Published checkpoints as tables of model and transforms, weights and statistics."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TOKENIZERS = {
 }
 """Where the tokenizers are published; the checkpoints have none."""
 _WORDS = 132
-"""Tokens of a prompt besides the places of pictures: 900 in all for three pictures."""
+"""Tokens of a prompt besides image tokens: 900 in all for three images."""
 
 
 def model_table(
@@ -49,14 +49,14 @@ def n15_transforms(
     """From an observation to what N1.5 takes."""
     count = len(robot.img_keys)
     side = int(model["vlm_backbone"].get("image_size", 224))
-    places = (side // int(model["vlm_backbone"].get("patch_size", 14))) ** 2
+    tokens_per_image = (side // int(model["vlm_backbone"].get("patch_size", 14))) ** 2
     return [
         {"type": "ListInstruction"},
         {
             "type": "ProcessPromptsWithImage",
-            "max_len": count * places + _WORDS,
+            "max_len": count * tokens_per_image + _WORDS,
             "num_images": count,
-            "fixed_img_tokens": places,
+            "fixed_img_tokens": tokens_per_image,
             "tokenizer": _tokenizer("n1.5", tokenizer),
         },
         {"type": "ResizeImages", "height": side, "width": side},
@@ -74,13 +74,13 @@ def n17_transforms(
     clip: bool,
 ) -> list[dict[str, Any]]:
     """From an observation to what N1.7 takes; ``resize`` is what ``resize_table`` gave."""
-    places = (int(resize["size"]) // 32) ** 2
+    tokens_per_image = (int(resize["size"]) // 32) ** 2
     return [
         dict(resize),
         {
             "type": "ProcessQwenPrompts",
-            # Pictures that keep their aspect take more places than square ones.
-            "max_len": len(robot.img_keys) * 2 * places + _WORDS,
+            # Images that keep their aspect ratio take more tokens than square ones.
+            "max_len": len(robot.img_keys) * 2 * tokens_per_image + _WORDS,
             "formalize": formalize,
             "tokenizer": _tokenizer("n1.7", tokenizer),
         },
@@ -91,7 +91,7 @@ def n17_transforms(
 
 
 def resize_table(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The transform of pictures, by N1.7's settings; their sizes are square."""
+    """The transform of images, by N1.7's settings; their sizes are square."""
     target, crop = settings.get("image_target_size"), settings.get("image_crop_size")
     size = 256 if target is None else int(target[0])
     fraction = settings.get("crop_fraction")

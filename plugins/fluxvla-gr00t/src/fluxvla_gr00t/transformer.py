@@ -21,10 +21,10 @@ _LONGEST = 10000.0
 
 
 @dataclass
-class Kept:
-    """Keys and values of a context, ``(B, heads, L, head_dim)``, once they have been computed.
+class KVCache:
+    """KV cache: keys and values of a context, ``(B, heads, L, head_dim)``; None until computed.
 
-    They do not depend on the noisy actions, so that the steps of an integration share them.
+    They do not depend on the noisy actions, so the steps of an integration share them.
     """
 
     key: Tensor | None = None
@@ -43,30 +43,30 @@ class Attention(nn.Module):
         self.out = nn.Linear(heads * head_dim, width)
 
     def forward(
-        self, x: Tensor, context: Tensor, mask: Tensor | None = None, kept: Kept | None = None
+        self, x: Tensor, context: Tensor, mask: Tensor | None = None, cache: KVCache | None = None
     ) -> Tensor:
-        """``mask`` ``(B, L)`` bool: what of the context is seen; None: all of it. Numbers are
-        added to the scores.
+        """``mask`` ``(B, L)``: bool, True where the context is attended to, or numbers that are
+        added to the scores; None: all of it.
 
-        ``kept``: keys and values of this same context from before; it is filled if it is empty.
+        ``cache``: keys and values of this same context ; it is filled if it is empty.
         """
         query = self._heads(self.query(x))
-        if kept is None or kept.key is None or kept.value is None:
+        if cache is None or cache.key is None or cache.value is None:
             key, value = self._heads(self.key(context)), self._heads(self.value(context))
-            if kept is not None:
-                kept.key, kept.value = key.detach(), value.detach()
+            if cache is not None:
+                cache.key, cache.value = key.detach(), value.detach()
         else:
-            key, value = kept.key, kept.value
-        seen = None if mask is None else mask[:, None, None, :]
-        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=seen)
+            key, value = cache.key, cache.value
+        attn_mask = None if mask is None else mask[:, None, None, :]
+        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=attn_mask)
         return self.out(mixed.transpose(1, 2).flatten(2))
 
-    def keep(self, context: Tensor) -> Kept:
-        """Keys and values of ``context`` ``(B, L, C)``."""
-        return Kept(self._heads(self.key(context)), self._heads(self.value(context)))
+    def cache_context(self, context: Tensor) -> KVCache:
+        """The KV cache of ``context`` ``(B, L, C)``."""
+        return KVCache(self._heads(self.key(context)), self._heads(self.value(context)))
 
-    def _heads(self, made: Tensor) -> Tensor:
-        return made.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+    def _heads(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
 class FeedForward(nn.Module):
@@ -107,7 +107,7 @@ class DiTBlock(nn.Module):
         time: Tensor | None,
         context: Tensor | None = None,
         mask: Tensor | None = None,
-        kept: Kept | None = None,
+        cache: KVCache | None = None,
         modulation: Tensor | None = None,
     ) -> Tensor:
         """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``.
@@ -120,7 +120,7 @@ class DiTBlock(nn.Module):
             modulation = self.modulation(time)[:, None]
         scale, shift = modulation.chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
-        attended = self.attention(normal, normal if context is None else context, mask, kept)
+        attended = self.attention(normal, normal if context is None else context, mask, cache)
         x = x + self.dropout(self.dropout(attended))
         return x + self.feed_forward(functional.layer_norm(x, x.shape[-1:], eps=1e-5))
 
@@ -130,7 +130,7 @@ class DiTBlock(nn.Module):
 
 
 class ContextBlock(nn.Module):
-    """One block of plain self-attention over what the backbone saw and read."""
+    """One block of plain self-attention over the backbone's hidden states."""
 
     def __init__(self, heads: int, head_dim: int, dropout: float) -> None:
         super().__init__()
@@ -142,7 +142,7 @@ class ContextBlock(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """``x`` ``(B, L, C)``, ``mask`` ``(B, L)`` bool: what is seen; None: all."""
+        """``x`` ``(B, L, C)``, ``mask`` ``(B, L)`` bool: True where attended to; None: all."""
         normal = self.attention_norm(x)
         x = x + self.dropout(self.dropout(self.attention(normal, normal, mask)))
         return x + self.feed_forward(self.feed_forward_norm(x))
@@ -193,14 +193,14 @@ class DiT(nn.Module):
         steps: Tensor,
         context: Tensor,
         masks: list[Tensor | None],
-        kept: list[Kept] | None = None,
+        cache: list[KVCache] | None = None,
     ) -> Tensor:
         """``x`` ``(B, T, W)`` at ``steps`` ``(B,)`` int64.
 
         Args:
             context: ``(B, L, C)``.
-            masks: for each even block ``(B, L)`` bool, what of the context it sees; None: all.
-            kept: for each even block its keys and values of this same context.
+            masks: for each even block ``(B, L)`` bool, where it attends to the context; None: all.
+            cache: for each even block its KV cache of this same context.
         """
         time = self.time(steps)
         for layer, block in enumerate(self.blocks):
@@ -208,11 +208,11 @@ class DiT(nn.Module):
                 x = block(x, time)
             else:
                 pair = layer // 2
-                x = block(x, time, context, masks[pair], None if kept is None else kept[pair])
+                x = block(x, time, context, masks[pair], None if cache is None else cache[pair])
         return self._out(x, self.modulate(functional.silu(time))[:, None])
 
     def step_tables(self, steps: Tensor) -> dict[str, Tensor]:
-        """What follows from the times ``steps`` ``(K,)`` of all integration steps.
+        """Tensors that depend only on the times ``steps`` ``(K,)`` of the integration steps.
 
         ``blocks`` ``(layers, K, 2 * W)``: scale and shift of each block; ``last`` ``(K, 2 * W)``.
         """
@@ -227,13 +227,13 @@ class DiT(nn.Module):
         x: Tensor,
         tables: Mapping[str, Tensor],
         number: int,
-        kept: list[Kept],
+        cache: list[KVCache],
         masks: list[Tensor | None],
     ) -> Tensor:
         """As ``forward`` in integration step ``number`` of those that ``tables`` is for.
 
         Args:
-            kept: for each even block its keys and values of the context.
+            cache: for each even block its KV cache of the context.
             masks: for each even block ``(B, L)``, what is added to its scores; None: nothing.
         """
         for layer, block in enumerate(self.blocks):
@@ -242,7 +242,7 @@ class DiT(nn.Module):
                 x = block(x, None, modulation=modulation)
             else:
                 pair = layer // 2
-                x = block(x, None, None, masks[pair], kept[pair], modulation)
+                x = block(x, None, None, masks[pair], cache[pair], modulation)
         return self._out(x, tables["last"][number])
 
     def _out(self, x: Tensor, modulation: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What GR00T N1.7 does to pictures, instructions, states and actions before the model."""
+"""Preprocessing of GR00T N1.7: images, instructions, states and actions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from fluxvla_core.data import split_images, stack_images
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.training import Tokenizer, Transform
 
-Picture = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint8]
 METHODS = ("bicubic", "area")
 SIDE = 32
 """Pixels of the side of a place between the words: 2 x 2 patches of 16 x 16."""
-_PLACE, _START, _END = "<|image_pad|>", "<|vision_start|>", "<|vision_end|>"
+_IMAGE_TOKEN, _START, _END = "<|image_pad|>", "<|vision_start|>", "<|vision_end|>"
 
 
 class ResizeCropImages(Transform):
-    """Resize every picture, cut its middle out and resize that; uint8 ``(3N, H, W)``.
+    """Resize every image, cut its middle out and resize that; uint8 ``(3N, H, W)``.
 
     Args:
         size: side of the result; with ``area`` its shorter one.
@@ -30,7 +30,7 @@ class ResizeCropImages(Transform):
         method: ``bicubic``: to a square, antialiased; ``area``: the aspect is kept, by OpenCV's
             INTER_AREA, and then sides are brought to multiples of 32. Which one a published
             checkpoint was trained with is its ``use_albumentations``: ``area`` if true.
-        letter_box: make pictures square with black bars first.
+        letter_box: make images square with black bars first.
 
     Raises:
         ConfigError: an unknown ``method``, a ``size`` that is no multiple of 32, or a
@@ -63,38 +63,38 @@ class ResizeCropImages(Transform):
         self.letter_box = letter_box
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        pictures = [self._one(picture) for picture in split_images(sample["images"])]
-        return {**sample, "images": stack_images(pictures)}
+        images = [self._one(image) for image in split_images(sample["images"])]
+        return {**sample, "images": stack_images(images)}
 
-    def _one(self, picture: Picture) -> Picture:
+    def _one(self, image: Image) -> Image:
         if self.letter_box:
-            picture = _square(picture)
+            image = _square(image)
         if self.method == "area":
-            whole = _to_shortest(picture, self.edge)
+            whole = _to_shortest(image, self.edge)
             cut = _to_shortest(_middle(whole, self.crop_fraction, int), self.edge)
             sides = (max(SIDE, round(side / SIDE) * SIDE) for side in cut.shape[1:])
             return _bicubic(cut, *sides)
-        whole = _bicubic(picture, self.edge, self.edge)
+        whole = _bicubic(image, self.edge, self.edge)
         return _bicubic(_middle(whole, self.crop_fraction, round), self.size, self.size)
 
 
 class ProcessQwenPrompts(Transform):
-    """Tokenise Qwen3-VL's chat with places for pictures: ``lang_tokens`` and ``lang_masks``.
+    """Tokenise Qwen3-VL's chat with image tokens: ``lang_tokens`` and ``lang_masks``.
 
-    The text is ``<|im_start|>user``, for each picture ``<|vision_start|>``, its places and
-    ``<|vision_end|>``, then the instruction and ``<|im_end|>``. There is one place for 32 x 32
-    pixels, so this belongs behind what resizes pictures. Padding stands on the left.
+    The text is ``<|im_start|>user``, for each image ``<|vision_start|>``, its image tokens and
+    ``<|vision_end|>``, then the instruction and ``<|im_end|>``. There is one image token for
+    32 x 32 pixels, so this belongs behind transforms that resize. Padding is on the left.
 
     Args:
         tokenizer: a table of ``fluxvla.tokenizers``, or one already built.
-        max_len: length of the result; places count.
+        max_len: length of the result, image tokens included.
         formalize: write the instruction in lower case and without punctuation, as in the
             published training (``formalize_language``).
 
     Raises:
         ConfigError: there is no instruction, or none is left; the chat is longer than ``max_len``;
             ``<|image_pad|>`` is not one token of the tokenizer, or stands in the instruction; or
-            the sides of pictures are not multiples of 32.
+            the sides of images are not multiples of 32.
     """
 
     def __init__(
@@ -103,14 +103,14 @@ class ProcessQwenPrompts(Transform):
         self.tokenizer = Tokenizer.adapt(build_tokenizer_from_cfg(tokenizer))
         self.max_len = max_len
         self.formalize = formalize
-        ids = list(self.tokenizer.encode(_PLACE))
+        ids = list(self.tokenizer.encode(_IMAGE_TOKEN))
         if len(ids) != 1:
             raise ConfigError(
-                f"ProcessQwenPrompts: {_PLACE} is not a token of this tokenizer, it is cut into "
-                f"{len(ids)}",
-                cause="the tokenizer is not the one of the model that sees pictures",
+                f"ProcessQwenPrompts: {_IMAGE_TOKEN} is not a token of this tokenizer, which "
+                f"makes {len(ids)} of it",
+                cause="the tokenizer is not the one of the vision-language model",
             )
-        self._place = int(ids[0])
+        self._image_token = int(ids[0])
         # A dataset has a handful of instructions and millions of frames.
         self._known: dict[tuple[str, int, int], tuple[Any, Any]] = {}
 
@@ -125,28 +125,29 @@ class ProcessQwenPrompts(Transform):
                 "ProcessQwenPrompts: there is no instruction: neither 'prompt' nor "
                 f"'task_description' in the sample has words ({text!r})"
             )
-        pictures = split_images(sample["images"])
-        key = (words, len(pictures), _places(pictures[0]) if pictures else 0)
+        images = split_images(sample["images"])
+        key = (words, len(images), _tokens_per_image(images[0]) if images else 0)
         if key not in self._known:
             self._known[key] = self._tokens(*key)
         tokens, mask = self._known[key]
         return {**sample, "lang_tokens": tokens.copy(), "lang_masks": mask.copy()}
 
     def _tokens(
-        self, words: str, pictures: int, places: int
+        self, instruction: str, count: int, tokens_per_image: int
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-        seen = f"{_START}{_PLACE * places}{_END}" * pictures
-        ids = list(self.tokenizer.encode(f"<|im_start|>user\n{seen}{words}<|im_end|>\n"))
-        if ids.count(self._place) != pictures * places:
+        images = f"{_START}{_IMAGE_TOKEN * tokens_per_image}{_END}" * count
+        ids = list(self.tokenizer.encode(f"<|im_start|>user\n{images}{instruction}<|im_end|>\n"))
+        if ids.count(self._image_token) != count * tokens_per_image:
             raise ConfigError(
-                f"ProcessQwenPrompts: the chat around the instruction {words!r} has "
-                f"{ids.count(self._place)} places for pictures, {pictures} x {places} expected",
-                cause=f"the instruction itself holds {_PLACE}",
+                f"ProcessQwenPrompts: the chat around the instruction {instruction!r} has "
+                f"{ids.count(self._image_token)} image tokens, {count} x {tokens_per_image} "
+                "expected",
+                cause=f"the instruction itself holds {_IMAGE_TOKEN}",
             )
         if len(ids) > self.max_len:
             raise ConfigError(
-                f"ProcessQwenPrompts: the instruction {words!r} has {len(ids)} tokens with "
-                f"{pictures} x {places} places for pictures, max_len is {self.max_len}",
+                f"ProcessQwenPrompts: the instruction {instruction!r} has {len(ids)} tokens with "
+                f"{count} x {tokens_per_image} image tokens, max_len is {self.max_len}",
                 next=f"--set <ProcessQwenPrompts>.max_len={len(ids)} (or more)",
             )
         tokens = np.full(self.max_len, int(self.tokenizer.pad_token_id or 0), np.int64)
@@ -191,55 +192,55 @@ class ClipNormalized(Transform):
         return {**sample, **clipped}
 
 
-def _places(picture: Picture) -> int:
-    height, width = picture.shape[1:]
+def _tokens_per_image(image: Image) -> int:
+    height, width = image.shape[1:]
     if height % SIDE or width % SIDE:
         raise ConfigError(
-            f"ProcessQwenPrompts: pictures have {height} x {width} pixels, sides are to be "
+            f"ProcessQwenPrompts: images have {height} x {width} pixels, sides are to be "
             f"multiples of {SIDE}",
             next="ResizeCropImages, or ResizeImages, before ProcessQwenPrompts",
         )
     return (height // SIDE) * (width // SIDE)
 
 
-def _square(picture: Picture) -> Picture:
-    height, width = picture.shape[1:]
+def _square(image: Image) -> Image:
+    height, width = image.shape[1:]
     side = max(height, width)
     above, before = (side - height) // 2, (side - width) // 2
     rows, columns = (above, side - height - above), (before, side - width - before)
-    return np.pad(picture, ((0, 0), rows, columns))
+    return np.pad(image, ((0, 0), rows, columns))
 
 
-def _middle(picture: Picture, fraction: float, whole: Any) -> Picture:
+def _middle(image: Image, fraction: float, whole: Any) -> Image:
     """The middle of ``(3, H, W)``; ``whole`` makes pixels of a share of them."""
-    height, width = picture.shape[1:]
+    height, width = image.shape[1:]
     tall, wide = (max(1, whole(side * fraction)) for side in (height, width))
     top, left = (height - tall) // 2, (width - wide) // 2
-    return picture[:, top : top + tall, left : left + wide]
+    return image[:, top : top + tall, left : left + wide]
 
 
-def _to_shortest(picture: Picture, edge: int) -> Picture:
+def _to_shortest(image: Image, edge: int) -> Image:
     """``(3, H, W)`` with its shorter side ``edge`` pixels long."""
-    height, width = picture.shape[1:]
+    height, width = image.shape[1:]
     shortest = min(height, width)
     if shortest == edge:
-        return picture
+        return image
     import cv2
 
     sizes = (max(1, round(side * (edge / shortest))) for side in (width, height))
-    rows = np.ascontiguousarray(picture.transpose(1, 2, 0))
+    rows = np.ascontiguousarray(image.transpose(1, 2, 0))
     resized = cv2.resize(rows, tuple(sizes), interpolation=cv2.INTER_AREA)
     return np.asarray(resized, np.uint8).transpose(2, 0, 1)
 
 
-def _bicubic(picture: Picture, height: int, width: int) -> Picture:
+def _bicubic(image: Image, height: int, width: int) -> Image:
     """``(3, height, width)``, antialiased."""
-    if picture.shape[1:] == (height, width):
-        return picture
+    if image.shape[1:] == (height, width):
+        return image
     import torch
     from torch.nn import functional
 
-    values = torch.from_numpy(np.ascontiguousarray(picture))[None]
+    values = torch.from_numpy(np.ascontiguousarray(image))[None]
     made = functional.interpolate(
         values, (height, width), mode="bicubic", antialias=True, align_corners=False
     )

@@ -1,4 +1,4 @@
-"""What LeRobot's files say of a policy, read before LeRobot gets to see them.
+"""Files of a LeRobot policy, read and checked before LeRobot loads them.
 
 ``config.json`` has the policy's ``type`` and its inputs and outputs; ``policy_preprocessor.json``
 and ``policy_postprocessor.json`` list the steps around it (lerobot/configs/policies.py,

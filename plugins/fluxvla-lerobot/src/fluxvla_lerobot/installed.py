@@ -19,7 +19,7 @@ INSTALL = "pip install 'fluxvla-lerobot[lerobot]' (LeRobot 0.6 is for Python 3.1
 
 @dataclass(frozen=True)
 class LeRobot:
-    """What is used of LeRobot.
+    """The parts of LeRobot that are used.
 
     Args:
         version: of the distribution.

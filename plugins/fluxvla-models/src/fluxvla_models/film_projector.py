@@ -1,4 +1,4 @@
-"""Joins what is seen, what is asked, and where the joints are."""
+"""FiLM projector: image features modulated by the instruction, joined with the robot state."""
 
 from __future__ import annotations
 

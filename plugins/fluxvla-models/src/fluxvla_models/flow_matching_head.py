@@ -3,7 +3,7 @@
 The path is linear, ``x_t = (1 - t) * noise + t * actions`` with t from 0 to 1 (Lipman et al. 2023;
 Liu et al. 2023). The network answers with an estimate of ``actions``, from which the velocity is
 ``(estimate - x_t) / (1 - t)``. Its squared error is the velocity's, weighted by ``(1 - t)^2``:
-near t = 0 that is plain regression, so few draws of noise for each sample are enough, and the last
+near t = 0 that is plain regression, so few noise samples each are enough, and the last
 integration step lands on the estimate.
 """
 
@@ -89,7 +89,7 @@ class FlowMatchingHead(nn.Module):
     def errors(
         self, context: Tensor, actions: Tensor, masks: Tensor, noise: Tensor, time: Tensor
     ) -> Tensor:
-        """Squared errors of the estimate, ``(B * K, T, D)``, the draws of a sample in a row.
+        """Squared errors of the estimate, ``(B * K, T, D)``, K noise samples each.
 
         The loss is the mean of all of them, padded ones counting as zero: a denominator that
         depended on the masks would make the gradient depend on how samples share batches.
@@ -100,13 +100,13 @@ class FlowMatchingHead(nn.Module):
             masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)`` standard normal; ``time``: ``(B, K)`` in 0..1.
         """
-        draws = noise.shape[1]
-        clean = actions[:, None].expand(-1, draws, -1, -1)
+        repeats = noise.shape[1]
+        clean = actions[:, None].expand(-1, repeats, -1, -1)
         mixed = torch.lerp(noise, clean, time[..., None, None])
-        repeated = context[:, None].expand(-1, draws, -1)
-        found = self.estimate(mixed.flatten(0, 1), time.flatten(), repeated.flatten(0, 1))
-        error = (found - clean.flatten(0, 1)).square()
-        return error * masks.repeat_interleave(draws, 0)[..., None]
+        repeated = context[:, None].expand(-1, repeats, -1)
+        estimate = self.estimate(mixed.flatten(0, 1), time.flatten(), repeated.flatten(0, 1))
+        error = (estimate - clean.flatten(0, 1)).square()
+        return error * masks.repeat_interleave(repeats, 0)[..., None]
 
     def loss(
         self, context: Tensor, actions: Tensor, masks: Tensor, noise: Tensor, time: Tensor

@@ -17,7 +17,7 @@ from fluxvla_models.lerobot_write import write_act, write_diffusion
 
 
 class _LeRobotFormat(CheckpointFormat):
-    """What the two have in common; ``kind`` is the ``type`` in LeRobot's config."""
+    """Base class of the two formats; ``kind`` is the ``type`` in LeRobot's config."""
 
     name = "lerobot"
     kind: ClassVar[str]
@@ -28,7 +28,7 @@ class _LeRobotFormat(CheckpointFormat):
         """The table of the model that LeRobot's ``config`` describes."""
 
     def notes(self, config: Mapping[str, Any]) -> Sequence[str]:
-        """What somebody who imports the checkpoint ought to know."""
+        """Notes that are printed when the checkpoint is imported."""
         horizon, used = self.horizon(config), config.get("n_action_steps")
         if not isinstance(used, int) or used >= horizon:
             return ()

@@ -36,14 +36,14 @@ def diffusion_name(name: str) -> str | None:
     ``rgb_encoders.0.backbone.layer1.0.conv1.weight``; a shared encoder is number 0."""
     if name.startswith(BUFFERS) or name.endswith(".pool.pos_grid"):
         return None
-    ours = name.removeprefix("diffusion.")
-    if ours.startswith("rgb_encoder."):
-        rest = ours.removeprefix("rgb_encoder.")
-        ours = f"rgb_encoders.{rest}" if rest[0].isdigit() else f"rgb_encoders.0.{rest}"
-    place = _BACKBONE.match(ours)
+    own_name = name.removeprefix("diffusion.")
+    if own_name.startswith("rgb_encoder."):
+        rest = own_name.removeprefix("rgb_encoder.")
+        own_name = f"rgb_encoders.{rest}" if rest[0].isdigit() else f"rgb_encoders.0.{rest}"
+    place = _BACKBONE.match(own_name)
     if place is None or place[2] not in _NETWORK:
-        return ours
-    return f"{place[1]}{_NETWORK[place[2]]}.{ours[place.end() :]}"
+        return own_name
+    return f"{place[1]}{_NETWORK[place[2]]}.{own_name[place.end() :]}"
 
 
 def published_act_name(name: str) -> str:
@@ -52,7 +52,7 @@ def published_act_name(name: str) -> str:
 
 
 def published_diffusion_name(name: str, separate: bool) -> str:
-    """Of our ``name`` LeRobot's; ``separate``: each camera has its own encoder."""
+    """LeRobot's name of our tensor ``name``; ``separate``: each camera has its own encoder."""
     part = _OWN_BACKBONE.match(name)
     if part is not None and part[2] in _PLACES:
         name = f"{part[1]}{_PLACES[part[2]]}.{name[part.end() :]}"

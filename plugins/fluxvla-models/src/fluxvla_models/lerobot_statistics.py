@@ -1,4 +1,4 @@
-"""What a LeRobot policy is normalised by, as this project's statistics and transforms.
+"""Normalisation of a LeRobot policy, as this project's statistics and transforms.
 
 LeRobot saves statistics with the processors, ``policy_preprocessor.json`` and the safetensors file
 that its ``normalizer_processor`` names (``<feature>.<statistic>``); before version 0.4 they were

@@ -42,7 +42,7 @@ Floats = npt.NDArray[np.float64]
 EPS = 1e-8
 """What LeRobot adds to a standard deviation."""
 _STRIDE = 32
-"""Of a residual network: pixels to a place of its last map."""
+"""Stride of a ResNet: pixels of the image for one of its last feature map."""
 _MINUTE = 2e-6
 """A command this far off is the same: what never moved is scaled by one number here, by another in
 LeRobot."""
@@ -67,7 +67,7 @@ class Preparation:
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """What the policy sees."""
+        """Input features of the policy."""
         return {name: entry for name, entry in self.features.items() if name != ACTION}
 
 
@@ -287,7 +287,7 @@ def _numbers(
     feature: str,
     width: int,
 ) -> tuple[dict[str, Floats], str]:
-    """What LeRobot normalises a feature by, and its mode."""
+    """Statistics that LeRobot normalises a feature by, and its mode."""
     who = "NormalizeStatesAndActions"
     action = feature == ACTION
     affine = make_affine(

@@ -75,10 +75,10 @@ class LlavaVLA(VLA, nn.Module):
         }
         given = [name for name, part in halves.items() if part is not None]
         if len(given) != (3 if vlm_backbone is None else 0):
-            told = ", ".join([*given, *(["vlm_backbone"] if vlm_backbone is not None else [])])
+            names = ", ".join([*given, *(["vlm_backbone"] if vlm_backbone is not None else [])])
             raise ConfigError(
                 "LlavaVLA takes vlm_backbone, or all of vision_backbone, projector and "
-                f"llm_backbone; it was given {told or 'none of them'}"
+                f"llm_backbone; it was given {names or 'none of them'}"
             )
         frozen = {
             "vision_backbone": freeze_vision_backbone,
@@ -87,7 +87,7 @@ class LlavaVLA(VLA, nn.Module):
             "vlm_backbone": freeze_vlm_backbone,
         }
         used = ["vlm_backbone"] if vlm_backbone is not None else given
-        unused = [name for name, asked in frozen.items() if asked and name not in used]
+        unused = [name for name, freeze in frozen.items() if freeze and name not in used]
         if unused:
             raise ConfigError(f"freeze_{unused[0]}: the model has no {unused[0]}")
         if vlm_backbone is not None:
@@ -172,12 +172,13 @@ class LlavaVLA(VLA, nn.Module):
     def _hidden(
         self, images: Tensor, img_masks: Tensor | None, tokens: Tensor, masks: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Hidden states ``(B, L, C)`` of pictures and words, and what of them is real."""
+        """Hidden states ``(B, L, C)`` of image and text tokens, and their padding mask."""
         cameras = images.shape[1] // 3
-        known = masks.new_ones(len(images), cameras) if img_masks is None else img_masks.bool()
+        present = masks.new_ones(len(images), cameras) if img_masks is None else img_masks.bool()
         if "vlm_backbone" in self._parts:
-            return self.vlm_backbone(images, known, tokens, masks)
-        seen = self.projector(self.vision_backbone(images))
-        both = torch.cat([seen, self.llm_backbone.embed(tokens)], dim=1)
-        real = torch.cat([known.repeat_interleave(seen.shape[1] // cameras, 1), masks], dim=1)
-        return self.llm_backbone(both, real), real
+            return self.vlm_backbone(images, present, tokens, masks)
+        features = self.projector(self.vision_backbone(images))
+        embeddings = torch.cat([features, self.llm_backbone.embed(tokens)], dim=1)
+        image_mask = present.repeat_interleave(features.shape[1] // cameras, 1)
+        mask = torch.cat([image_mask, masks], dim=1)
+        return self.llm_backbone(embeddings, mask), mask

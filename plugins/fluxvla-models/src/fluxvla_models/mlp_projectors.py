@@ -1,4 +1,4 @@
-"""From a vision encoder's features to a language model's embeddings, patch by patch."""
+"""Projectors from a vision encoder's patch features to a language model's embeddings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LinearProjector(nn.Module):
         return self.projector(features)
 
     def fsdp_units(self) -> list[nn.Module]:
-        """None: it is small beside what it joins."""
+        """No units: the projector is too small to shard by itself."""
         return []
 
 
@@ -56,7 +56,7 @@ class FusedMLPProjector(nn.Module):
         return self.projector(features)
 
     def fsdp_units(self) -> list[nn.Module]:
-        """None: it is small beside what it joins."""
+        """No units: the projector is too small to shard by itself."""
         return []
 
 

@@ -103,13 +103,13 @@ class LanguageBackbone(nn.Module):
         Positions count what the masks leave, so that padding does not matter, on either side.
         """
         positions = (masks.long().cumsum(1) - 1).clamp(min=0)
-        found = self.model(
+        output = self.model(
             inputs_embeds=embeddings,
             attention_mask=masks.long(),
             position_ids=positions,
             use_cache=False,
         )
-        return found.last_hidden_state
+        return output.last_hidden_state
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
@@ -135,7 +135,7 @@ class LlamaBackbone(LanguageBackbone):
 
 
 class PaliGemmaBackbone(nn.Module):
-    """PaliGemma (Beyer et al. 2024): pictures and words in one model, all seeing each other.
+    """PaliGemma (Beyer et al. 2024): image and text tokens in one model, with full attention.
 
     Args:
         model_folder, num_cameras, pretrained: as of ``SigLIPBackbone``.
@@ -164,19 +164,19 @@ class PaliGemmaBackbone(nn.Module):
         Args:
             images: ``(B, 3N, H, W)`` in -1..1; img_masks: ``(B, N)``; tokens, masks: ``(B, L)``.
         """
-        places = self.num_cameras * self.tokens_per_image
-        seen = tokens.new_full((len(tokens), places), self.image_token)
-        known = torch.cat([img_masks.repeat_interleave(self.tokens_per_image, 1), masks], dim=1)
-        ids = torch.cat([seen, tokens], dim=1)
-        found = self.model(
+        count = self.num_cameras * self.tokens_per_image
+        image_tokens = tokens.new_full((len(tokens), count), self.image_token)
+        mask = torch.cat([img_masks.repeat_interleave(self.tokens_per_image, 1), masks], dim=1)
+        ids = torch.cat([image_tokens, tokens], dim=1)
+        output = self.model(
             input_ids=ids,
             pixel_values=split_views(images, self.num_cameras, self.image_size),
-            attention_mask=known.long(),
-            position_ids=known.long().cumsum(1).clamp(min=1),  # it counts from 1
+            attention_mask=mask.long(),
+            position_ids=mask.long().cumsum(1).clamp(min=1),  # it counts from 1
             token_type_ids=torch.zeros_like(ids),
             use_cache=False,
         )
-        return found.last_hidden_state, known
+        return output.last_hidden_state, mask
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""

@@ -21,7 +21,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class FeedForward(nn.Module):
-    """What encoder and decoder layers share; the names are the layer's own, not a submodule's."""
+    """Base class of encoder and decoder layers; its parameters have the layer's own names."""
 
     def __init__(
         self, width: int, hidden: int, dropout: float, activation: str, pre_norm: bool

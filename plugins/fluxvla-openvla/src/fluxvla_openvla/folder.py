@@ -1,4 +1,4 @@
-"""What a published folder says besides its tensors: sizes, statistics, which robot it is for.
+"""Contents of a published folder besides its tensors: sizes, statistics, robot.
 
 OpenVLA-OFT's files do not say how long a chunk is, how many pictures there are, or which of
 several statistics are meant: its code takes them from words of the command line. A folder may hold

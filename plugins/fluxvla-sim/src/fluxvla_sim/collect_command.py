@@ -12,7 +12,7 @@ class CollectCommand:
     help: ClassVar[str] = "Record demonstrations of a scripted expert as a LeRobot v3.0 dataset."
 
     def add_arguments(self, parser: Any) -> None:
-        parser.add_argument("robot", choices=("aloha", "ur5e"), help="whose scene")
+        parser.add_argument("robot", choices=("aloha", "ur5e"), help="the simulated robot")
         parser.add_argument("--out", required=True, metavar="DIR", help="the dataset to make")
         parser.add_argument("--episodes", type=int, default=240, metavar="N", help="default 240")
         parser.add_argument("--workers", type=int, default=2, metavar="N", help="default 2")
@@ -44,7 +44,7 @@ class CollectCommand:
             "--log-format",
             choices=("text", "json"),
             default="text",
-            help="for people (default) or one JSON object a line",
+            help="text (default), or one JSON object per line",
         )
 
     def run(self, args: Any) -> int:

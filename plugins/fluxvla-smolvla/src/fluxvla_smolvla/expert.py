@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_smolvla.sizes import TextSize
-from fluxvla_smolvla.transformer import ExpertLayer, Memory, RMSNorm, Rotation, Suffix
+from fluxvla_smolvla.transformer import ExpertLayer, KVCache, RMSNorm, Rotation, Suffix
 
 
 class Expert(nn.Module):
@@ -43,23 +43,23 @@ class Expert(nn.Module):
         self.layers = nn.ModuleList(ExpertLayer(size, crosses) for crosses in crossed)
         self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
 
-    def forward(self, x: Tensor, memory: Memory) -> Tensor:
+    def forward(self, x: Tensor, cache: KVCache) -> Tensor:
         """Action tokens ``(B, T, width)`` -> the same shape."""
-        suffix = self._suffix(memory, x.shape[1])
+        suffix = self._suffix(cache, x.shape[1])
         for number, layer in enumerate(self.layers):
             place = number * self.stride
-            x = layer(x, memory.keys[place], memory.values[place], memory.seen, suffix)
+            x = layer(x, cache.keys[place], cache.values[place], cache.mask, suffix)
         return self.norm(x)
 
-    def observe(self, memory: Memory, count: int) -> dict[str, Tensor]:
+    def observe(self, cache: KVCache, count: int) -> dict[str, Tensor]:
         """What does not depend on the ``count`` action tokens, for :meth:`step`: keys and values of
         every layer, masks and rotations."""
-        suffix = self._suffix(memory, count)
-        groups, dtype = self.layers[0].self_attn.groups, memory.values[0].dtype
-        rows = memory.seen.expand(-1, -1, count, -1)
+        suffix = self._suffix(cache, count)
+        groups, dtype = self.layers[0].self_attn.groups, cache.values[0].dtype
+        rows = cache.mask.expand(-1, -1, count, -1)
         whole = torch.cat([rows, suffix.causal.expand(len(rows), -1, -1, -1)], dim=3)
         found = {
-            "crossed": folded_mask(memory.seen, groups, dtype),
+            "crossed": folded_mask(cache.mask, groups, dtype),
             "joined": folded_mask(whole, groups, dtype),
             "behind.cos": suffix.behind.cos,
             "behind.sin": suffix.behind.sin,
@@ -68,12 +68,12 @@ class Expert(nn.Module):
         }
         for number, layer in enumerate(self.layers):
             place = number * self.stride
-            keys, values = layer.project(memory.keys[place], memory.values[place])
+            keys, values = layer.project(cache.keys[place], cache.values[place])
             found |= {f"key.{number}": keys, f"value.{number}": values}
         return found
 
     def step(self, x: Tensor, seen: Mapping[str, Tensor]) -> Tensor:
-        """As ``forward``, with what :meth:`observe` found."""
+        """As ``forward``, with the tensors of :meth:`observe`."""
         behind, alone = (
             Rotation(seen[f"{name}.cos"], seen[f"{name}.sin"]) for name in ("behind", "alone")
         )
@@ -81,15 +81,15 @@ class Expert(nn.Module):
         for number, layer in enumerate(self.layers):
             mask = seen["crossed" if layer.crosses else "joined"]
             keys, values = seen[f"key.{number}"], seen[f"value.{number}"]
-            x = layer(x, keys, values, mask, suffix, known=True)
+            x = layer(x, keys, values, mask, suffix, prepared=True)
         return self.norm(x)
 
-    def _suffix(self, memory: Memory, count: int) -> Suffix:
-        device = memory.length.device
+    def _suffix(self, cache: KVCache, count: int) -> Suffix:
+        device = cache.length.device
         places = torch.arange(count, device=device)[None]
         return Suffix(
             causal=torch.ones(count, count, dtype=torch.bool, device=device).tril()[None, None],
-            behind=Rotation.at(memory.length[:, None] + places, self.head_dim),
+            behind=Rotation.at(cache.length[:, None] + places, self.head_dim),
             alone=Rotation.at(places, self.head_dim),
         )
 
@@ -110,17 +110,17 @@ class ActionTimeMLP(nn.Module):
         self.action_time_mlp_out = nn.Linear(width, width)
 
     def forward(self, noisy: Tensor, time: Tensor) -> Tensor:
-        return self.told(noisy, self.waves(time)[:, None])
+        return self.embed_at_time(noisy, self.time_features(time)[:, None])
 
-    def waves(self, time: Tensor) -> Tensor:
-        """What stands for times ``(B,)``: ``(B, width)`` float64."""
+    def time_features(self, time: Tensor) -> Tensor:
+        """Sinusoidal features ``(B, width)`` float64 of times ``(B,)``."""
         width = self.action_in_proj.out_features
         return sinusoids(time, width, self.shortest, self.longest)
 
-    def told(self, noisy: Tensor, waves: Tensor) -> Tensor:
-        """Action tokens of ``noisy``, ``waves`` being broadcast to them."""
+    def embed_at_time(self, noisy: Tensor, time_features: Tensor) -> Tensor:
+        """Action tokens of ``noisy`` actions, ``time_features`` being broadcast to them."""
         actions = self.action_in_proj(noisy)
-        joined = torch.cat([actions, waves.to(actions.dtype).expand_as(actions)], dim=2)
+        joined = torch.cat([actions, time_features.to(actions.dtype).expand_as(actions)], dim=2)
         return self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))
 
 

@@ -1,4 +1,4 @@
-"""``SmolVLAImages``: a sample's pictures as SmolVLA takes them."""
+"""``SmolVLAImages``: a sample's images as SmolVLA takes them."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from fluxvla_core.errors import ConfigError, DataError
 
 
 class SmolVLAImages(Transform):
-    """Normalise pictures to -1..1 and add cameras that are not there; gives ``(3N, H, W)`` float32.
+    """Normalise images to -1..1 and add cameras that are not there; gives ``(3N, H, W)`` float32.
 
-    The model itself resizes pictures to the size of its vision tower, on its device, so that they
+    The model itself resizes images to the size of its vision tower, on its device, so that they
     travel as they are. Cameras of different sizes need ``height`` and ``width``: they are resized
     here, as the model does it, without distortion, with black on the left and on top.
 
     Args:
-        height, width: of all pictures, usually 512 both; None leaves them as they are.
-        empty_cameras: black pictures to add behind the others, with a mask of False: a model that
+        height, width: of all images, usually 512 both; None leaves them as they are.
+        empty_cameras: black images to add behind the others, with a mask of False: a model that
             was trained with more cameras sees them so.
 
     Raises:
-        ConfigError: settings that fit no picture.
+        ConfigError: settings that fit no image.
         DataError: cameras of different sizes, and no ``height`` and ``width``.
     """
 
@@ -51,25 +51,25 @@ class SmolVLAImages(Transform):
         return dict(self._normalize.defer(self._complete(sample)))
 
     def _complete(self, sample: dict[str, Any]) -> dict[str, Any]:
-        pictures = [self._resize(picture) for picture in split_images(sample["images"])]
-        sizes = {picture.shape[1:] for picture in pictures}
+        images = [self._resize(image) for image in split_images(sample["images"])]
+        sizes = {image.shape[1:] for image in images}
         if len(sizes) > 1:
             listed = ", ".join(f"{h} x {w}" for h, w in sorted(sizes))
             raise DataError(
                 f"SmolVLAImages: cameras of different sizes: {listed}",
                 next="--set <SmolVLAImages>.height=512 --set <SmolVLAImages>.width=512",
             )
-        masks = np.asarray(sample.get("img_masks", np.ones(len(pictures))), np.bool_)
-        pictures += [np.zeros_like(pictures[0])] * self.empty_cameras
+        masks = np.asarray(sample.get("img_masks", np.ones(len(images))), np.bool_)
+        images += [np.zeros_like(images[0])] * self.empty_cameras
         masks = np.concatenate([masks, np.zeros(self.empty_cameras, np.bool_)])
-        return {**sample, "images": pictures, "img_masks": masks}
+        return {**sample, "images": images, "img_masks": masks}
 
-    def _resize(self, picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        if self.size is None or picture.shape[1:] == self.size:
-            return picture
+    def _resize(self, image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        if self.size is None or image.shape[1:] == self.size:
+            return image
         import torch
 
         from fluxvla_smolvla.vision import resize_with_pad
 
-        pixels = torch.from_numpy(np.ascontiguousarray(picture, np.float32))[None]
+        pixels = torch.from_numpy(np.ascontiguousarray(image, np.float32))[None]
         return resize_with_pad(pixels, *self.size, fill=0.0)[0].numpy()

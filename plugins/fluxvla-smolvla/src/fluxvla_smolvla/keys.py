@@ -17,7 +17,7 @@ PREFIXES = {
     "state_proj.": "model.state_proj.",
     "action_out_proj.": "model.action_out_proj.",
 }
-"""What a name begins with here -> there; the first that fits counts."""
+"""Prefix of a name here -> prefix there; the first that fits counts."""
 
 
 def published(name: str) -> str:

@@ -33,15 +33,15 @@ from fluxvla_smolvla.model import SMOLVLM2, SmolVLA
 
 MODEL_TYPE = "smolvla"
 HEAD_DIM = 64
-"""Of SmolLM2 of every size, and of SigLIP's base model."""
+"""Width of an attention head in SmolLM2 of every size, and in SigLIP's base model."""
 VISION_HEADS = {1152: 16}
 """Width of a vision tower -> its heads, where they are not ``HEAD_DIM`` wide: SigLIP so400m."""
 COMPILED = "model._orig_mod."
-"""What names begin with if the policy was compiled when it was saved."""
+"""Prefix of names if the policy was compiled when it was saved."""
 UNSUPPORTED = {
     "adapt_to_pi_aloha": (False, "its joints and grippers are those of pi0's ALOHA"),
     "use_delta_joint_actions_aloha": (False, "its actions are differences"),
-    "add_image_special_tokens": (False, "tokens stand around its pictures"),
+    "add_image_special_tokens": (False, "tokens stand around its images"),
     "use_peft": (False, "it is an adapter for other weights"),
     "n_obs_steps": (1, "it looks at several frames"),
 }
@@ -70,7 +70,7 @@ class LeRobotSmolVLA(CheckpointFormat):
 
         Args:
             tokenizer: the folder of SmolVLM2's tokenizer, which LeRobot fetches from the hub.
-            absent: cameras without pictures, which LeRobot leaves out.
+            absent: cameras without images, which LeRobot leaves out.
 
         Raises:
             CheckpointError: it is damaged, or does something that SmolVLA here does not.
@@ -189,11 +189,11 @@ class Settings:
             if not isinstance(value, dict):
                 raise self._wrong(f"input_features.{key}", value, "a table")
         keys = [key for key, value in features.items() if value.get("type") == "VISUAL"]
-        real = [key for key in keys if not _EMPTY.search(key)]
-        if not real:
+        present = [key for key in keys if not _EMPTY.search(key)]
+        if not present:
             raise CheckpointError("input_features: there is no camera", where=self.where)
         back = {theirs: ours for ours, theirs in robot_keys.items()}
-        names = (back.get(key, key) for key in real)
+        names = (back.get(key, key) for key in present)
         return (
             tuple(
                 n.removeprefix("observation.images.").removeprefix("observation.") for n in names

@@ -55,7 +55,7 @@ Statistics = dict[str, dict[str, list[float]]]
 
 @dataclass(frozen=True)
 class Processors:
-    """What LeRobot does before and after the model.
+    """LeRobot's pre- and postprocessing of the model.
 
     Args:
         norms: ``STATE`` and ``ACTION`` -> the name of a normalisation.
@@ -124,7 +124,7 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
     """State's and action's normalisation, from LeRobot's names.
 
     Raises:
-        CheckpointError: an unknown normalisation, or one of pictures.
+        CheckpointError: an unknown normalisation, or one of images.
     """
     texts = _texts(mapping, "the mapping of normalisations", where)
     unknown = {kind: norm for kind, norm in texts.items() if norm not in NORMS}
@@ -135,7 +135,7 @@ def norms_of(mapping: Mapping[str, Any], where: str) -> dict[str, str]:
         )
     if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
         raise CheckpointError(
-            f"pictures are normalised by {mapping['VISUAL']}; SmolVLA takes them as they are "
+            f"images are normalised by {mapping['VISUAL']}; SmolVLA takes them as they are "
             "(IDENTITY)",
             where=where,
         )
@@ -149,7 +149,7 @@ def _texts(table: Any, what: str, where: str) -> dict[str, str]:
 
 
 def _statistics(tensors: Mapping[str, Stored]) -> Statistics:
-    """Those of a step, flat as ``<feature>.<statistic>``."""
+    """Statistics of a step, flat as ``<feature>.<statistic>``."""
     found: Statistics = {}
     for name, stored in tensors.items():
         feature, _, statistic = name.rpartition(".")

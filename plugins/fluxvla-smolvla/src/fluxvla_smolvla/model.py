@@ -1,9 +1,9 @@
 """SmolVLA (Shukor et al. 2025, arXiv 2506.01844), as LeRobot publishes it.
 
-Pictures, the instruction and a state token go through the first layers of SmolVLM2. An action
+Images, the instruction and a state token go through the first layers of SmolVLM2. An action
 expert of narrower layers attends to that model's keys and values, layer by layer, and predicts the
 velocity of flow matching. The language model sees nothing of the actions, so its part of a sample
-is computed once, however many draws of noise or integration steps follow.
+is computed once, however many noise samples or integration steps follow.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
 from fluxvla_smolvla.loss import masked_mean
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
-from fluxvla_smolvla.transformer import ContextLayer, Memory, Prefix, RMSNorm, Rotation
+from fluxvla_smolvla.transformer import ContextLayer, KVCache, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
 
 LOSSES = ("valid", "all")
 SMOLVLM2 = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 BLACK = -1.0
-"""What pictures are padded with, normalised."""
+"""Normalised value that images are padded with."""
 
 
 class LanguageModel(nn.Module):
@@ -46,18 +46,18 @@ class LanguageModel(nn.Module):
         self.layers = nn.ModuleList(ContextLayer(size) for _ in range(size.layers))
         self.norm = RMSNorm(size.hidden_size, size.rms_norm_eps)
 
-    def forward(self, context: Tensor, seen: Tensor, state: Tensor) -> Memory:
+    def forward(self, context: Tensor, mask: Tensor, state: Tensor) -> KVCache:
         """Keys and values of the layers up to the deepest.
 
         Args:
-            context: ``(B, C, width)``; ``seen``: ``(B, C)`` bool, real ones.
+            context: ``(B, C, width)``; ``mask``: ``(B, C)`` bool, False on padding.
             state: ``(B, 1, width)``.
         """
-        count = seen.sum(1)
+        count = mask.sum(1)
         head_dim = self.size.head_dim
         prefix = Prefix(
-            seen=seen[:, None, None],
-            context=Rotation.at(seen.long().cumsum(1) - 1, head_dim),
+            mask=mask[:, None, None],
+            context=Rotation.at(mask.long().cumsum(1) - 1, head_dim),
             state=Rotation.at(count[:, None], head_dim),
         )
         keys, values = [], []
@@ -66,12 +66,12 @@ class LanguageModel(nn.Module):
             context, state, key, value = layer(context, state, prefix, last)
             keys.append(key)
             values.append(value)
-        all_seen = nn.functional.pad(prefix.seen, (0, 1), value=True)
-        return Memory(tuple(keys), tuple(values), all_seen, count + 1)
+        cache_mask = nn.functional.pad(prefix.mask, (0, 1), value=True)
+        return KVCache(tuple(keys), tuple(values), cache_mask, count + 1)
 
 
 class SmolVLA(VLA, nn.Module):
-    """Pictures, instruction and joint state in, action chunk out; 450 million parameters.
+    """Images, instruction and joint state in, action chunk out; 450 million parameters.
 
     ``forward`` and ``predict_action`` draw nothing: noise and times come in with the batch.
 
@@ -121,11 +121,11 @@ class SmolVLA(VLA, nn.Module):
         pretrained_name_or_path: str | None = None,
     ) -> None:
         super().__init__()
-        seen, read = size_of(VisionSize, vision), size_of(TextSize, text)
-        experts = read.layers if num_expert_layers is None else num_expert_layers
+        vision_size, text_size = size_of(VisionSize, vision), size_of(TextSize, text)
+        experts = text_size.layers if num_expert_layers is None else num_expert_layers
         _check_counts(
             experts,
-            read.layers,
+            text_size.layers,
             n_action_steps=n_action_steps,
             num_steps=num_steps,
             max_state_dim=max_state_dim,
@@ -141,16 +141,16 @@ class SmolVLA(VLA, nn.Module):
         self.n_action_steps, self.num_steps, self.loss_mean = n_action_steps, num_steps, loss_mean
         self.max_state_dim, self.max_action_dim = max_state_dim, max_action_dim
         self.ori_action_dim = max_action_dim if ori_action_dim is None else ori_action_dim
-        self.image_size, self.width = seen.image_size, read.hidden_size
+        self.image_size, self.width = vision_size.image_size, text_size.hidden_size
         self.pretrained_name_or_path = pretrained_name_or_path
-        size = expert_size(read, experts, expert_width_multiplier)
-        self.vision = VisionTower(seen)
-        self.connector = Connector(seen, read.hidden_size)
-        stride = read.layers // experts
-        self.text = LanguageModel(read, deepest=(experts - 1) * stride)
+        size = expert_size(text_size, experts, expert_width_multiplier)
+        self.vision = VisionTower(vision_size)
+        self.connector = Connector(vision_size, text_size.hidden_size)
+        stride = text_size.layers // experts
+        self.text = LanguageModel(text_size, deepest=(experts - 1) * stride)
         # Of no use here; kept so that a checkpoint goes back to LeRobot as it came.
-        self.lm_head = nn.Linear(read.hidden_size, read.vocabulary, bias=False)
-        self.state_proj = nn.Linear(max_state_dim, read.hidden_size)
+        self.lm_head = nn.Linear(text_size.hidden_size, text_size.vocabulary, bias=False)
+        self.state_proj = nn.Linear(max_state_dim, text_size.hidden_size)
         self.embed_actions = ActionTimeMLP(max_action_dim, size.hidden_size, min_period, max_period)
         self.expert = Expert(size, stride, self_attn_every_n_layers)
         self.action_out_proj = nn.Linear(size.hidden_size, max_action_dim)
@@ -183,15 +183,17 @@ class SmolVLA(VLA, nn.Module):
         Raises:
             DataError: an input of a width that the model does not have.
         """
-        draws, shape = noise.shape[1], self.action_shape
+        repeats, shape = noise.shape[1], self.action_shape
         _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
         _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states).repeat(draws)
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        cache = cache.repeat_interleave(repeats)
         t = (1.0 - time)[..., None, None]
         clean = actions[:, None]
         noisy, target = t * noise + (1.0 - t) * clean, noise - clean
-        found = self._velocity(noisy.flatten(0, 1), t.flatten(), memory).unflatten(0, (-1, draws))
-        errors = (found.float() - target).square()[..., : self.ori_action_dim]
+        velocity = self._velocity(noisy.flatten(0, 1), t.flatten(), cache)
+        velocity = velocity.unflatten(0, (-1, repeats))
+        errors = (velocity.float() - target).square()[..., : self.ori_action_dim]
         loss, each = masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
@@ -225,10 +227,10 @@ class SmolVLA(VLA, nn.Module):
         if guide is None:
             seen = self.observe(images, img_masks, lang_tokens, lang_masks, states)
             return self.denoise(seen, noise, self.step_tables())
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return self._velocity(x, t, memory).to(x.dtype)
+            return self._velocity(x, t, cache).to(x.dtype)
 
         return sample(velocity, noise, self.num_steps, guide)
 
@@ -245,8 +247,8 @@ class SmolVLA(VLA, nn.Module):
         Raises:
             DataError: an input of a width that the model does not have.
         """
-        memory = self._memory(images, img_masks, lang_tokens, lang_masks, states)
-        return self.expert.observe(memory, self.n_action_steps)
+        cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        return self.expert.observe(cache, self.n_action_steps)
 
     def denoise(
         self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
@@ -255,14 +257,14 @@ class SmolVLA(VLA, nn.Module):
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
         x = noise
         for step in range(self.num_steps):
-            tokens = self.embed_actions.told(x, tables["times"][step])
+            tokens = self.embed_actions.embed_at_time(x, tables["times"][step])
             x = x - self._out(self.expert.step(tokens, seen)).to(x.dtype) / self.num_steps
         return x
 
     def step_tables(self) -> dict[str, Tensor]:
-        """``times`` ``(K, W)``: what stands for the time in every step."""
+        """``times`` ``(K, W)``: sinusoidal features of the time of every step."""
         times = torch.tensor([1.0 - step / self.num_steps for step in range(self.num_steps)])
-        return {"times": self.embed_actions.waves(times.to(self.state_proj.weight.device))}
+        return {"times": self.embed_actions.time_features(times.to(self.state_proj.weight.device))}
 
     @property
     def observe_is_capturable(self) -> bool:
@@ -282,9 +284,10 @@ class SmolVLA(VLA, nn.Module):
         """The layers of the vision tower, of the language model and of the expert."""
         return [*self.vision.layers, *self.text.layers, *self.expert.layers]
 
-    def _memory(
+    def _encode_prefix(
         self, images: Tensor, img_masks: Tensor, tokens: Tensor, masks: Tensor, states: Tensor
-    ) -> Memory:
+    ) -> KVCache:
+        """The KV cache of images, instruction and state."""
         cameras, rest = divmod(images.shape[1], 3)
         if rest or cameras != img_masks.shape[1]:
             raise DataError(
@@ -292,23 +295,23 @@ class SmolVLA(VLA, nn.Module):
                 "cameras; 3 channels each are expected"
             )
         _expect("states", states.shape[1:], "max_state_dim", (self.max_state_dim,))
-        pictures = self._look(images.unflatten(1, (cameras, 3)).flatten(0, 1))
-        pictures = pictures.unflatten(0, (-1, cameras))
-        shown = img_masks.bool()[..., None].expand(-1, -1, pictures.shape[2])
-        words = self.text.embed_tokens(tokens)
-        context = torch.cat([pictures.flatten(1, 2), words.to(pictures.dtype)], dim=1)
-        seen = torch.cat([shown.flatten(1), masks.bool()], dim=1)
+        features = self._encode_images(images.unflatten(1, (cameras, 3)).flatten(0, 1))
+        features = features.unflatten(0, (-1, cameras))
+        image_mask = img_masks.bool()[..., None].expand(-1, -1, features.shape[2])
+        embeddings = self.text.embed_tokens(tokens)
+        context = torch.cat([features.flatten(1, 2), embeddings.to(features.dtype)], dim=1)
+        mask = torch.cat([image_mask.flatten(1), masks.bool()], dim=1)
         state = self.state_proj(states)[:, None]
-        # LeRobot scales pictures and words by the root of their width, but not the state.
-        return self.text(context * self.width**0.5, seen, state)
+        # LeRobot scales image and text embeddings by the root of their width, but not the state.
+        return self.text(context * self.width**0.5, mask, state)
 
-    def _look(self, pictures: Tensor) -> Tensor:
+    def _encode_images(self, images: Tensor) -> Tensor:
         """``(B, 3, H, W)`` in -1..1 -> ``(B, tokens, width)``."""
-        whole = resize_with_pad(pictures, self.image_size, self.image_size, BLACK)
+        whole = resize_with_pad(images, self.image_size, self.image_size, BLACK)
         return self.connector(self.vision(whole))
 
-    def _velocity(self, noisy: Tensor, t: Tensor, memory: Memory) -> Tensor:
-        return self._out(self.expert(self.embed_actions(noisy, t), memory))
+    def _velocity(self, noisy: Tensor, t: Tensor, cache: KVCache) -> Tensor:
+        return self._out(self.expert(self.embed_actions(noisy, t), cache))
 
     def _out(self, hidden: Tensor) -> Tensor:
         out = self.action_out_proj

@@ -11,7 +11,7 @@ from fluxvla_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class VisionSize:
-    """The vision tower: a SigLIP transformer on square pictures.
+    """The vision tower: a SigLIP transformer on square images.
 
     Args:
         hidden_size, intermediate_size: widths of the residual stream and of its MLPs.
@@ -37,7 +37,7 @@ class VisionSize:
 
     @property
     def side(self) -> int:
-        """Patches along a side of a picture."""
+        """Patches along a side of an image."""
         return self.image_size // self.patch_size
 
 

@@ -27,12 +27,12 @@ class Rotation:
 
     @classmethod
     def at(cls, positions: Tensor, head_dim: int) -> Rotation:
-        """For ``positions`` ``(B, L)``, in fp32."""
+        """Cosines and sines at ``positions`` ``(B, L)``, in fp32."""
         half = torch.arange(head_dim // 2, dtype=torch.float32, device=positions.device)
         angles = positions[:, None, :, None].float() / LONGEST_WAVE ** (2.0 / head_dim * half)
         return cls(angles.cos(), angles.sin())
 
-    def turn(self, x: Tensor) -> Tensor:
+    def rotate(self, x: Tensor) -> Tensor:
         """``(B, heads, L, head_dim)`` with its two halves rotated, computed in fp32."""
         first, second = x.float().chunk(2, dim=-1)
         turned = (
@@ -98,7 +98,7 @@ class Attention(nn.Module):
     def attend(
         self, query: Tensor, key: Tensor, value: Tensor, mask: Tensor, folded: bool = False
     ) -> Tensor:
-        """``(B, L, width)``: the answer to each query.
+        """The attention's output ``(B, L, width)``.
 
         Args:
             query: ``(B, heads, L, head_dim)``.
@@ -118,7 +118,7 @@ class Attention(nn.Module):
 
 
 class Layer(nn.Module):
-    """What both kinds of layers are made of."""
+    """Base class of both kinds of layers: norms, attention and MLP."""
 
     def __init__(self, size: TextSize, key_width: int | None = None) -> None:
         super().__init__()
@@ -134,14 +134,14 @@ class Layer(nn.Module):
 
 @dataclass(frozen=True)
 class Prefix:
-    """Where the tokens of a prefix are and which of them are real.
+    """Attention mask and rotary positions of the prefix: images, instruction and state.
 
     Args:
-        seen: ``(B, 1, 1, C)`` bool: real context tokens.
+        mask: ``(B, 1, 1, C)`` bool, False on padding and absent cameras.
         context, state: rotations of the C context tokens and of the state token.
     """
 
-    seen: Tensor
+    mask: Tensor
     context: Rotation
     state: Rotation
 
@@ -149,7 +149,7 @@ class Prefix:
 class ContextLayer(Layer):
     """A layer of the language model.
 
-    Context tokens (pictures, instruction) attend to each other, the state token attends to them
+    Context tokens (images, instruction) attend to each other, the state token attends to them
     and to itself. Nothing attends to the state, so it goes beside the context: where the language
     model is frozen, only the state's share is differentiated.
     """
@@ -162,64 +162,64 @@ class ContextLayer(Layer):
         Args:
             context: ``(B, C, width)``; ``state``: ``(B, 1, width)``.
             prefix: positions and mask.
-            last: nobody needs the next layer's tokens; they come back as they are.
+            last: no layer follows; the tokens are returned unchanged.
 
         Returns:
             ``(B, C, width)``, ``(B, 1, width)``, and keys and values, the state's behind the
             context's: ``(B, kv_heads, C + 1, head_dim)`` each.
         """
         attention = self.self_attn
-        here, own = self.input_layernorm(context), self.input_layernorm(state)
-        keys, values = attention.key_value(here, here)
-        state_key, state_value = attention.key_value(own, own)
-        keys = prefix.context.turn(keys)
-        all_keys = torch.cat([keys, prefix.state.turn(state_key)], dim=2)
+        normed, state_normed = self.input_layernorm(context), self.input_layernorm(state)
+        keys, values = attention.key_value(normed, normed)
+        state_key, state_value = attention.key_value(state_normed, state_normed)
+        keys = prefix.context.rotate(keys)
+        all_keys = torch.cat([keys, prefix.state.rotate(state_key)], dim=2)
         all_values = torch.cat([values, state_value], dim=2)
         if last:
             return context, state, all_keys, all_values
-        asked = prefix.context.turn(attention.query(here))
-        context = self._after(context, attention.attend(asked, keys, values, prefix.seen))
-        asked = prefix.state.turn(attention.query(own))
-        seen = functional.pad(prefix.seen, (0, 1), value=True)
-        state = self._after(state, attention.attend(asked, all_keys, all_values, seen))
+        query = prefix.context.rotate(attention.query(normed))
+        context = self._after(context, attention.attend(query, keys, values, prefix.mask))
+        query = prefix.state.rotate(attention.query(state_normed))
+        mask = functional.pad(prefix.mask, (0, 1), value=True)
+        state = self._after(state, attention.attend(query, all_keys, all_values, mask))
         return context, state, all_keys, all_values
 
 
 @dataclass(frozen=True)
-class Memory:
-    """What the action expert attends to: the language model's keys and values, layer by layer.
+class KVCache:
+    """KV cache: the language model's keys and values of the prefix, which the expert attends to.
 
     Args:
-        keys, values: ``(B, kv_heads, S, head_dim)`` each.
-        seen: ``(B, 1, 1, S)`` bool.
+        keys, values: of each layer, ``(B, kv_heads, S, head_dim)`` each.
+        mask: ``(B, 1, 1, S)`` bool.
         length: ``(B,)``: real tokens, the position of the first action.
     """
 
     keys: tuple[Tensor, ...]
     values: tuple[Tensor, ...]
-    seen: Tensor
+    mask: Tensor
     length: Tensor
 
-    def repeat(self, times: int) -> Memory:
-        """The memory of each sample ``times`` in a row."""
+    def repeat_interleave(self, times: int) -> KVCache:
+        """Each sample ``times`` in a row (repeat-interleave)."""
         if times == 1:
             return self
         keys, values = (
             tuple(part.repeat_interleave(times, 0) for part in parts)
             for parts in (self.keys, self.values)
         )
-        return Memory(
+        return KVCache(
             keys,
             values,
-            self.seen.repeat_interleave(times, 0),
+            self.mask.repeat_interleave(times, 0),
             self.length.repeat_interleave(times, 0),
         )
 
 
 @dataclass(frozen=True)
 class Suffix:
-    """Where the action tokens are: ``causal`` ``(1, 1, T, T)`` bool, rotations of their positions
-    behind the prefix and, for cross-attention, counted from 0."""
+    """Mask and positions of the action tokens: ``causal`` ``(1, 1, T, T)`` bool, rotations of their
+    positions behind the prefix and, for cross-attention, counted from 0 (``alone``)."""
 
     causal: Tensor
     behind: Rotation
@@ -242,34 +242,33 @@ class ExpertLayer(Layer):
         x: Tensor,
         keys: Tensor,
         values: Tensor,
-        seen: Tensor,
+        mask: Tensor,
         suffix: Suffix,
-        known: bool = False,
+        prepared: bool = False,
     ) -> Tensor:
         """``(B, T, width)`` -> the same shape.
 
         Args:
-            keys, values, seen: one layer of ``Memory``.
-            suffix: places of the action tokens.
-            known: keys and values are what :meth:`project` made of them, and ``seen`` the whole
+            keys, values, mask: one layer of ``KVCache``.
+            suffix: mask and positions of the action tokens.
+            prepared: keys and values are what :meth:`project` returned, and ``mask`` the whole
                 mask of this kind of layer as ``fluxvla_models.folded_attention`` has it.
         """
         attention = self.self_attn
         normed = self.input_layernorm(x)
-        asked = attention.query(normed)
+        query = attention.query(normed)
         if self.crosses:
-            if not known:
+            if not prepared:
                 keys, values = self.project(keys, values)
-            answer = attention.attend(suffix.alone.turn(asked), keys, values, seen, known)
+            answer = attention.attend(suffix.alone.rotate(query), keys, values, mask, prepared)
             return self._after(x, answer)
         own_keys, own_values = attention.key_value(normed, normed)
-        keys = torch.cat([keys, suffix.behind.turn(own_keys)], dim=2)
+        keys = torch.cat([keys, suffix.behind.rotate(own_keys)], dim=2)
         values = torch.cat([values, own_values], dim=2)
-        mask = seen
-        if not known:
-            rows = seen.expand(-1, -1, x.shape[1], -1)
+        if not prepared:
+            rows = mask.expand(-1, -1, x.shape[1], -1)
             mask = torch.cat([rows, suffix.causal.expand(len(x), -1, -1, -1)], dim=3)
-        answer = attention.attend(suffix.behind.turn(asked), keys, values, mask, known)
+        answer = attention.attend(suffix.behind.rotate(query), keys, values, mask, prepared)
         return self._after(x, answer)
 
     def project(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
-"""The vision tower and the connector: pictures to tokens of the language model.
+"""The vision tower and the connector: images to tokens of the language model.
 
-SigLIP (Zhai et al. 2023) on whole pictures, then pixel shuffle: a square of neighbouring patches
+SigLIP (Zhai et al. 2023) on whole images, then pixel shuffle: a square of neighbouring patches
 becomes one wide vector, which a linear layer brings to the language model's width (Marafioti et
 al. 2025, SmolVLM, arXiv 2504.05299).
 """
@@ -15,7 +15,7 @@ from fluxvla_smolvla.sizes import VisionSize
 
 
 class VisionAttention(nn.Module):
-    """Attention between all patches of a picture."""
+    """Attention between all patches of an image."""
 
     def __init__(self, size: VisionSize) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class VisionLayer(nn.Module):
 
 
 class VisionTower(nn.Module):
-    """Pictures ``(B, 3, H, W)`` in -1..1 -> ``(B, patches, width)``."""
+    """Images ``(B, 3, H, W)`` in -1..1 -> ``(B, patches, width)``."""
 
     def __init__(self, size: VisionSize) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class Connector(nn.Module):
 
 
 def resize_with_pad(images: Tensor, height: int, width: int, fill: float) -> Tensor:
-    """``(B, C, H, W)`` float pictures at ``height`` x ``width`` without distortion.
+    """``(B, C, H, W)`` float images at ``height`` x ``width`` without distortion.
 
     What is left of the shape is filled on the left and on top, as LeRobot does for SmolVLA; sizes
     are rounded down, interpolation is bilinear without a filter.

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from fluxvla_core.errors import ConfigError, Faulted, Rejected
 from fluxvla_core.operators import Camera
 from fluxvla_core.ros2 import (
+    AUXILIARY,
     FLOAT64,
     FLOAT64_ARRAY,
     JOINT_STATE,
-    SIDE,
     BadMessage,
     CommandSpec,
     RosOperator,
@@ -83,8 +83,8 @@ class UROperator(RosOperator):
         gripper_message: type of its state and command: std_msgs ``Float64`` or ``Float32``.
         trajectory_time_s: with a trajectory controller, how far ahead each target is set.
         camera_rate_hz: pictures a second that should come; None: as many as are sent.
-        domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.RosOperator``.
+        **connection: as ``fluxvla_core.ros2.RosOperator`` takes it: ``domain_id``, how long to wait
+            for streams, how old they may be.
 
     Raises:
         ConfigError: an unknown model or controller, or a value out of its range.
@@ -117,16 +117,9 @@ class UROperator(RosOperator):
         gripper_message: str = FLOAT64,
         trajectory_time_s: float = 0.1,
         camera_rate_hz: float | None = None,
-        domain_id: int | None = None,
-        connect_timeout_s: float = 10.0,
-        max_age_s: float = 0.5,
-        max_skew_s: float = 0.1,
-        sync_on: str = "stamp",
-        rate_window_s: float = 1.0,
+        **connection: Any,
     ) -> None:
-        super().__init__(
-            domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s
-        )
+        super().__init__(**connection)
         if controller not in CONTROLLERS:
             raise ConfigError(
                 f"unknown controller {controller!r}; known are {', '.join(CONTROLLERS)}"
@@ -176,14 +169,16 @@ class UROperator(RosOperator):
         if self._gripper_joint is None:
             # A bare number has no stamp, so it cannot be matched in time with the others.
             found.append(
-                StreamSpec("gripper", self._gripper_state, self._gripper_message, SIDE, depth=1)
+                StreamSpec(
+                    "gripper", self._gripper_state, self._gripper_message, AUXILIARY, depth=1
+                )
             )
         hint = " (drivers that have none: require_status=False)" if self._require_status else ""
         scaling = StreamSpec(
             "speed scaling",
             self._scaling_topic,
             FLOAT64,
-            SIDE,
+            AUXILIARY,
             depth=1,
             required=self._require_status,
             unheard="the driver's speed_scaling_state_broadcaster is not active, or has another "
@@ -193,7 +188,7 @@ class UROperator(RosOperator):
             "program running",
             self._running_topic,
             BOOL,
-            SIDE,
+            AUXILIARY,
             depth=1,
             required=self._require_status,
             latched=True,
@@ -232,7 +227,7 @@ class UROperator(RosOperator):
             raise BadMessage(f"the speed scaling ({self._scaling_topic}) is {percent}")
         return min(max(percent / 100.0, 0.0), 1.0)
 
-    def admit(self, action: Array) -> None:
+    def check_command(self, action: Array) -> None:
         running = self.newest("program running")
         if running is not None and not running.message.data:
             raise Faulted(

@@ -11,7 +11,7 @@ from fluxvla_core.errors import UsageError
 from fluxvla_wandb.runs import MODES, open_run, place, video
 
 FOLDERS = ("eval", "eval_live", "eval_robot")
-"""Of a work dir, each with ``results.json``: in simulation, on the wall clock, on a robot."""
+"""Folders of a work dir that have a ``results.json``: simulated, real-time, on a robot."""
 FORMAT = "fluxvla-eval-1"
 
 

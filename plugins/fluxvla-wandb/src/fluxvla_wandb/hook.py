@@ -11,7 +11,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_wandb.runs import check_mode, open_run, place, video
 
 FOLDER = "inference"
-"""Of a work dir: a folder for each episode, with a video for each camera."""
+"""Folder of a work dir that has a folder for each episode, with a video for each camera."""
 _SUMMARY = "episode.json"
 """Written when an episode has ended, after its videos."""
 

@@ -62,5 +62,5 @@ def video(path: Path, caption: str) -> Any:
 
 
 def place(run: Any) -> str:
-    """Where people find what was logged: a URL, or the folder of an offline run."""
+    """Where the logged run is found: a URL, or the folder of an offline run."""
     return run.url or f"{Path(run.dir).parent}; 'wandb sync' sends it"

@@ -27,7 +27,7 @@ _INSIDE = 1e-6  # m
 
 
 class SnapGripper(ActionFilter):
-    """Closes a gripper wholly once its target is nearly closed.
+    """Closes a gripper completely once its target is nearly closed.
 
     Policies learn the position at which a gripper came to rest on an object; commanding that holds
     it without force.

@@ -80,7 +80,7 @@ class Smoothing:
         return newest
 
     def halt(self, joints: npt.NDArray[np.bool_], pose: Array) -> None:
-        """The joints that are marked have been at the ``(D,)`` pose for ever."""
+        """Reset the marked joints: they have rested at the ``(D,)`` pose."""
         self._rows = np.where(joints, pose, self._rows)
 
     def add(self, newest: Array) -> Array:

@@ -25,8 +25,8 @@ from fluxvla_core.robot.process.messages import Array
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 SHARE = 0.5
-"""Of the control period: what all timed filters together may take. A command is so late at most,
-and none is skipped."""
+"""Share of the control period that all timed filters together may take: no command is later than
+that, and none is skipped."""
 MOST_LATE = 3
 """Commands in a row of which a filter may be left out; the last of them is not sent."""
 RESET_S = 0.5

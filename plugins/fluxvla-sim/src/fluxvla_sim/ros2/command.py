@@ -101,7 +101,7 @@ class SimCommand:
             "--log-format",
             choices=("text", "json"),
             default="text",
-            help="for people (default) or one JSON object a line",
+            help="text (default), or one JSON object per line",
         )
 
     def run(self, args: Any) -> int:

@@ -14,7 +14,7 @@ from fluxvla_core.ros2.sync import Stale
 POLL_S = 0.002
 
 
-class Readings:
+class StreamReader:
     """The newest messages of the streams of one connection.
 
     Args:
@@ -76,7 +76,7 @@ class Readings:
             Stale: their stamps are too far apart.
         """
         if self._sync_on == "stamp" and not self._clock_stepped():
-            sync.check_together(self._kept(self._states), self._max_skew, sync.wall())
+            sync.check_together(self._kept(self._states), self._max_skew, sync.wall_offset())
 
     def matched(self) -> Mapping[str, Received]:
         """Messages of state, cameras and depth that belong together, one of each stream.
@@ -96,7 +96,7 @@ class Readings:
             kept = self._kept(self._in_frames)
             try:
                 self.check_states_together()
-                match = sync.match(kept, self._max_skew, by, sync.wall())
+                match = sync.match(kept, self._max_skew, by, sync.wall_offset())
                 sync.check_age(match, time.monotonic(), self._max_age)
             except Stale:
                 if time.monotonic() >= until:

@@ -1,7 +1,7 @@
-"""Parts of sharded tensors: which one this rank holds, and reading any part of saved ones.
+"""Shards of tensors: which one this rank holds, and reading any block of saved tensors.
 
-Each rank saves its own parts of the optimizer's state in a safetensors file, with the place of
-each part in its header, in the layout that torch.distributed.checkpoint's
+Each rank saves its own shards of the optimizer's state in a safetensors file, with the offsets
+of each shard in its header, in the layout that torch.distributed.checkpoint's
 ``HuggingFaceStorageReader`` reads (torch/distributed/checkpoint/hf_storage.py). DCP's own writer
 is not used: its default one pickles the metadata and its safetensors one forms each file in
 memory as a whole, and neither can be hashed, flushed and failed one operation at a time.
@@ -36,31 +36,31 @@ T = TypeVar("T")
 PLACES = "DCP_SHARDING_INFO"
 """Header entry: JSON of ``{name: {"saved_offsets": [...]}}``."""
 SHAPES = "shapes"
-"""Header entry: JSON of ``{name: [...]}``, the shapes of the whole tensors."""
+"""Header entry: JSON of ``{name: [...]}``, the shapes of the full tensors."""
 
 
 @dataclass(frozen=True)
-class Region:
+class Block:
     """A block of a tensor: where it begins and how long it is in each dimension."""
 
     offsets: tuple[int, ...]
     sizes: tuple[int, ...]
 
     @classmethod
-    def of(cls, tensor: Tensor) -> Region:
-        """This rank's part of ``tensor``; all of it if it is not sharded.
+    def of(cls, tensor: Tensor) -> Block:
+        """This rank's shard of ``tensor``; all of it if it is not sharded.
 
         Raises:
-            CheckpointError: it is split in a way that is not a block.
+            CheckpointError: it is sharded in a way that is not a block.
         """
         offsets, sizes = [0] * tensor.ndim, list(tensor.shape)
         if is_dtensor(tensor):
-            for along, dim in splits(tensor).items():
+            for along, dim in shard_dims(tensor).items():
                 # As torch.chunk cuts: equal parts, the last ones shorter or empty.
-                part = -(-sizes[dim] // tensor.device_mesh.size(along))
-                begin = min(tensor.device_mesh.get_local_rank(along) * part, sizes[dim])
+                length = -(-sizes[dim] // tensor.device_mesh.size(along))
+                begin = min(tensor.device_mesh.get_local_rank(along) * length, sizes[dim])
                 offsets[dim] += begin
-                sizes[dim] = min(part, sizes[dim] - begin)
+                sizes[dim] = min(length, sizes[dim] - begin)
             if tuple(sizes) != tuple(tensor.to_local().shape):
                 raise CheckpointError(
                     f"a tensor that is split by {tensor.placements} cannot be saved or loaded",
@@ -70,56 +70,56 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        """Slices that select this region of the full tensor."""
+        """Slices that select this block of the full tensor."""
         return tuple(slice(o, o + n) for o, n in zip(self.offsets, self.sizes, strict=True))
 
-    def common(self, other: Region) -> Region | None:
-        """The block that lies in both, in whole coordinates; None if there is none."""
+    def intersection(self, other: Block) -> Block | None:
+        """The block that both cover, in coordinates of the full tensor; None if there is none."""
         begins = [max(pair) for pair in zip(self.offsets, other.offsets, strict=True)]
         ends = [
             min(a + n, b + m)
             for a, n, b, m in zip(self.offsets, self.sizes, other.offsets, other.sizes, strict=True)
         ]
         sizes = [end - begin for begin, end in zip(begins, ends, strict=True)]
-        return Region(tuple(begins), tuple(sizes)) if all(n > 0 for n in sizes) else None
+        return Block(tuple(begins), tuple(sizes)) if all(n > 0 for n in sizes) else None
 
-    def inside(self, outer: Region) -> tuple[slice, ...]:
-        """Slices that select this region of a tensor that holds just ``outer``."""
+    def relative_to(self, outer: Block) -> tuple[slice, ...]:
+        """Slices that select this block of a tensor that holds just ``outer``."""
         moved = [o - p for o, p in zip(self.offsets, outer.offsets, strict=True)]
-        return Region(tuple(moved), self.sizes).slices
+        return Block(tuple(moved), self.sizes).slices
 
 
-def is_split(tensor: Tensor) -> bool:
-    """Whether more than one rank is needed to put ``tensor`` together."""
+def is_sharded(tensor: Tensor) -> bool:
+    """Whether ``tensor`` is sharded over more than one rank."""
     return is_dtensor(tensor) and any(
-        tensor.device_mesh.size(along) > 1 for along in splits(tensor)
+        tensor.device_mesh.size(along) > 1 for along in shard_dims(tensor)
     )
 
 
-def own_parts(tensors: Mapping[str, Tensor], first: bool) -> dict[str, Tensor]:
+def local_shards(tensors: Mapping[str, Tensor], is_rank0: bool) -> dict[str, Tensor]:
     """The local shards of ``tensors`` that this rank saves; each shard is saved by one rank.
 
     Args:
-        first: whether this rank saves what is not split.
+        is_rank0: whether this rank saves what is not sharded.
     """
-    found = {}
+    shards = {}
     for name, tensor in tensors.items():
         if not is_dtensor(tensor):
-            mine = first
+            mine = is_rank0
         else:
-            mesh, cut = tensor.device_mesh, splits(tensor)
+            mesh, cut = tensor.device_mesh, shard_dims(tensor)
             copies = [along for along in range(mesh.ndim) if along not in cut]
             mine = all(mesh.get_local_rank(dim) == 0 for dim in copies)
-            region = Region.of(tensor)
-            mine = mine and (prod(region.sizes) > 0 or not any(region.offsets))
+            block = Block.of(tensor)
+            mine = mine and (prod(block.sizes) > 0 or not any(block.offsets))
         if mine:
-            found[name] = tensor
-    return found
+            shards[name] = tensor
+    return shards
 
 
-def describe_parts(tensors: Mapping[str, Tensor]) -> dict[str, str]:
-    """Description of this rank's parts of ``tensors``, for the header of their file."""
-    places = {name: {"saved_offsets": Region.of(t).offsets} for name, t in tensors.items()}
+def shard_metadata(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """Offsets and shapes of this rank's shards of ``tensors``, for the header of their file."""
+    places = {name: {"saved_offsets": Block.of(t).offsets} for name, t in tensors.items()}
     shapes = {name: list(t.shape) for name, t in tensors.items()}
     return {PLACES: json.dumps(places), "DCP_VERSION": "1.0", SHAPES: json.dumps(shapes)}
 
@@ -130,41 +130,41 @@ class Stored:
     def __init__(self, name: str, shape: Sequence[int]) -> None:
         self.name = name
         self.shape = torch.Size(shape)
-        self._parts: list[tuple[Any, Region]] = []
+        self._shards: list[tuple[Any, Block]] = []
 
-    def add(self, file: Any, region: Region) -> None:
-        """``file``, opened by safetensors, has ``region`` under this name."""
-        self._parts.append((file, region))
+    def add(self, file: Any, block: Block) -> None:
+        """``file``, opened by safetensors, has ``block`` under this name."""
+        self._shards.append((file, block))
 
     def __getitem__(self, where: tuple[slice, ...]) -> Tensor:
         """A block, on the CPU; it may be a view of the file.
 
         Raises:
-            CheckpointError: parts of it are in no file.
+            CheckpointError: some of it is in no file.
         """
         ranges = [s.indices(length) for s, length in zip(where, self.shape, strict=True)]
-        wanted = Region(
+        wanted = Block(
             tuple(begin for begin, _, _ in ranges), tuple(end - begin for begin, end, _ in ranges)
         )
-        for file, region in self._parts:
-            if region == wanted:
+        for file, block in self._shards:
+            if block == wanted:
                 whole: Tensor = file.get_tensor(self.name)
                 return whole
         out: Tensor | None = None
-        found = 0
-        for file, region in self._parts:
-            both = wanted.common(region)
-            if both is None:
+        count = 0
+        for file, block in self._shards:
+            overlap = wanted.intersection(block)
+            if overlap is None:
                 continue
-            piece: Tensor = file.get_slice(self.name)[both.inside(region)]
+            piece: Tensor = file.get_slice(self.name)[overlap.relative_to(block)]
             if out is None:
                 out = torch.empty(wanted.sizes, dtype=piece.dtype)
-            out[both.inside(wanted)] = piece
-            found += prod(both.sizes)
-        if found != prod(wanted.sizes):
+            out[overlap.relative_to(wanted)] = piece
+            count += prod(overlap.sizes)
+        if count != prod(wanted.sizes):
             raise CheckpointError(f"parts of {self.name} are in no file of the checkpoint")
         if out is None:  # nothing was asked for: this rank's part is empty
-            file, region = self._parts[0]
+            file, block = self._shards[0]
             none = tuple(slice(0, 0) if n == 0 else slice(0, n) for n in wanted.sizes)
             out = torch.empty(wanted.sizes, dtype=file.get_slice(self.name)[none].dtype)
         return out
@@ -176,7 +176,7 @@ class _Place:
 
 
 class StoredTensors(Mapping[str, Stored]):
-    """The tensors of one or several safetensors files, by name; parts of one belong together.
+    """The tensors of one or several safetensors files, by name; shards of one are joined.
 
     Raises:
         CheckpointError: a file cannot be read as that format.
@@ -203,7 +203,7 @@ class StoredTensors(Mapping[str, Stored]):
             shape = shapes.get(name, sizes)
             if not len(offsets) == len(sizes) == len(shape):
                 raise CheckpointError(f"{path.name} contradicts itself about {name}")
-            self._tensors.setdefault(name, Stored(name, shape)).add(file, Region(offsets, sizes))
+            self._tensors.setdefault(name, Stored(name, shape)).add(file, Block(offsets, sizes))
 
     def __getitem__(self, name: str) -> Stored:
         return self._tensors[name]
@@ -264,14 +264,14 @@ def is_dtensor(tensor: object) -> TypeGuard[DTensor]:
     return isinstance(tensor, getattr(sys.modules.get("torch.distributed.tensor"), "DTensor", ()))
 
 
-def splits(tensor: DTensor) -> dict[int, int]:
-    """Dimension of the mesh -> dimension of ``tensor`` that is cut along it."""
+def shard_dims(tensor: DTensor) -> dict[int, int]:
+    """Dimension of the mesh -> dimension of ``tensor`` that is sharded along it."""
     from torch.distributed.tensor import Shard
 
     return {d: p.dim for d, p in enumerate(tensor.placements) if isinstance(p, Shard)}
 
 
-def local(tensor: Tensor) -> Tensor:
-    """This rank's part of ``tensor``, without its gradient: all of it if it is not a DTensor."""
+def to_local(tensor: Tensor) -> Tensor:
+    """This rank's shard of ``tensor``, detached: all of it if it is not a DTensor."""
     tensor = tensor.detach()
     return tensor.to_local() if is_dtensor(tensor) else tensor

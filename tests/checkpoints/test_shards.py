@@ -10,13 +10,13 @@ import torch.distributed.checkpoint as dcp
 from safetensors.torch import save_file
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader
 
-from fluxvla_core.checkpoints.parts import (
+from fluxvla_core.checkpoints.shards import (
     PLACES,
     SHAPES,
-    Region,
+    Block,
     StoredTensors,
-    is_split,
-    own_parts,
+    is_sharded,
+    local_shards,
 )
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
@@ -91,19 +91,19 @@ def test_a_file_of_another_kind_is_named(tmp_path):
 
 def test_a_plain_file_is_its_own_only_part(tmp_path):
     with CheckpointWriter(tmp_path, 1, 0) as writer:
-        TensorFile.whole("o.safetensors", WHOLE, True).write(writer)
-        TensorFile.parts("p.safetensors", own_parts(WHOLE, True)).write(writer)
+        TensorFile.full("o.safetensors", WHOLE, True).write(writer)
+        TensorFile.shards("p.safetensors", local_shards(WHOLE, True)).write(writer)
         path = writer.commit()
-    assert own_parts(WHOLE, False) == {}
+    assert local_shards(WHOLE, False) == {}
     for name in ("o", "p"):
         found = everything(StoredTensors([path / f"{name}.safetensors"]))
         assert all(torch.equal(found[n], WHOLE[n]) for n in WHOLE)
 
 
 def test_regions():
-    whole = Region.of(WHOLE["a"])
-    assert whole == Region((0, 0), (7, 5))
-    assert Region((2, 1), (3, 4)).common(Region((4, 0), (3, 2))) == Region((4, 1), (1, 1))
-    assert Region((0, 0), (2, 5)).common(Region((2, 0), (5, 5))) is None
-    assert Region((4, 1), (1, 1)).inside(Region((3, 0), (4, 5))) == (slice(1, 2), slice(1, 2))
-    assert not is_split(WHOLE["a"])
+    whole = Block.of(WHOLE["a"])
+    assert whole == Block((0, 0), (7, 5))
+    assert Block((2, 1), (3, 4)).intersection(Block((4, 0), (3, 2))) == Block((4, 1), (1, 1))
+    assert Block((0, 0), (2, 5)).intersection(Block((2, 0), (5, 5))) is None
+    assert Block((4, 1), (1, 1)).relative_to(Block((3, 0), (4, 5))) == (slice(1, 2), slice(1, 2))
+    assert not is_sharded(WHOLE["a"])

@@ -18,6 +18,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
+from tests.policies.benched import DIVIDED, stages_of
 
 from .oracles.pi_inputs import EXPERT, GEMMA, VISION, VOCABULARY
 from .published_folders import tokenizer_folder
@@ -102,6 +103,7 @@ def test_it_trains_from_published_weights_and_acts(tmp_path, monkeypatch):
     )
     assert found.shape == (50, 14)
     assert np.isfinite(found).all()
+    assert stages_of(tmp_path / "out", tmp_path / "measured") == DIVIDED
 
 
 TINY = ROOT / "configs" / "aloha_sim_pi05_tiny.py"

@@ -151,17 +151,17 @@ class Stored:
                 whole: Tensor = file.get_tensor(self.name)
                 return whole
         out: Tensor | None = None
-        found = 0
+        count = 0
         for file, block in self._shards:
-            both = wanted.intersection(block)
-            if both is None:
+            overlap = wanted.intersection(block)
+            if overlap is None:
                 continue
-            piece: Tensor = file.get_slice(self.name)[both.relative_to(block)]
+            piece: Tensor = file.get_slice(self.name)[overlap.relative_to(block)]
             if out is None:
                 out = torch.empty(wanted.sizes, dtype=piece.dtype)
-            out[both.relative_to(wanted)] = piece
-            found += prod(both.sizes)
-        if found != prod(wanted.sizes):
+            out[overlap.relative_to(wanted)] = piece
+            count += prod(overlap.sizes)
+        if count != prod(wanted.sizes):
             raise CheckpointError(f"parts of {self.name} are in no file of the checkpoint")
         if out is None:  # nothing was asked for: this rank's part is empty
             file, block = self._shards[0]

@@ -267,11 +267,11 @@ def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> 
     reporter = KeepAliveReporter(make_reporter(args.log_format))
     try:
         reporter.info(f"collecting {collection.episodes} demonstrations into {Path(args.out)}")
-        found = collect(args.out, collection, args.workers, args.resume, reporter)
-        again = f", {found['retried']} tried again" if found["retried"] else ""
+        results = collect(args.out, collection, args.workers, args.resume, reporter)
+        again = f", {results['retried']} tried again" if results["retried"] else ""
         reporter.info(
-            f"{found['episodes']} episodes, {found['frames']} new frames{again} in "
-            f"{found['seconds']:.0f} s: {found['frames_per_s']:.1f} frames/s"
+            f"{results['episodes']} episodes, {results['frames']} new frames{again} in "
+            f"{results['seconds']:.0f} s: {results['frames_per_s']:.1f} frames/s"
         )
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(

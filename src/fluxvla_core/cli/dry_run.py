@@ -10,6 +10,7 @@ from fluxvla_core.cli.config_commands import listing, used
 from fluxvla_core.cli.plan import Plan
 
 if TYPE_CHECKING:
+    from fluxvla_core.errors import FluxError
     from fluxvla_core.spec.embodiment import EmbodimentSpec
     from fluxvla_core.training.footprint import Footprint
     from fluxvla_core.training.rehearsal import Rehearsal
@@ -30,16 +31,17 @@ _ROWS = {
 }
 
 
-def outline(plan: Plan, log_format: str, nproc: int | None) -> str:
-    """What ``--dry-run`` prints, for people or as one JSON object.
+def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxError | None]:
+    """What ``--dry-run`` prints, for people or as one JSON object; what the run would end with.
 
     Args:
         log_format: ``text`` or ``json``.
         nproc: processes of the training; None for a few numbers of them.
     """
-    found = _rehearsal(plan, nproc) if plan.trains and "model" in plan.config.tree else None
+    rehearsal = _rehearsal(plan, nproc) if plan.trains and "model" in plan.config.tree else None
+    refused = None if rehearsal is None or isinstance(rehearsal, str) else rehearsal.refused
     if log_format == "json":
-        return json.dumps(_as_json(plan, found))
+        return json.dumps(_as_json(plan, rehearsal)), refused
     lines = [
         f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
         f"work dir: {plan.work_dir}",
@@ -48,11 +50,11 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> str:
         "config:",
         *(f"  {line}" for line in listing(plan.config, origin=True)),
     ]
-    if isinstance(found, str):
-        lines += ["pipeline:", f"  {found}"]
-    elif found is not None:
-        lines += ["pipeline:", *(f"  {line}" for line in _pipeline(found)), *_memory(found)]
-    return "\n".join(lines)
+    if isinstance(rehearsal, str):
+        lines += ["pipeline:", f"  {rehearsal}"]
+    elif rehearsal is not None:
+        lines += ["pipeline:", *(f"  {line}" for line in _pipeline(rehearsal)), *_memory(rehearsal)]
+    return "\n".join(lines), refused
 
 
 def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
@@ -77,8 +79,8 @@ def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
         return rehearse(context, PROCESSES if nproc is None else (nproc,))
 
 
-def _as_json(plan: Plan, found: Rehearsal | str | None) -> dict[str, Any]:
-    told: dict[str, Any] = {
+def _as_json(plan: Plan, rehearsal: Rehearsal | str | None) -> dict[str, Any]:
+    record: dict[str, Any] = {
         "section": plan.section,
         "trains": plan.trains,
         "work_dir": str(plan.work_dir),
@@ -88,11 +90,11 @@ def _as_json(plan: Plan, found: Rehearsal | str | None) -> dict[str, Any]:
         "config": plan.config.tree,
         "origins": dict(plan.config.origins),
     }
-    if isinstance(found, str):
-        return {**told, "notes": [found]}
-    if found is None:
-        return told
-    data, robot = found.data, found.robot
+    if isinstance(rehearsal, str):
+        return {**record, "notes": [rehearsal]}
+    if rehearsal is None:
+        return record
+    data, robot = rehearsal.data, rehearsal.robot
     pipeline = {
         "dataset": None
         if data is None
@@ -102,44 +104,46 @@ def _as_json(plan: Plan, found: Rehearsal | str | None) -> dict[str, Any]:
             "actions": data.actions,
             "cameras": {name: list(size or ()) or None for name, size in data.cameras.items()},
         },
-        "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in found.batch.items()},
+        "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in rehearsal.batch.items()},
         "model": {
-            "type": found.model,
-            "parameters": found.parameters,
-            "trained": found.trained,
-            "action_shape": None if found.action_shape is None else list(found.action_shape),
+            "type": rehearsal.model,
+            "parameters": rehearsal.parameters,
+            "trained": rehearsal.trained,
+            "action_shape": None
+            if rehearsal.action_shape is None
+            else list(rehearsal.action_shape),
         },
         "robot": None if robot is None else robot.to_dict(),
     }
     memory = {
-        "precision": found.precision,
-        "activations_known": found.activations_known,
+        "precision": rehearsal.precision,
+        "activations_known": rehearsal.activations_known,
         "left_out": list(_left_out()),
-        "bytes": {str(count): one.to_dict() for count, one in found.memory.items()},
+        "bytes": {str(count): one.to_dict() for count, one in rehearsal.memory.items()},
     }
-    return {**told, "pipeline": pipeline, "memory": memory, "notes": found.notes}
+    return {**record, "pipeline": pipeline, "memory": memory, "notes": rehearsal.notes}
 
 
-def _pipeline(found: Rehearsal) -> list[str]:
+def _pipeline(rehearsal: Rehearsal) -> list[str]:
     """The way of the shapes from the data to the robot, a line each."""
     rows: list[tuple[str, str]] = []
-    data = found.data
+    data = rehearsal.data
     if data is not None:
-        rows.append(("dataset", _dataset(found)))
+        rows.append(("dataset", _dataset(rehearsal)))
         cameras = [f"{name} {_size(size)}" for name, size in data.cameras.items()]
         rows.append(("cameras", ", ".join(cameras) or "none"))
         rows.append(("sample", f"states {data.states}, actions {data.actions} wide"))
-    for number, (key, (shape, dtype)) in enumerate(found.batch.items()):
+    for number, (key, (shape, dtype)) in enumerate(rehearsal.batch.items()):
         rows.append(("" if number else "batch", f"{key} {shape} {dtype}"))
-    if found.model:
-        share = found.trained / found.parameters if found.parameters else 0.0
-        counts = f"{found.parameters:,} parameters, {found.trained:,} trained ({share:.1%})"
-        rows.append(("model", f"{found.model}: {counts}"))
-        if found.action_shape is not None:
-            rows.append(("", "chunks of {} actions, {} wide".format(*found.action_shape)))
-    if found.robot is not None:
-        rows += _robot(found.robot)
-    rows += [("" if number else "notes", note) for number, note in enumerate(found.notes)]
+    if rehearsal.model:
+        share = rehearsal.trained / rehearsal.parameters if rehearsal.parameters else 0.0
+        counts = f"{rehearsal.parameters:,} parameters, {rehearsal.trained:,} trained ({share:.1%})"
+        rows.append(("model", f"{rehearsal.model}: {counts}"))
+        if rehearsal.action_shape is not None:
+            rows.append(("", "chunks of {} actions, {} wide".format(*rehearsal.action_shape)))
+    if rehearsal.robot is not None:
+        rows += _robot(rehearsal.robot)
+    rows += [("" if number else "notes", note) for number, note in enumerate(rehearsal.notes)]
     width = max((len(name) for name, _ in rows), default=0)
     return [
         line

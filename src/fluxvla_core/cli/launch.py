@@ -177,18 +177,18 @@ def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed |
     )
 
 
-def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ranks.Failure]:
+def _all(ended: Mapping[int, Any], reported: Mapping[int, ranks.Failure]) -> list[ranks.Failure]:
     """What each rank that failed said, or how it ended."""
     now = time.monotonic()
-    first = min((f.time for f in said.values()), default=now)
-    found = []
+    first = min((f.time for f in reported.values()), default=now)
+    failures = []
     for rank, process in ended.items():
-        if rank in said:
-            found.append(said[rank])
+        if rank in reported:
+            failures.append(reported[rank])
             continue
         # SIGTERM came from us, and so did SIGKILL to one that did not answer it in time.
         late = process.exitcode == -signal.SIGKILL and now - first >= _STOP_S
-        ours = late or process.exitcode == -signal.SIGTERM
+        terminated = late or process.exitcode == -signal.SIGTERM
         text = f"ended without an error message: {_ending(process.exitcode)}"
         if process.exitcode == -signal.SIGKILL:
             text += (
@@ -201,8 +201,8 @@ def _all(ended: Mapping[int, Any], said: Mapping[int, ranks.Failure]) -> list[ra
                 "somebody sent it the signal"
             )
         text += "\n  next: run the same command again with --resume auto"
-        found.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=ours, silent=True))
-    return found
+        failures.append(ranks.Failure(rank, now, text, EXIT_FAILED, asked=terminated, silent=True))
+    return failures
 
 
 def _report_failure(failure: ranks.Failure) -> int:

@@ -70,7 +70,7 @@ print(json.dumps({"works": True, "renderer": GL.glGetString(GL.GL_RENDERER).deco
 
 
 def facts(limit_s: float | None, environ: Mapping[str, str] = os.environ) -> dict[str, Any]:
-    """JSON values; docs/writing-a-plugin.md documents the keys.
+    """JSON values; docs/files.md documents the keys.
 
     Args:
         limit_s: seconds that one import may take; None imports nothing, and what only an import
@@ -90,11 +90,11 @@ def facts(limit_s: float | None, environ: Mapping[str, str] = os.environ) -> dic
     }
 
 
-def remarks(found: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
+def remarks(facts: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
     """What is wrong (True) or may become so (False) with a machine that has these facts."""
-    if found["torch"]["error"]:
-        yield True, f"torch {found['torch']['version']} is installed and {found['torch']['error']}"
-    ros2 = found["ros2"]
+    if facts["torch"]["error"]:
+        yield True, f"torch {facts['torch']['version']} is installed and {facts['torch']['error']}"
+    ros2 = facts["ros2"]
     if ros2["error"]:
         yield True, ros2["error"].replace("\n", ";")
     domain = ros2["domain_id"]
@@ -104,44 +104,44 @@ def remarks(found: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
     if ros2["profiles_file"] and not Path(ros2["profiles_file"]).is_file():
         text = f"FASTDDS_DEFAULT_PROFILES_FILE names {ros2['profiles_file']}, which is not there: "
         yield True, text + "Fast DDS goes on without it"
-    rendering = found["rendering"]
+    rendering = facts["rendering"]
     if rendering["error"]:
         text = f"MuJoCo cannot render (MUJOCO_GL={rendering['backend'] or ''}): "
         text += f"{rendering['error']}; without a display, MUJOCO_GL=egl needs libegl1 and, on a "
         yield False, text + "machine without a GPU, libegl-mesa0 and libgl1-mesa-dri"
-    for disk in found["disks"]:
+    for disk in facts["disks"]:
         if disk["free_bytes"] < _SMALL_DISK:
             yield False, f"{_size(disk['free_bytes'])} are free in {disk['path']}"
-    shm = found["shared_memory"]
+    shm = facts["shared_memory"]
     if shm is not None and shm["total_bytes"] < _SMALL_SHM:
         text = f"{SHM} has {_size(shm['total_bytes'])}, and workers that load data pass batches "
         yield False, text + "through it: docker run --shm-size=8g"
 
 
-def lines(found: Mapping[str, Any]) -> list[str]:
+def lines(facts: Mapping[str, Any]) -> list[str]:
     """The facts for people, one a line."""
-    torch, ros2, rendering = found["torch"], found["ros2"], found["rendering"]
-    said = [("python", f"{found['python']}, {found['platform']}, {found['cpus']} CPUs")]
+    torch, ros2, rendering = facts["torch"], facts["ros2"], facts["rendering"]
+    rows = [("python", f"{facts['python']}, {facts['platform']}, {facts['cpus']} CPUs")]
     if torch["version"] is None:
-        said.append(("torch", "not installed"))
+        rows.append(("torch", "not installed"))
     elif torch["devices"] is None:
-        said.append(("torch", torch["version"]))
+        rows.append(("torch", torch["version"]))
     else:
         parts = [torch["version"]]
         parts += [f"{n} {torch[k]}" for n, k in (("CUDA", "cuda"), ("NCCL", "nccl")) if torch[k]]
         parts.append(", ".join(torch["devices"]) or "no GPU")
-        said.append(("torch", "; ".join(parts)))
-    said.append(("ROS 2", _ros2_line(ros2)))
+        rows.append(("torch", "; ".join(parts)))
+    rows.append(("ROS 2", _ros2_line(ros2)))
     if rendering["mujoco"] is None:
-        said.append(("rendering", "no MuJoCo"))
+        rows.append(("rendering", "no MuJoCo"))
     else:
         backend = f"MUJOCO_GL={rendering['backend'] or '(not set)'}"
-        said.append(("rendering", "; ".join(filter(None, [rendering["renderer"], backend]))))
-    for disk in found["disks"]:
-        said.append(("disk", f"{_free(disk)} in {disk['path']}"))
-    shm = found["shared_memory"]
-    said.append((str(SHM), _free(shm) if shm else "not there"))
-    return [f"  {name:9}  {text}" for name, text in said]
+        rows.append(("rendering", "; ".join(filter(None, [rendering["renderer"], backend]))))
+    for disk in facts["disks"]:
+        rows.append(("disk", f"{_free(disk)} in {disk['path']}"))
+    shm = facts["shared_memory"]
+    rows.append((str(SHM), _free(shm) if shm else "not there"))
+    return [f"  {name:9}  {text}" for name, text in rows]
 
 
 def _ros2_line(ros2: Mapping[str, Any]) -> str:
@@ -174,11 +174,11 @@ def _torch(limit_s: float | None) -> dict[str, Any]:
 
 
 def _ros2(limit_s: float | None, environ: Mapping[str, str]) -> dict[str, Any]:
-    said = {key: environ.get(name) or _ROS_DEFAULTS.get(key) for key, name in _ROS.items()}
-    found: dict[str, Any] = {**said, "rclpy": version("rclpy"), "works": None, "error": None}
-    if limit_s is None or not (found["distribution"] or found["rclpy"]):
-        return found
-    return found | _asked(_RCLPY, limit_s)
+    settings = {key: environ.get(name) or _ROS_DEFAULTS.get(key) for key, name in _ROS.items()}
+    facts: dict[str, Any] = {**settings, "rclpy": version("rclpy"), "works": None, "error": None}
+    if limit_s is None or not (facts["distribution"] or facts["rclpy"]):
+        return facts
+    return facts | _asked(_RCLPY, limit_s)
 
 
 def _rendering(limit_s: float | None, environ: Mapping[str, str]) -> dict[str, Any]:

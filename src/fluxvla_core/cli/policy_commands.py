@@ -124,7 +124,7 @@ class ImportCheckpoint:
         rate_hz, cameras = _rate(args.rate), _cameras(args.camera)
         embodiment = None if args.embodiment is None else embodiment_in(args.embodiment)
         with heartbeat(f"importing {args.source}"):
-            path, found = import_checkpoint(
+            path, checkpoint = import_checkpoint(
                 args.source,
                 args.folder,
                 format=args.format,
@@ -134,13 +134,18 @@ class ImportCheckpoint:
                 cameras=cameras,
                 robot=args.robot,
             )
-        name = "no robot" if found.embodiment is None else found.embodiment.name
-        rate = "an unknown rate" if not found.action_rate_hz else f"{found.action_rate_hz:g} Hz"
-        say(
-            f"{path}: {found.model['type']}, {len(found.tensors)} tensors; cameras "
-            f"{', '.join(found.img_keys)}; chunks of {found.horizon} actions at {rate}; {name}"
+        name = "no robot" if checkpoint.embodiment is None else checkpoint.embodiment.name
+        rate = (
+            "an unknown rate"
+            if not checkpoint.action_rate_hz
+            else f"{checkpoint.action_rate_hz:g} Hz"
         )
-        for note in found.notes:
+        say(
+            f"{path}: {checkpoint.model['type']}, {len(checkpoint.tensors)} tensors; cameras "
+            f"{', '.join(checkpoint.img_keys)}; chunks of {checkpoint.horizon} actions at {rate}; "
+            f"{name}"
+        )
+        for note in checkpoint.notes:
             say(f"note: {note}")
         return 0
 
@@ -151,14 +156,14 @@ def _rate(hz: float | None) -> float | None:
     return hz
 
 
-def _cameras(given: Sequence[str]) -> dict[str, str | None]:
+def _cameras(options: Sequence[str]) -> dict[str, str | None]:
     """The checkpoint's camera -> the robot's; None for one that the robot lacks."""
-    found: dict[str, str | None] = {}
-    for text in given:
-        theirs, equals, ours = text.partition("=")
-        if not (theirs and equals and ours):
+    cameras: dict[str, str | None] = {}
+    for text in options:
+        source, equals, camera = text.partition("=")
+        if not (source and equals and camera):
             raise UsageError(f"--camera {text!r} is not THEIRS=OURS")
-        if theirs in found:
-            raise UsageError(f"--camera {theirs}=… is given twice")
-        found[theirs] = None if ours == "none" else ours
-    return found
+        if source in cameras:
+            raise UsageError(f"--camera {source}=… is given twice")
+        cameras[source] = None if camera == "none" else camera
+    return cameras

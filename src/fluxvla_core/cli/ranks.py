@@ -88,15 +88,15 @@ def _agent_folder() -> Path | None:
 
 def _started_here(work_dir: Path) -> bool:
     """Whether it is this job that began last in ``work_dir``."""
-    ours = _job()
+    own_job = _job()
     try:
-        theirs = json.loads((work_dir / JOB).read_text(encoding="utf-8"))
+        saved_job = json.loads((work_dir / JOB).read_text(encoding="utf-8"))
         # Of several machines another may have the first rank now. On the same one, a name that
         # is used again and again is another job's.
-        moved = theirs["id"] == ours["id"] != _NO_ID and theirs["host"] != ours["host"]
+        moved = saved_job["id"] == own_job["id"] != _NO_ID and saved_job["host"] != own_job["host"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return bool(theirs == ours or moved)
+    return bool(saved_job == own_job or moved)
 
 
 def _job() -> dict[str, str]:

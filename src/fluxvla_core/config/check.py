@@ -209,7 +209,7 @@ class _Walk:
             self.children(key, table, whole)
             return
         try:
-            found = resolve(kind, registry)
+            resolved = resolve(kind, registry)
         except PluginError as error:
             text = error.what.partition("\n")[0]
             if error.next and error.next != LIST:
@@ -219,14 +219,14 @@ class _Walk:
             if registry == "runners" and "." not in key:
                 self.sections.append(key)
         else:
-            if found.registry == "runners" and "." not in key:
+            if resolved.registry == "runners" and "." not in key:
                 self.sections.append(key)
                 whole = True
-                if found.signature:
-                    (self.trains if found.signature.trains else self.runs).append(key)
-            self.uses.append(Use(key, found))
-            if found.signature is not None:
-                self.arguments(key, table, found.signature, whole)
+                if resolved.signature:
+                    (self.trains if resolved.signature.trains else self.runs).append(key)
+            self.uses.append(Use(key, resolved))
+            if resolved.signature is not None:
+                self.arguments(key, table, resolved.signature, whole)
         self.children(key, table, whole)
 
     def arguments(self, key: str, table: dict[str, Any], signature: Signature, whole: bool) -> None:

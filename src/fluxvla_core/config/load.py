@@ -49,17 +49,17 @@ def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Co
     read 16 million times.
     """
     _check_there(path)
-    real = Path(os.path.realpath(path))
-    if real in chain:
-        names = " -> ".join(shown(p) for p in (*chain[chain.index(real) :], real))
+    resolved = Path(os.path.realpath(path))
+    if resolved in chain:
+        names = " -> ".join(shown(p) for p in (*chain[chain.index(resolved) :], resolved))
         raise ConfigError(f"circular {BASE}: {names}", where=shown(chain[-1]))
     if len(chain) >= _LONGEST_CHAIN:
         raise ConfigError(
             f"a chain of more than {_LONGEST_CHAIN} files by {BASE}", where=shown(chain[0])
         )
-    if real not in loaded:
-        loaded[real] = _load_file(path, (*chain, real), loaded)
-    return loaded[real]
+    if resolved not in loaded:
+        loaded[resolved] = _load_file(path, (*chain, resolved), loaded)
+    return loaded[resolved]
 
 
 def _load_file(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:

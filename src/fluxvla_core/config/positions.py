@@ -73,7 +73,7 @@ class _PythonWalker:
 
     def places(self, node: ast.expr, key: str) -> dict[str, str]:
         """The places of everything below ``key``, if ``node`` is its value."""
-        found: dict[str, str] = {}
+        positions: dict[str, str] = {}
         if isinstance(node, ast.Name):
             prefix = node.id + "."
             return {
@@ -84,20 +84,20 @@ class _PythonWalker:
         if isinstance(node, ast.Dict):
             for name, value in zip(node.keys, node.values, strict=True):
                 if name is None:
-                    found.update(self.places(value, key))
+                    positions.update(self.places(value, key))
                 elif isinstance(name, ast.Constant) and isinstance(name.value, str):
-                    self._put(found, join_key(key, name.value), name.lineno, value)
+                    self._put(positions, join_key(key, name.value), name.lineno, value)
         elif isinstance(node, (ast.List, ast.Tuple)):
             for index, item in enumerate(node.elts):
                 if isinstance(item, ast.Starred):  # what follows has an unknown index
                     break
-                self._put(found, join_key(key, index), item.lineno, item)
+                self._put(positions, join_key(key, index), item.lineno, item)
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr):
-            found.update(self.places(node.left, key))
-            found.update(self.places(node.right, key))
+            positions.update(self.places(node.left, key))
+            positions.update(self.places(node.right, key))
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-            found.update(self.places(node.left, key))  # the right side's indices are unknown
-        return found
+            positions.update(self.places(node.left, key))  # the right side's indices are unknown
+        return positions
 
     def _call(self, node: ast.Call, key: str) -> dict[str, str]:
         found: dict[str, str] = {}

@@ -89,23 +89,34 @@ def option_fields(cls: type) -> tuple[Parameter, ...]:
     options: Any = options_class(cls)
     if options is None:
         return ()
-    owners = {n: base for base in reversed(options.__mro__) for n in inspect.get_annotations(base)}
-    names = {field.name for field in dataclasses.fields(options) if field.init}
+    names = option_names(cls)
+    places: dict[str, str] = {}
+    for base in reversed(options.__mro__):
+        own = names & set(inspect.get_annotations(base))
+        places |= dict.fromkeys(own, _class_place(base) if own else "")
     return tuple(
-        replace(parameter, place=_class_place(owners[parameter.name]))
+        replace(parameter, place=places[parameter.name])
         for parameter in _runtime_init(options.__init__).parameters
         if parameter.name in names
     )
 
 
+def option_names(cls: type) -> set[str]:
+    """The names of the fields of a class's ``Options``; none where it has no such class."""
+    options: Any = options_class(cls)
+    if options is None:
+        return set()
+    return {field.name for field in dataclasses.fields(options) if field.init}
+
+
 def _runtime_meanings(cls: type) -> dict[str, str]:
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for base in cls.__mro__[:-1]:
         init = base.__dict__.get("__init__")
-        said = argument_texts(init.__doc__) if inspect.isfunction(init) else {}
-        said |= argument_texts(base.__doc__) | field_texts(_class_node(base))
-        found = {**said, **found}
-    return found
+        texts = argument_texts(init.__doc__) if inspect.isfunction(init) else {}
+        texts |= argument_texts(base.__doc__) | field_texts(_class_node(base))
+        meanings = {**texts, **meanings}
+    return meanings
 
 
 def _class_node(cls: type) -> ast.ClassDef:

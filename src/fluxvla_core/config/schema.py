@@ -78,13 +78,13 @@ def _ref(*parts: str) -> str:
 
 def _classes(registry: str) -> Iterable[_Class]:
     """Every class of a registry that a config can name; what cannot work is left out."""
-    here = BY_NAME[registry]
-    registered = [name for name in here if here.registered(name) is not None]
+    group = BY_NAME[registry]
+    registered = [name for name in group if group.registered(name) is not None]
     for name in registered:
-        signature = inspect_signature(here.registered(name))
-        found = Found(registry, name, "registered in this process", None, signature)
-        yield _Class((name,), found)
-    for name, plugins in sorted(here.installed().items()):
+        signature = inspect_signature(group.registered(name))
+        resolved = Found(registry, name, "registered in this process", None, signature)
+        yield _Class((name,), resolved)
+    for name, plugins in sorted(group.installed().items()):
         preferred = [p for p in plugins if is_core(p)] or (plugins if len(plugins) == 1 else [])
         for plugin in plugins:
             qualified = f"{plugin.dist}:{name}"

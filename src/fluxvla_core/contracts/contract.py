@@ -112,18 +112,18 @@ def original(made: Any) -> Any:
     return object.__getattribute__(made, "_made") if issubclass(type(made), _Adapter) else made
 
 
-def implements(made: Any, contract: type[Contract], ability: str) -> bool:
-    """Whether ``made`` brings the optional ``ability`` itself, and not the contract's default.
+def implements(candidate: Any, contract: type[Contract], ability: str) -> bool:
+    """Whether ``candidate`` brings the optional ``ability`` itself, and not the contract's default.
 
     A property is not asked, which may raise.
     """
-    made = original(made)
-    found = inspect.getattr_static(made, ability, _NOTHING)
-    if found is _NOTHING:  # unless the object answers for another one
-        return hasattr(type(made), "__getattr__") and hasattr(made, ability)
+    candidate = original(candidate)
+    attribute = inspect.getattr_static(candidate, ability, _NOTHING)
+    if attribute is _NOTHING:  # unless the object answers for another one
+        return hasattr(type(candidate), "__getattr__") and hasattr(candidate, ability)
     default = inspect.getattr_static(contract, ability, _NOTHING)
     # ``stop = None`` in a class says that it has no such method.
-    return found is not default and not (found is None and inspect.isfunction(default))
+    return attribute is not default and not (attribute is None and inspect.isfunction(default))
 
 
 class _Adapter:

@@ -244,11 +244,11 @@ def check_compatible(datasets: Sequence[LoadedDataset]) -> None:
                 raise DataError(
                     f"{one.root} and {two.root} do not go together: {what}: {left} / {right}"
                 )
-        for what, here, there in _names(first, other):
-            if here != there and sorted(here) == sorted(there):
+        for what, expected, actual in _names(first, other):
+            if expected != actual and sorted(expected) == sorted(actual):
                 raise DataError(
                     f"{one.root} and {two.root} do not go together: {what}: the same names in "
-                    f"another order: {', '.join(here)} / {', '.join(there)}",
+                    f"another order: {', '.join(expected)} / {', '.join(actual)}",
                     next="write one of them again with its columns in the order of the other",
                 )
 
@@ -266,36 +266,36 @@ def naming_warnings(datasets: Sequence[LoadedDataset]) -> list[str]:
 
 
 def find_embodiment(
-    datasets: Sequence[LoadedDataset], given: Mapping[str, Any] | str | None
+    datasets: Sequence[LoadedDataset], configured: Mapping[str, Any] | str | None
 ) -> EmbodimentSpec | None:
-    """The robot that the datasets were recorded with: from their metadata, else ``given``.
+    """The robot that the datasets were recorded with: from their metadata, else ``configured``.
 
     Raises:
-        SpecMismatch: metadata and ``given`` differ; or the robot has another number of joints than
-            the data has columns.
-        DataError: ``given`` is a path that cannot be read.
+        SpecMismatch: metadata and ``configured`` differ; or the numbers of the robot's joints and
+            of the data's columns do.
+        DataError: ``configured`` is a path that cannot be read.
     """
-    found = next((r.meta.embodiment for r in datasets if r.meta.embodiment is not None), None)
+    embodiment = next((r.meta.embodiment for r in datasets if r.meta.embodiment is not None), None)
     root, first = datasets[0].meta.root, datasets[0]
-    if given is not None:
-        table = read_json(Path(given)) if isinstance(given, str) else given
+    if configured is not None:
+        table = read_json(Path(configured)) if isinstance(configured, str) else configured
         spec = EmbodimentSpec.from_dict(table)
-        if found is not None:
-            check_match(spec, found, "the config's embodiment", str(root), ())
-        found = spec
-    if found is None:
+        if embodiment is not None:
+            check_match(spec, embodiment, "the config's embodiment", str(root), ())
+        embodiment = spec
+    if embodiment is None:
         return None
     for what, joints, columns in (
-        ("states", found.state_dim, first.states.shape[1]),
-        ("actions", found.dim, first.actions.shape[1]),
+        ("states", embodiment.state_dim, first.states.shape[1]),
+        ("actions", embodiment.dim, first.actions.shape[1]),
     ):
         if joints != columns:
             raise SpecMismatch(
                 f"{root}: {what} have {columns} columns, "
-                f"the robot {found.name} has {joints} joints",
+                f"the robot {embodiment.name} has {joints} joints",
                 next="name the features that belong to the robot: state_key and action_key",
             )
-    return found
+    return embodiment
 
 
 def _choose(meta: Metadata, episodes: Sequence[int] | None) -> npt.NDArray[np.bool_]:

@@ -238,16 +238,16 @@ def shares(total: int, weights: Sequence[float] | Ints, count: int) -> Ints:
             next="leave out a dataset that is not to be seen",
         )
     due = due / due.sum() * total
-    given: Ints = np.floor(due).astype(np.int64)
-    rest = np.argsort(given - due, kind="stable")[: total - int(given.sum())]
-    given[rest] += 1
-    if (given < 1).any():
+    counts: Ints = np.floor(due).astype(np.int64)
+    rest = np.argsort(counts - due, kind="stable")[: total - int(counts.sum())]
+    counts[rest] += 1
+    if (counts < 1).any():
         raise ConfigError(
             f"DistributedRepeatingDataset: of an epoch of {total} samples, dataset "
-            f"{int(np.argmin(given))} gets none",
+            f"{int(np.argmin(counts))} gets none",
             next="raise samples_per_epoch, or its weight",
         )
-    return given
+    return counts
 
 
 def first_dataset(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -98,7 +98,8 @@ class EpisodeEncoder:
             raise DataError(
                 f"{path.stem}: pictures of {height} x {width} cannot be stored as video",
                 cause="height and width must be even",
-                next="crop or pad them by one pixel before add_frame",
+                next="collect them in another size (data collect: --cameras NAME --height H "
+                "--width W), or crop a pixel where they are made and say so in the embodiment",
             )
         if codec.encoder == "libsvtav1":
             os.environ.setdefault("SVT_LOG", "1")  # errors only; it prints a page a stream
@@ -204,7 +205,7 @@ def _packets(clip: Clip, step: Fraction) -> Iterator[tuple[Any, int]]:
     """A clip's packets in decoding order, each with its place in display order."""
     av = libav()
 
-    found = 0
+    count = 0
     try:
         with open_video(clip.path) as source:
             stream = source.streams.video[0]
@@ -214,20 +215,20 @@ def _packets(clip: Clip, step: Fraction) -> Iterator[tuple[Any, int]]:
             for packet in source.demux(stream):
                 if packet.pts is None or packet.pts < first - step / stream.time_base / 2:
                     continue
-                if found == clip.frames:
+                if count == clip.frames:
                     break
                 shown = round((packet.pts - first) * stream.time_base / step)
-                if found - shown > clip.delay or (found == 0 and not packet.is_keyframe):
+                if count - shown > clip.delay or (count == 0 and not packet.is_keyframe):
                     raise DataError(
                         f"{clip.path}: the episode at {clip.start:.3f} s cannot be copied",
                         cause="its frames refer across its ends; another program wrote it",
                     )
-                found += 1
+                count += 1
                 yield packet, shown
     except av.error.FFmpegError as error:
         raise DataError(f"{clip.path}: cannot be read as video ({error.strerror})") from error
-    if found != clip.frames:
-        raise DataError(f"{clip.path}: {clip.frames} frames expected, {found} found")
+    if count != clip.frames:
+        raise DataError(f"{clip.path}: {clip.frames} frames expected, {count} found")
 
 
 @contextlib.contextmanager

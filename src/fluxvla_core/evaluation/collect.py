@@ -334,26 +334,26 @@ def collect_episodes(
         except OSError as error:
             next = f"make room, then {_GO_ON}"
             raise explain_disk(error, out, "no episode was lost", next) from error
-        kept = writer.episodes
-        jobs = range(kept, episodes)
+        saved = writer.episodes
+        jobs = range(saved, episodes)
         with WorkerPool(factory, workers) as pool:
-            for number, found in _in_order(pool.run(jobs), jobs):
-                for frame in range(len(found.states)):
-                    pictures = {name: stack[frame] for name, stack in found.images.items()}
+            for number, outcome in _in_order(pool.run(jobs), jobs):
+                for frame in range(len(outcome.states)):
+                    pictures = {name: stack[frame] for name, stack in outcome.images.items()}
                     writer.add_frame(
-                        pictures, found.states[frame], found.actions[frame], found.instruction
+                        pictures, outcome.states[frame], outcome.actions[frame], outcome.instruction
                     )
                 writer.save_episode(key=number)
-                retried += found.retried
-                frames += len(found.states)
-                pace = (number + 1 - kept) / (time.monotonic() - began)
+                retried += outcome.retried
+                frames += len(outcome.states)
+                pace = (number + 1 - saved) / (time.monotonic() - began)
                 reporter.progress("demonstrations", number + 1, episodes, per_s=round(pace, 2))
     # It stays with the dataset, so that an evaluation knows the seeds of the training data.
     write_metadata(out / META / SETTINGS, dict(settings))
     seconds = time.monotonic() - began
     result = {
         "episodes": episodes,
-        "collected": episodes - kept,
+        "collected": episodes - saved,
         "frames": frames,
         "retried": retried,
         "seconds": seconds,

@@ -132,14 +132,14 @@ def differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
     return [f"{n}: {one.get(n)} / {two.get(n)}" for n in names if one.get(n) != two.get(n)]
 
 
-def describe(found: Mapping[str, Any]) -> list[str]:
+def describe(comparison: Mapping[str, Any]) -> list[str]:
     """Lines for people."""
-    lines = [f"A: {found['a']['folder']} ({found['a']['group']})"]
-    lines += [f"B: {found['b']['folder']} ({found['b']['group']})"]
-    lines += [f"not the same in both: {line}" for line in found["differences"]]
-    rows = dict(found["tasks"])
+    lines = [f"A: {comparison['a']['folder']} ({comparison['a']['group']})"]
+    lines += [f"B: {comparison['b']['folder']} ({comparison['b']['group']})"]
+    lines += [f"not the same in both: {line}" for line in comparison["differences"]]
+    rows = dict(comparison["tasks"])
     if len(rows) != 1:
-        rows[all_of(len(found["tasks"]))] = found["all"]
+        rows[all_of(len(comparison["tasks"]))] = comparison["all"]
     for name, row in rows.items():
         sides = "  ".join(
             f"{side.upper()} {row[side]['successes']}/{row[side]['episodes']} "
@@ -150,11 +150,11 @@ def describe(found: Mapping[str, Any]) -> list[str]:
             f"{name}: {sides}  A alone {row['only_a']}, B alone {row['only_b']}, "
             f"p = {row['p_different']:.2g}"
         )
-    if found["unpaired"]:
-        lines.append(f"{found['unpaired']} episodes that only one side has were left out")
-    p = found["all"]["p_different"]
-    said = verdict(found["all"])
-    lines.append(f"exact McNemar test, two-sided, all episodes: p = {p:.2g}, {said}")
+    if comparison["unpaired"]:
+        lines.append(f"{comparison['unpaired']} episodes that only one side has were left out")
+    p = comparison["all"]["p_different"]
+    conclusion = verdict(comparison["all"])
+    lines.append(f"exact McNemar test, two-sided, all episodes: p = {p:.2g}, {conclusion}")
     return lines
 
 

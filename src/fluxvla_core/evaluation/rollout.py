@@ -23,7 +23,7 @@ from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
 from fluxvla_core.robot.control.clamps import PassThrough
 from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.sender import CommandFormer
+from fluxvla_core.robot.control.sender import CommandPipeline
 from fluxvla_core.robot.control.tracking import action_columns, action_values
 from fluxvla_core.spec.embodiment import Camera
 
@@ -67,7 +67,7 @@ class ChunkCommands:
         self._action_rate = action_rate_hz or self._rate
         self._columns = action_columns(body) if spec.limited else np.arange(0)
         self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
-        self._former = CommandFormer(self._limiter or PassThrough(body))
+        self._pipeline = CommandPipeline(self._limiter or PassThrough(body))
 
     def start(self, state: Array) -> None:
         """Begin an episode where the robot is."""
@@ -83,7 +83,7 @@ class ChunkCommands:
 
     def command(self, target: Array) -> Array:
         """The ``(dim,)`` command for one target."""
-        commands, clamps = self._former.form(target[None])
+        commands, clamps = self._pipeline.form(target[None])
         self.clamped += bool(clamps[0])
         return np.asarray(commands[0])
 
@@ -149,12 +149,12 @@ def run_episode(
         instruction = observation["task_description"]
         # Before the policy is queried: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
-        seen = time.perf_counter()
+        observed_at = time.perf_counter()
         chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
         answered = time.perf_counter()
         del observation  # so that the next pictures can have its memory: fresh pages cost more
-        spent["observe"] += seen - at
-        spent["policy"] += answered - seen
+        spent["observe"] += observed_at - at
+        spent["policy"] += answered - observed_at
         calls += 1
         problem = not_finite(chunk, spec.embodiment.joint_names)
         if problem is not None:
@@ -162,14 +162,14 @@ def run_episode(
             break
         for target in commands.targets(chunk[: settings.replan_every]):
             at = time.perf_counter()
-            found = environment.step(commands.command(target))
+            outcome = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
             steps += 1
-            total += found.reward
+            total += outcome.reward
             # Before anything is made of it: a scene that resets itself may even look like success.
             state = check_step(environment, steps)
-            success, ended = bool(found.success), bool(found.ended)
-            behaviours = None if found.behaviours is None else dict(found.behaviours)
+            success, ended = bool(outcome.success), bool(outcome.ended)
+            behaviours = None if outcome.behaviours is None else dict(outcome.behaviours)
             if not own_hash:
                 state_digest.update(state.tobytes())
             if on_step is not None:

@@ -128,19 +128,19 @@ def index() -> Index:
     ``FLUXVLA_PLUGINS=ur,fsdp`` sees only those distributions (and the core); empty means none.
     ``FLUXVLA_BLOCK=ur`` leaves those out. Names may drop the ``fluxvla-`` prefix.
     """
-    found: dict[tuple[str, str], list[Plugin]] = {}
+    plugins: dict[tuple[str, str], list[Plugin]] = {}
     broken: set[str] = set()
     folders: dict[str, str] = {}
     versions: dict[str, str] = {}
-    seen: set[str] = set()
+    names: set[str] = set()
     # Never metadata.entry_points(): one malformed file in any distribution ends it for all.
     for dist in _distributions():
         where = dist.path if isinstance(dist, _Folder) else getattr(dist, "_path", dist)
         if isinstance(dist, _Folder) and dist.is_dist_info:
             folders.setdefault(dist.stated_name, dist.path)
         try:
-            ours = _groups_of(dist.read_text(_ENTRY_POINTS) or "")
-            if not ours:
+            groups = _groups_of(dist.read_text(_ENTRY_POINTS) or "")
+            if not groups:
                 continue
             if os.path.basename(str(where)).startswith("~"):
                 raise ValueError("leftover of an interrupted uninstall; delete this folder")
@@ -149,9 +149,9 @@ def index() -> Index:
             if not name:
                 raise ValueError("its METADATA is missing or has no Name; reinstall it")
             key = canonical(name)
-            if key in seen:  # shadowed by an earlier sys.path entry
+            if key in names:  # shadowed by an earlier sys.path entry
                 continue
-            seen.add(key)
+            names.add(key)
             if not _wanted(key):
                 continue
             version, requires = about.version, tuple(about.requires or ())
@@ -159,13 +159,13 @@ def index() -> Index:
                 raise ValueError("its METADATA has no Version; reinstall it")
             versions[key] = version
             for point in about.entry_points:
-                if point.group in ours:
+                if point.group in groups:
                     plugin = Plugin(point.group, point.name, point.value, name, version, requires)
-                    found.setdefault((plugin.group, plugin.name), []).append(plugin)
+                    plugins.setdefault((plugin.group, plugin.name), []).append(plugin)
         except Exception as error:  # noqa: BLE001 - one broken distribution must not hide the others
             broken.add(f"{where}: {type(error).__name__}: {error}")
     # The scan follows os.listdir, whose order is not stable.
-    ordered = {k: tuple(sorted(v, key=lambda p: canonical(p.dist))) for k, v in found.items()}
+    ordered = {k: tuple(sorted(v, key=lambda p: canonical(p.dist))) for k, v in plugins.items()}
     return Index(ordered, tuple(sorted(broken)), folders, versions)
 
 

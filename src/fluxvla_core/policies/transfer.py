@@ -57,10 +57,10 @@ class Transfer:
 
     def _buffer(self, key: str, like: Tensor) -> Tensor:
         """Host memory for ``like``; that of the last call where it fits."""
-        kept = self._kept.get(key)
-        if kept is None or kept.shape != like.shape or kept.dtype != like.dtype:
+        buffer = self._kept.get(key)
+        if buffer is None or buffer.shape != like.shape or buffer.dtype != like.dtype:
             # In inference mode it would be a tensor that no other mode may write to.
             with torch.inference_mode(False):
-                kept = torch.empty(like.shape, dtype=like.dtype, pin_memory=self._pinned)
-            self._kept[key] = kept
-        return kept
+                buffer = torch.empty(like.shape, dtype=like.dtype, pin_memory=self._pinned)
+            self._kept[key] = buffer
+        return buffer

@@ -228,7 +228,7 @@ class ControlLoop:
 
     def _no_chunk(self, until: float) -> Starved:
         most = self.safety.first_chunk_s
-        late, seconds = self.client.late(until - most)
+        late, seconds = self.client.slowest_since(until - most)
         return Starved(
             f"there was no chunk within {most:g} s: {late.name} took {seconds:.2f} s of that",
             cause=late.cause,
@@ -237,7 +237,7 @@ class ControlLoop:
 
     def _check_starved(self, seconds: float) -> None:
         if seconds > self.safety.starvation_s:
-            late, share = self.client.late(time.monotonic() - seconds)
+            late, share = self.client.slowest_since(time.monotonic() - seconds)
             raise Starved(
                 f"the robot waits for a chunk for {seconds:.2f} s, "
                 f"safety.starvation_s is {self.safety.starvation_s:g}: "

@@ -23,7 +23,13 @@ from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.policy_client import PolicyClient
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
-from fluxvla_core.robot.control.sender import CommandSender, Execute, Sent, come_to_rest, ramp
+from fluxvla_core.robot.control.sender import (
+    CommandSender,
+    Execute,
+    SentCommand,
+    come_to_rest,
+    ramp,
+)
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.control_loop import ControlLoop
 from fluxvla_core.robot.events import (
@@ -288,8 +294,8 @@ class Episode:
         kept = self._grippers
         if self._held is not None:
             kept = kept | self._tracking.follows(commanded, state)
-        elif self._robot.tells_hold:
-            kept = kept | self._tracking.stayed(commanded, state)
+        elif self._robot.reports_last_action:
+            kept = kept | self._tracking.settled(commanded, state)
         return np.where(kept, commanded, self._tracking.positions(state))
 
     def _execute(self, actions: Array, rate: Rate) -> None:
@@ -297,7 +303,7 @@ class Episode:
         self._parts.execute(actions, rate)
         self._executing = False
 
-    def _after_tick(self, sent: Sent | None) -> None:
+    def _after_tick(self, sent: SentCommand | None) -> None:
         self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
 
     def _emit(self, event: Event) -> None:
@@ -343,7 +349,7 @@ class Episode:
     def _state(self) -> Array | None:
         """The robot's current state; None if it does not tell, or only plays a recording."""
         try:
-            measured = self._robot.state() if self._robot.follows else None
+            measured = self._robot.state() if self._robot.follows_commands else None
         except FluxError:
             # A stream that fell silent, or says nonsense, keeps no arm from coming to rest.
             return None

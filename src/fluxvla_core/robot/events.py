@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.robot.control.safety import Trip
-from fluxvla_core.robot.control.sender import Sent
+from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]
@@ -49,16 +49,16 @@ class Phase(str, Enum):
 
 
 @dataclass(frozen=True)
-class Reading:
-    """What was seen at one moment, on the robot's clock.
+class RobotReading:
+    """One reading of the robot: observation, state and their times (s) on the robot's clock.
 
     Args:
         observation: as the operator gave it, with the instruction.
-        frame: what it is of, where the operator has frames.
+        frame: the operator's frame that it was made of; None if the operator has no frames.
         state: ``(state_dim,)``.
-        measured: when the state came.
-        at: when the oldest of its streams came.
-        seconds: what it took, by stage.
+        measured: when the state arrived.
+        at: when the oldest of its streams arrived.
+        seconds: duration of each stage of reading.
     """
 
     observation: dict[str, Any]
@@ -96,7 +96,7 @@ class EpisodeStarted(Event):
 class Observed(Event):
     """A reading of the robot that passed its checks."""
 
-    reading: Reading
+    reading: RobotReading
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Refused(Event):
 class ChunkAccepted(Event):
     """The policy's answer to a reading: ``(T, D)`` actions, read-only; and seconds by stage."""
 
-    reading: Reading
+    reading: RobotReading
     actions: Array
     stages: Mapping[str, float]
 
@@ -123,7 +123,7 @@ class CommandSent(Event):
     ``send_s`` is what sending took, if it is known, ``late_s`` how late it was.
     """
 
-    sent: Sent
+    sent: SentCommand
     phase: Phase
     state: Array | None
     send_s: float | None

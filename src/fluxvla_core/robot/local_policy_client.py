@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fluxvla_core.robot.control.delays import DelaySource
 from fluxvla_core.robot.control.joiners import Ahead
 from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
-from fluxvla_core.robot.events import ChunkAccepted, Event, Reading, Refused
+from fluxvla_core.robot.events import ChunkAccepted, Event, Refused, RobotReading
 from fluxvla_core.robot.observation import ObservationReader
 from fluxvla_core.robot.policy_calls import PolicyAnswer, PolicyCaller, PolicyThread
 from fluxvla_core.robot.robot import Robot
@@ -68,9 +68,9 @@ class LocalPolicyClient(PolicyClient):
         assert isinstance(answer, PolicyAnswer)
         self._emit(Refused(self._robot.clock.now(), "chunk", {"answer": answer.chunk}))
 
-    def late(self, since: float) -> tuple[DelaySource, float]:
+    def slowest_since(self, since: float) -> tuple[DelaySource, float]:
         return self._robot.delays.longest(since)
 
-    def _think(self, reading: Reading, ahead: Ahead | None) -> Answer:
+    def _think(self, reading: RobotReading, ahead: Ahead | None) -> Answer:
         rest = None if ahead is None else ahead.seen_at(reading.at, self._policy.policy.horizon)
         return self._policy.ask(reading, rest)

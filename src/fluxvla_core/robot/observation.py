@@ -17,7 +17,7 @@ from fluxvla_core.errors import ConfigError, FluxError, NotReady, SpecMismatch
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.events import Event, Observed, Reading, Refused
+from fluxvla_core.robot.events import Event, Observed, Refused, RobotReading
 from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.robot import Robot, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
@@ -72,7 +72,7 @@ class ObservationReader:
         self._emit = emit
         self._gate = FreshnessGate(safety.max_age_s, safety.max_skew_s)
 
-    def first(self) -> Reading:
+    def first(self) -> RobotReading:
         """The first one, for which the robot has ``ready_s``.
 
         Raises:
@@ -98,7 +98,7 @@ class ObservationReader:
         self._emit(Observed(self._robot.clock.now(), reading))
         return reading
 
-    def read(self) -> Reading:
+    def read(self) -> RobotReading:
         """One more; in the thread that asks the policy.
 
         Raises:
@@ -107,12 +107,12 @@ class ObservationReader:
             NotFollowing: the arm is not where it is commanded to be.
         """
         reading = self._read()
-        if self._robot.follows:
+        if self._robot.follows_commands:
             self._tracking.check(reading.state, reading.measured)
         self._emit(Observed(self._robot.clock.now(), reading))
         return reading
 
-    def _read(self) -> Reading:
+    def _read(self) -> RobotReading:
         began = time.perf_counter()
         observation, frame = self._frame()
         seconds = {"sync": time.perf_counter() - began}
@@ -170,7 +170,7 @@ class ObservationReader:
 
     def _checked(
         self, observation: dict[str, Any], frame: Frame | None, seconds: dict[str, float]
-    ) -> Reading:
+    ) -> RobotReading:
         _check_complete(observation, self._cameras)
         measured = at = now = self._robot.clock.now()
         state, images, stamps = observation["qpos"], observation["images"], dict[str, float]()
@@ -188,7 +188,7 @@ class ObservationReader:
             raise
         state = np.asarray(state, dtype=np.float64)
         asked = {**observation, "task_description": self._instruction}
-        return Reading(asked, frame, state, measured, at, seconds)
+        return RobotReading(asked, frame, state, measured, at, seconds)
 
 
 def _shown(window: object) -> str:

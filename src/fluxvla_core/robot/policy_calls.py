@@ -20,7 +20,7 @@ from fluxvla_core.robot.control.chunks import check_chunk
 from fluxvla_core.robot.control.delays import POLICY, DelayMonitor
 from fluxvla_core.robot.control.policy_client import Answer, PolicyFailed
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
-from fluxvla_core.robot.events import Reading
+from fluxvla_core.robot.events import RobotReading
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ class PolicyAnswer(Answer):
         stages: seconds, by stage; ``policy`` is all of it.
     """
 
-    reading: Reading
+    reading: RobotReading
     chunk: Any
     stages: Mapping[str, float]
 
@@ -83,7 +83,7 @@ class PolicyCaller:
                 f"the policy raised {type(error).__name__} in reset(): {error}"
             ) from error
 
-    def ask(self, reading: Reading, rest: Continuation | None) -> PolicyAnswer:
+    def ask(self, reading: RobotReading, rest: Continuation | None) -> PolicyAnswer:
         """The policy's answer; ``rest`` of a chunk is what it has to continue.
 
         Raises:

@@ -33,8 +33,8 @@ _LEAST_SPEED = 0.01
 
 
 @dataclass(frozen=True)
-class Measured:
-    """``(state_dim,)`` where the robot was, and when that arrived, on its clock."""
+class StateSample:
+    """A ``(state_dim,)`` state and when it arrived (seconds on the robot's clock)."""
 
     state: npt.NDArray[np.float64]
     at: float
@@ -88,7 +88,7 @@ class Robot:
         self.sent_s: float | None = None
         self._reads_state, self._stamps_state = self._has("get_state"), self._has("state_stamp")
         # A replayed robot ignores commands, so tracking is not checked.
-        self.follows = bool(self._operator.follows_commands)
+        self.follows_commands = bool(self._operator.follows_commands)
         self.clock = clock_of(self._operator)
         self.lockstep = in_lockstep(self.clock)
         self.delays = DelayMonitor()
@@ -135,7 +135,7 @@ class Robot:
         """
         return as_frame(self._ask("get_frame", self._operator.get_frame), self.reading.name)
 
-    def state(self) -> Measured | None:
+    def state(self) -> StateSample | None:
         """The state alone, from an operator that has ``get_state``; else None.
 
         It is read after each command, on a real robot while another thread may read frames.
@@ -156,7 +156,7 @@ class Robot:
                 at = as_number(stamp, f"{self.name}.state_stamp()")
             found = self._ask("get_state", self._operator.get_state)
             state = as_state(found, self.embodiment, self._measuring.name)
-        return Measured(state, self.clock.now() if at is None else at)
+        return StateSample(state, self.clock.now() if at is None else at)
 
     @property
     def speed(self) -> Callable[[], float] | None:
@@ -192,7 +192,7 @@ class Robot:
         return implements(self._described, Operator, "begin_episode")
 
     @property
-    def tells_hold(self) -> bool:
+    def reports_last_action(self) -> bool:
         """Whether ``commanded`` holds after a stop too: without ``last_action`` an operator's own
         ``stop`` may have commanded anything."""
         return self._has("last_action") or not self.can_stop
@@ -290,12 +290,14 @@ class Robot:
             return f"{self.name}.{method} raised {type(error).__name__}: {error}"
         return None
 
-    def _embodiment(self, given: EmbodimentSpec | Mapping[str, Any] | None) -> EmbodimentSpec:
-        if given is not None and not isinstance(given, (EmbodimentSpec, Mapping)):
-            raise ConfigError(f"embodiment must be a table, got {given!r}")
-        said = EmbodimentSpec.from_dict(given) if isinstance(given, Mapping) else given
+    def _embodiment(self, configured: EmbodimentSpec | Mapping[str, Any] | None) -> EmbodimentSpec:
+        if configured is not None and not isinstance(configured, (EmbodimentSpec, Mapping)):
+            raise ConfigError(f"embodiment must be a table, got {configured!r}")
+        spec = (
+            EmbodimentSpec.from_dict(configured) if isinstance(configured, Mapping) else configured
+        )
         own: Any = self._operator.embodiment if self._has("embodiment") else None
-        if own is None and said is None:
+        if own is None and spec is None:
             raise LoadFailed(
                 f"{self.name} has no embodiment: which joints it moves and within which limits is "
                 "not known, so nothing may be sent to it",
@@ -304,33 +306,33 @@ class Robot:
                 "rate_hz=…), or the operator an attribute embodiment",
             )
         if own is None:
-            assert said is not None
-            return said
+            assert spec is not None
+            return spec
         if not isinstance(own, EmbodimentSpec):
             raise LoadFailed(
                 f"{self.name}.embodiment is a {type(own).__name__}, not an EmbodimentSpec"
             )
-        if said is not None:
-            check_match(said, own, "the config's embodiment", self.name)
-            _check_tighter(said, own)
-            return said
+        if spec is not None:
+            check_match(spec, own, "the config's embodiment", self.name)
+            _check_tighter(spec, own)
+            return spec
         return own
 
 
-def _check_tighter(said: EmbodimentSpec, own: EmbodimentSpec) -> None:
+def _check_tighter(config: EmbodimentSpec, operator: EmbodimentSpec) -> None:
     """A config may narrow a robot's limits; it cannot widen them."""
-    for ours, theirs in zip(said.joints, own.joints, strict=True):
+    for config_joint, operator_joint in zip(config.joints, operator.joints, strict=True):
         limits = {
-            "lower": (ours.lower, theirs.lower),
-            "upper": (ours.upper, theirs.upper),
-            "velocity": (ours.velocity, theirs.velocity),
-            "acceleration": (ours.acceleration, theirs.acceleration),
-            "jerk": (ours.jerk or math.inf, theirs.jerk or math.inf),
+            "lower": (config_joint.lower, operator_joint.lower),
+            "upper": (config_joint.upper, operator_joint.upper),
+            "velocity": (config_joint.velocity, operator_joint.velocity),
+            "acceleration": (config_joint.acceleration, operator_joint.acceleration),
+            "jerk": (config_joint.jerk or math.inf, operator_joint.jerk or math.inf),
         }
-        for name, (given, own_limit) in limits.items():
-            if (given < own_limit) if name == "lower" else (given > own_limit):
+        for name, (value, own_limit) in limits.items():
+            if (value < own_limit) if name == "lower" else (value > own_limit):
                 raise SpecMismatch(
-                    f"the config's embodiment widens {name} of {ours.name} to {given:g}; "
+                    f"the config's embodiment widens {name} of {config_joint.name} to {value:g}; "
                     f"the robot's own limit is {own_limit:g}"
                 )
 
@@ -398,14 +400,14 @@ def _as_vector(
     value: Any, names: tuple[str, ...], robot: str, source: str
 ) -> npt.NDArray[np.float64]:
     try:
-        found = np.asarray(value)
+        vector = np.asarray(value)
     except ValueError:  # rows of different lengths
-        found = np.empty(0, dtype=object)
-    if found.dtype.kind not in "fiu":
+        vector = np.empty(0, dtype=object)
+    if vector.dtype.kind not in "fiu":
         raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
-    if found.shape != (len(names),):
-        raise BadFrame(f"{source} has shape {found.shape}; {robot} has ({len(names)},)")
-    bad = [name for name, ok in zip(names, np.isfinite(found), strict=True) if not ok]
+    if vector.shape != (len(names),):
+        raise BadFrame(f"{source} has shape {vector.shape}; {robot} has ({len(names)},)")
+    bad = [name for name, ok in zip(names, np.isfinite(vector), strict=True) if not ok]
     if bad:
         raise BadFrame(f"{source} is not finite for {', '.join(bad)}")
-    return found.astype(np.float64)
+    return vector.astype(np.float64)

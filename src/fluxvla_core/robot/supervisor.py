@@ -7,7 +7,7 @@ from collections.abc import Callable
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.sender import Sent
+from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import CommandSent, Event, Phase
 from fluxvla_core.robot.robot import Robot
@@ -57,7 +57,7 @@ class Supervisor:
         """The policy's motion begins, or continues."""
         self.phase = Phase.RUN
 
-    def after_tick(self, sent: Sent | None, sent_at: float, late_s: float) -> None:
+    def after_tick(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
         """The tick after each command: reported always, supervised while it may still stop.
 
         Args:
@@ -89,7 +89,7 @@ class Supervisor:
         self._interrupts.check()
         if sent is not None:
             self._tracking.sent(sent.command, sent_at)
-        if measured is not None and robot.follows:
+        if measured is not None and robot.follows_commands:
             self._tracking.check(measured.state, measured.at)
         if phase is not Phase.RUN or sent is None:
             return

@@ -37,24 +37,24 @@ def positions(message: Any, names: Sequence[str], source: str = "joint states") 
 
 # A driver sends the same names with every message; a few streams with a few orders each.
 @functools.lru_cache(maxsize=64)
-def _columns(given: tuple[str, ...], count: int, names: tuple[str, ...], source: str) -> list[int]:
-    """Index of each joint in a message that has the names ``given`` and ``count`` positions."""
-    if not given:
+def _columns(sent: tuple[str, ...], count: int, names: tuple[str, ...], source: str) -> list[int]:
+    """Index of each joint in a message that has the names ``sent`` and ``count`` positions."""
+    if not sent:
         raise BadMessage(
             f"{source}: {count} positions without joint names; "
             "joints are only ever told apart by name",
             next="let the driver fill JointState.name",
         )
-    if count != len(given):
-        raise BadMessage(f"{source}: {len(given)} joint names, but {count} positions")
-    at = {name: index for index, name in enumerate(given)}
-    if len(at) != len(given):
-        twice = sorted({name for name in given if given.count(name) > 1})
+    if count != len(sent):
+        raise BadMessage(f"{source}: {len(sent)} joint names, but {count} positions")
+    at = {name: index for index, name in enumerate(sent)}
+    if len(at) != len(sent):
+        twice = sorted({name for name in sent if sent.count(name) > 1})
         raise BadMessage(f"{source}: joint names come twice: {', '.join(twice)}")
     missing = [name for name in names if name not in at]
     if missing:
         raise BadMessage(
-            f"{source}: no joint called {', '.join(missing)}; there are {', '.join(given)}",
+            f"{source}: no joint called {', '.join(missing)}; there are {', '.join(sent)}",
             cause="another robot, or a driver that names its joints in another way",
             next="give the operator the names that its driver uses (joint_names)",
         )

@@ -20,7 +20,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")
 # A ``(state_dim,)`` state, and when it arrived.
-Measured = tuple[Array, float]
+TimedState = tuple[Array, float]
 PATIENCE_S = 0.25
 """How long a joint that lags may keep moving towards its last command."""
 # Commands further apart than this are single ones, and no motion that could be braked.
@@ -68,7 +68,10 @@ class Motion:
         self._last, self._at = command, now
 
     def stop_commands(
-        self, embodiment: EmbodimentSpec, last: Array, measured: tuple[Measured, Measured] | None
+        self,
+        embodiment: EmbodimentSpec,
+        last: Array,
+        measured: tuple[TimedState, TimedState] | None,
     ) -> list[Array]:
         """The commands of a stop, one at least; the motion before it is forgotten.
 

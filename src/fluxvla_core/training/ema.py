@@ -46,10 +46,10 @@ class Ema:
     def _swap(self) -> None:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
-                ours, theirs = to_local(self.shadow[name]), to_local(parameter)
-                kept = theirs.clone()
-                theirs.copy_(ours)
-                ours.copy_(kept)
+                average, weight = to_local(self.shadow[name]), to_local(parameter)
+                saved = weight.clone()
+                weight.copy_(average)
+                average.copy_(saved)
 
     def load(self, tensors: Mapping[str, Tensor], where: str) -> None:
         """Take the full averages in ``tensors``.

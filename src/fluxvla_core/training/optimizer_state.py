@@ -53,19 +53,19 @@ def torch_state(
         CheckpointError: other parameters, sizes, groups or another optimizer.
     """
     names = {id(parameter): name for name, parameter in model.named_parameters()}
-    ours = [[names[id(p)] for p in group["params"]] for group in optimizer.param_groups]
-    theirs = [group["params"] for group in described["groups"]]
-    if described["type"] != type(optimizer).__name__ or ours != theirs:
+    own_groups = [[names[id(p)] for p in group["params"]] for group in optimizer.param_groups]
+    saved_groups = [group["params"] for group in described["groups"]]
+    if described["type"] != type(optimizer).__name__ or own_groups != saved_groups:
         raise CheckpointError(
             f"the optimizer of the checkpoint ({described['type']}, groups of "
-            f"{[len(g) for g in theirs]} parameters) is not this run's "
-            f"({type(optimizer).__name__}, {[len(g) for g in ours]})",
+            f"{[len(g) for g in saved_groups]} parameters) is not this run's "
+            f"({type(optimizer).__name__}, {[len(g) for g in own_groups]})",
             where=where,
             cause="the model or the optimizer settings of the config have changed",
             next="resume with the config that made it: config.resolved.json in its folder",
         )
     parameters = {names[id(p)]: p for group in optimizer.param_groups for p in group["params"]}
-    index = {name: i for i, name in enumerate(name for group in ours for name in group)}
+    index = {name: i for i, name in enumerate(name for group in own_groups for name in group)}
     state: dict[int, dict[str, Any]] = {}
     for place, value in {**tensors, **described["scalars"]}.items():
         name, _, key = place.rpartition("/")
@@ -82,8 +82,8 @@ def torch_state(
         state.setdefault(index[name], {})[key] = value
     groups, first = [], 0
     for mine, saved in zip(optimizer.param_groups, described["groups"], strict=True):
-        kept = {k: saved[k] for k in ("lr", "initial_lr") if k in saved}
-        group = {**{k: v for k, v in mine.items() if k != "params"}, **kept}
+        rates = {k: saved[k] for k in ("lr", "initial_lr") if k in saved}
+        group = {**{k: v for k, v in mine.items() if k != "params"}, **rates}
         group["params"] = list(range(first, first + len(mine["params"])))
         first += len(mine["params"])
         groups.append(group)

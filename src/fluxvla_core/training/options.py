@@ -109,15 +109,15 @@ class TrainOptions:
             raise ConfigError.from_problems(tuple(found))
 
     def _problems(self) -> list[tuple[str, str]]:
-        found: list[tuple[str, str]] = []
+        problems: list[tuple[str, str]] = []
 
         def need(key: str, fine: bool, rule: str) -> None:
             if not fine:
-                found.append((key, f"{rule}, got {getattr(self, key)!r}"))
+                problems.append((key, f"{rule}, got {getattr(self, key)!r}"))
 
         if (self.max_epochs is None) == (self.max_steps is None):
             given = "both" if self.max_steps is not None else "none"
-            found.append(("max_epochs", f"give max_epochs or max_steps, got {given}"))
+            problems.append(("max_epochs", f"give max_epochs or max_steps, got {given}"))
         for key in (
             "max_epochs",
             "max_steps",
@@ -164,8 +164,8 @@ class TrainOptions:
         try:
             make_schedule(self.lr_scheduler_type, 1.0, 100, self.warmup_ratio, self.lr_schedule)
         except ConfigError as error:
-            found.append(("lr_scheduler_type", error.what))
-        return found
+            problems.append(("lr_scheduler_type", error.what))
+        return problems
 
     def lora_options(self, context: RunContext) -> LoraOptions | None:
         """The table ``lora``, checked; None without one.
@@ -241,24 +241,26 @@ class LoaderOptions:
                 next=f"{section} = dict(per_device_batch_size=…, dataset=dict(type=…))",
             )
         known = LOADER_KEYS
-        found: list[tuple[str, str]] = []
+        problems: list[tuple[str, str]] = []
         for key in table:
             if key not in known:
                 near = nearest(key, known)
                 hint = f"; did you mean {near!r}?" if near else f"; known: {', '.join(known)}"
-                found.append((key, f"unknown key{hint}"))
+                problems.append((key, f"unknown key{hint}"))
         size, workers, together = table.get(known[0]), table.get(known[1], 0), table.get(known[2])
         if not _count(size, 1):
-            found.append((known[0], f"must be a whole number above 0, got {size!r}"))
+            problems.append((known[0], f"must be a whole number above 0, got {size!r}"))
         if not _count(workers, 0):
-            found.append((known[1], f"must be a whole number from 0 up, got {workers!r}"))
+            problems.append((known[1], f"must be a whole number from 0 up, got {workers!r}"))
         if together is not None and not _count(together, 2):
-            found.append((known[2], f"must be a whole number above 1, or None, got {together!r}"))
-        if found:
+            problems.append(
+                (known[2], f"must be a whole number above 1, or None, got {together!r}")
+            )
+        if problems:
             raise ConfigError.from_problems(
                 tuple(
                     Problem(context.origins.get(f"{section}.{k}", ""), f"{section}.{k}", what)
-                    for k, what in found
+                    for k, what in problems
                 )
             )
         return cls(int(table[known[0]]), int(workers), together)

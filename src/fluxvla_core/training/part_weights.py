@@ -43,26 +43,28 @@ def matched(
     Raises:
         CheckpointError: as ``put_parts``.
     """
-    theirs = {name: other for name in wanted if (other := _other_name(name, part.names))}
-    if not theirs:
+    source_names = {name: other for name in wanted if (other := _other_name(name, part.names))}
+    if not source_names:
         parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in wanted))
         raise CheckpointError(
             f"no weight of the model has {' or '.join(map(repr, part.names))} in its name",
             where=part.place,
             cause=f"the model's parts are {parts}",
         )
-    found = {name for name, other in theirs.items() if other in tensors}
-    tied = {id(wanted[name]) for name in found}  # two names here of what has one name there
+    available = {name for name, other in source_names.items() if other in tensors}
+    tied = {id(wanted[name]) for name in available}  # two names here of what has one name there
     missing = [
-        n for name, n in theirs.items() if name not in found and id(wanted[name]) not in tied
+        n
+        for name, n in source_names.items()
+        if name not in available and id(wanted[name]) not in tied
     ]
-    used = set(theirs.values())
+    used = set(source_names.values())
     extra = [n for n in tensors if n not in used and not any(text in n for text in part.unread)]
     sizes = [
-        f"{theirs[name]}: {tuple(tensors[theirs[name]].shape)} there, "
+        f"{source_names[name]}: {tuple(tensors[source_names[name]].shape)} there, "
         f"{tuple(wanted[name].shape)} here"
-        for name in sorted(found)
-        if tensors[theirs[name]].shape != wanted[name].shape
+        for name in sorted(available)
+        if tensors[source_names[name]].shape != wanted[name].shape
     ]
     kinds = (("missing", missing), ("left over", extra), ("of another size", sizes))
     lines = [
@@ -79,7 +81,7 @@ def matched(
             cause="they are of another model, or their names correspond in another way to those "
             f"here: {named}",
         )
-    return {name: tensors[theirs[name]] for name in sorted(found)}
+    return {name: tensors[source_names[name]] for name in sorted(available)}
 
 
 def tensors_at(place: str | Path) -> Mapping[str, Tensor | Stored]:

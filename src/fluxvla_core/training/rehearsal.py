@@ -22,7 +22,7 @@ from fluxvla_core.build import (
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, example
-from fluxvla_core.errors import FluxError
+from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
@@ -60,6 +60,7 @@ class Rehearsal:
         notes: what is not known, or does not fit.
         skeleton: the model without memory, with its adapters.
         inputs: the batch itself.
+        refused: with what the training would end at its first batch.
     """
 
     robot: EmbodimentSpec | None = None
@@ -75,6 +76,7 @@ class Rehearsal:
     notes: list[str] = field(default_factory=list)
     skeleton: nn.Module | None = None
     inputs: Mapping[str, Any] | None = None
+    refused: FluxError | None = None
 
 
 def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
@@ -84,28 +86,33 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
         context: with the config's tree.
         processes: for which numbers of them to count the memory.
     """
-    found = Rehearsal()
-    found.robot = _robot(context.config, found.notes)
-    model = _model(context, found.notes)
-    runner = _runner(context, found.notes)
+    rehearsal = Rehearsal()
+    rehearsal.robot = _robot(context.config, rehearsal.notes)
+    model = _model(context, rehearsal.notes)
+    runner = _runner(context, rehearsal.notes)
     if model is not None:
-        found.model = type(model).__name__
-        found.parameters = sum(p.numel() for p in model.parameters())
-        found.action_shape = VLA.adapt(model).action_shape
+        rehearsal.model = type(model).__name__
+        rehearsal.parameters = sum(p.numel() for p in model.parameters())
+        rehearsal.action_shape = VLA.adapt(model).action_shape
         if runner is not None and runner.lora is not None:
-            model = _with_adapters(model, runner, context, found.notes)
+            model = _with_adapters(model, runner, context, rehearsal.notes)
     if model is not None:
-        found.trained = sum(p.numel() for p in trainable(model).values())
-    batch = _batch(context, found, runner)
-    found.skeleton, found.inputs = model, batch
-    _compare(found)
+        rehearsal.trained = sum(p.numel() for p in trainable(model).values())
+    batch = _batch(context, rehearsal, runner)
+    rehearsal.skeleton, rehearsal.inputs = model, batch
+    _compare(rehearsal)
+    if model is not None and batch is not None:
+        try:
+            ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
+        except ConfigError as error:
+            rehearsal.refused, batch = error, None
     if model is None or runner is None or not processes:
-        return found
-    if not found.trained:
-        found.notes.append("the model has no trainable parameter: all of its parts are frozen")
-        return found
-    _count(found, model, runner, batch, processes)
-    return found
+        return rehearsal
+    if not rehearsal.trained:
+        rehearsal.notes.append("the model has no trainable parameter: all of its parts are frozen")
+        return rehearsal
+    _count(rehearsal, model, runner, batch, processes)
+    return rehearsal
 
 
 def on_meta(context: RunContext) -> nn.Module:
@@ -137,21 +144,21 @@ def memory_of(
         Exception: what a model raises that decides by the values of its inputs.
     """
     options = runner.options
-    kept: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
-    found = {}
+    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
+    footprints = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
         lowered = tuple(layout.gathered_as.items())
-        if lowered not in kept:
-            kept[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
-        found[count] = footprint(
+        if lowered not in by_dtypes:
+            by_dtypes[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+        footprints[count] = footprint(
             layout,
-            kept[lowered],
+            by_dtypes[lowered],
             optimizer_bytes(runner.optimizer_settings.build, layout.optimized),
             averaged=options.ema_decay is not None,
             recompute=options.enable_gradient_checkpointing,
         )
-    return found
+    return footprints
 
 
 def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
@@ -182,6 +189,9 @@ def _count(
         try:
             found.memory = memory_of(model, runner, inputs, processes, device_type)
         except Exception as error:  # noqa: BLE001 - another's model; an estimate must not end the run
+            if isinstance(error, ConfigError) and inputs is not None:
+                found.refused = error
+                continue
             what = "activations are" if inputs is not None else "memory is"
             found.notes.append(f"{what} not known: {_told(error)}")
             continue
@@ -243,21 +253,21 @@ def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
 
 
 def _batch(
-    context: RunContext, found: Rehearsal, runner: BaseTrainRunner | None
+    context: RunContext, rehearsal: Rehearsal, runner: BaseTrainRunner | None
 ) -> Mapping[str, Any] | None:
     try:
         table = context.config["train_dataloader"]["dataset"]
-        widths = _widths(context.config.get("model", {}), found.action_shape)
-        found.data = example(table, context, found.robot, widths)
-        found.notes += found.data.assumed
+        widths = _widths(context.config.get("model", {}), rehearsal.action_shape)
+        rehearsal.data = example(table, context, rehearsal.robot, widths)
+        rehearsal.notes += rehearsal.data.assumed
         if runner is None:
             return None
         size = runner.loader_options.per_device_batch_size
-        batch: Mapping[str, Any] = runner.collator([found.data.sample] * size)
+        batch: Mapping[str, Any] = runner.collator([rehearsal.data.sample] * size)
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
-        found.notes.append(f"the batch is not known: {_told(error)}")
+        rehearsal.notes.append(f"the batch is not known: {_told(error)}")
         return None
-    found.batch = {
+    rehearsal.batch = {
         key: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
         for key, value in batch.items()
         if isinstance(value, Tensor)
@@ -282,25 +292,25 @@ def _named(table: Any, key: str) -> int | None:
     return next((value for value in inner if value is not None), None)
 
 
-def _compare(found: Rehearsal) -> None:
+def _compare(rehearsal: Rehearsal) -> None:
     """Note where data, model and robot do not fit together."""
-    data, robot, chunk = found.data, found.robot, found.action_shape
+    data, robot, chunk = rehearsal.data, rehearsal.robot, rehearsal.action_shape
     if data is not None and data.dataset is not None and robot is not None:
         for what, have, takes in (
             ("states", data.states, robot.state_dim),
             ("actions", data.actions, robot.dim),
         ):
             if have != takes:
-                found.notes.append(
+                rehearsal.notes.append(
                     f"the dataset's {what} have {have} numbers, those of {robot.name} {takes}"
                 )
     if robot is not None and data is not None:
         missing = sorted(set(data.cameras) - {camera.name for camera in robot.cameras})
         if missing:
-            found.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
-    actions = found.batch.get("actions")
+            rehearsal.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
+    actions = rehearsal.batch.get("actions")
     if chunk is not None and actions is not None and actions[0][1:] != tuple(chunk):
-        found.notes.append(
+        rehearsal.notes.append(
             f"the batch's actions are {actions[0][1:]} a sample, the model's chunks {tuple(chunk)}"
         )
 

@@ -400,19 +400,19 @@ def _leaves(name: str, value: Any, harmless: Set[str]) -> Iterator[tuple[str, st
             yield from _leaves(f"{name}.{key}", item, harmless)
 
 
-def changed_statistics(saved: Any, ours: Any, name: str = "") -> list[str]:
+def changed_statistics(saved: Any, present: Any, name: str = "") -> list[str]:
     """Dotted names of statistics that differ by more than another machine's rounding does."""
-    if isinstance(saved, Mapping) and isinstance(ours, Mapping):
+    if isinstance(saved, Mapping) and isinstance(present, Mapping):
         return [
-            found
-            for key in {**saved, **ours}
-            for found in changed_statistics(
-                saved.get(key), ours.get(key), f"{name}.{key}".strip(".")
+            change
+            for key in {**saved, **present}
+            for change in changed_statistics(
+                saved.get(key), present.get(key), f"{name}.{key}".strip(".")
             )
         ]
-    if isinstance(saved, list) and isinstance(ours, list) and len(saved) == len(ours):
-        pairs = zip(saved, ours, strict=True)
+    if isinstance(saved, list) and isinstance(present, list) and len(saved) == len(present):
+        pairs = zip(saved, present, strict=True)
         return [name] if any(changed_statistics(a, b, name) for a, b in pairs) else []
-    numbers = all(isinstance(v, int | float) for v in (saved, ours))
-    same = math.isclose(saved, ours, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == ours
+    numbers = all(isinstance(v, int | float) for v in (saved, present))
+    same = math.isclose(saved, present, rel_tol=1e-5, abs_tol=1e-8) if numbers else saved == present
     return [] if same else [name]

@@ -10,7 +10,7 @@ import pytest
 from fluxvla_core.robot import events
 from fluxvla_core.robot.control.clamps import Clamp
 from fluxvla_core.robot.control.safety import Rule, Trip
-from fluxvla_core.robot.control.sender import Sent
+from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.events import (
     ChunkAccepted,
     CommandSent,
@@ -21,8 +21,8 @@ from fluxvla_core.robot.events import (
     FilterLeftOut,
     Observed,
     Phase,
-    Reading,
     Refused,
+    RobotReading,
     Stopped,
     StoppedWhileHeld,
 )
@@ -36,10 +36,10 @@ CLAMPS = (
     Clamp("jaw", float("inf"), 0.0, "velocity"),
 )
 TASK = Task("1", "wave", False)
-READING = Reading({}, None, POSE, 1.0, 1.0, {})
+READING = RobotReading({}, None, POSE, 1.0, 1.0, {})
 SENT = [
-    Sent(POSE, POSE * 0.5, CLAMPS),
-    Sent(POSE, POSE, (), held=True),
+    SentCommand(POSE, POSE * 0.5, CLAMPS),
+    SentCommand(POSE, POSE, (), held=True),
 ]
 TOLD = [
     *(

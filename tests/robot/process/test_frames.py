@@ -16,11 +16,11 @@ from fluxvla_core.errors import FluxError, NotReady, Rejected
 from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
-    Look,
+    FrameMessage,
     frame_bytes,
     frame_of,
-    look_of,
     make_frame_memory,
+    message_of_frame,
 )
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
@@ -49,11 +49,11 @@ def ends():
     memory.close()
 
 
-def through(ends, look):
+def through(ends, message):
     main, control = ends
     main.ask()
     control.wait_for_question()
-    control.answer(look)
+    control.answer(message)
     assert main.answered(10.0)
     return main.take()
 
@@ -70,7 +70,9 @@ def assert_same(found, wanted, names=NAMES):
 def test_a_frame_arrives_in_fresh_arrays(ends):
     wanted = frame()
 
-    first, second = (frame_of(through(ends, look_of(wanted, NAMES, "a"))) for _ in range(2))
+    first, second = (
+        frame_of(through(ends, message_of_frame(wanted, NAMES, "a"))) for _ in range(2)
+    )
 
     assert_same(first, wanted)
     assert first.images["front"].flags.writeable
@@ -84,10 +86,10 @@ def test_depth_and_base_arrive_where_there_are_any(ends):
     depths = {c.name: random.uniform(0, 9, (c.height, c.width)) for c in CAMERAS}
     base = np.array([0.5, -0.25])
     wanted = RobotFrame(plain.state, plain.images, plain.stamps, depths, base)
-    assert ends[1].fits(look_of(wanted, NAMES, "a"))
+    assert ends[1].fits(message_of_frame(wanted, NAMES, "a"))
 
-    found = frame_of(through(ends, look_of(wanted, NAMES, "a")))
-    without = frame_of(through(ends, look_of(plain, NAMES, "a")))
+    found = frame_of(through(ends, message_of_frame(wanted, NAMES, "a")))
+    without = frame_of(through(ends, message_of_frame(plain, NAMES, "a")))
 
     assert_same(found, wanted)
     for name in NAMES:
@@ -99,14 +101,16 @@ def test_depth_and_base_arrive_where_there_are_any(ends):
 def test_only_the_cameras_that_are_looked_at_are_sent(ends):
     wanted = frame()
 
-    assert_same(frame_of(through(ends, look_of(wanted, ("wrist",), "a"))), wanted, ("wrist",))
+    assert_same(
+        frame_of(through(ends, message_of_frame(wanted, ("wrist",), "a"))), wanted, ("wrist",)
+    )
 
 
 def test_a_picture_that_has_not_come_yet_is_missing(ends):
     wanted = frame()
     images = {"front": None, "wrist": wanted.images["wrist"]}
 
-    found = frame_of(through(ends, look_of(frame(images=images), NAMES, "a")))
+    found = frame_of(through(ends, message_of_frame(frame(images=images), NAMES, "a")))
 
     assert_same(found, wanted, ("wrist",))
 
@@ -119,7 +123,9 @@ def test_pictures_that_are_views_and_states_that_are_lists(ends):
     assert not images["front"].flags.c_contiguous
 
     found = frame_of(
-        through(ends, look_of(frame(images=images, state=wanted.state.tolist()), NAMES, "a"))
+        through(
+            ends, message_of_frame(frame(images=images, state=wanted.state.tolist()), NAMES, "a")
+        )
     )
 
     assert_same(found, wanted)
@@ -136,7 +142,7 @@ def test_pictures_that_are_views_and_states_that_are_lists(ends):
 def test_what_is_wrong_with_a_frame_arrives_as_it_is(ends, changed):
     wanted = frame(**changed)
 
-    found = frame_of(through(ends, look_of(wanted, NAMES, "a")))
+    found = frame_of(through(ends, message_of_frame(wanted, NAMES, "a")))
 
     np.testing.assert_array_equal(found.state, wanted.state)
     for name in NAMES:
@@ -150,15 +156,15 @@ def test_what_is_wrong_with_a_frame_arrives_as_it_is(ends, changed):
 @pytest.mark.parametrize("changed", [{"state": "here"}, {"images": {"front": object()}}])
 def test_what_is_no_array_of_numbers_is_refused(changed):
     with pytest.raises(BadFrame, match="no array of numbers, but a"):
-        look_of(frame(**changed), NAMES, "Arm.get_frame()")
+        message_of_frame(frame(**changed), NAMES, "Arm.get_frame()")
 
 
 def test_a_picture_that_is_too_large_does_not_fit(ends):
     larger = {"front": np.zeros((480, 640, 3), np.uint8)}
 
-    assert ends[1].fits(look_of(frame(), NAMES, "a"))
-    assert not ends[1].fits(look_of(frame(images=larger), NAMES, "a"))
-    assert not ends[1].fits(Look({"text": "x" * 200_000}))
+    assert ends[1].fits(message_of_frame(frame(), NAMES, "a"))
+    assert not ends[1].fits(message_of_frame(frame(images=larger), NAMES, "a"))
+    assert not ends[1].fits(FrameMessage({"text": "x" * 200_000}))
 
 
 WITHOUT_ROOM = """
@@ -184,12 +190,12 @@ def test_memory_that_is_not_there_is_an_error_at_once():
 OTHER = """
 import sys
 import numpy as np
-from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory, Look
+from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory, FrameMessage
 
 channel = FrameChannel(FrameMemory(*map(int, sys.argv[1:])))
 for number in range(200):
     channel.wait_for_question()
-    channel.answer(Look({"number": number}, {"a": np.full((64, 48, 3), number, np.uint8)}))
+    channel.answer(FrameMessage({"number": number}, {"a": np.full((64, 48, 3), number, np.uint8)}))
 """
 
 
@@ -203,9 +209,9 @@ def test_every_answer_of_another_process_is_whole_and_new():
             until = time.monotonic() + 30
             while not channel.answered(0.05):
                 assert time.monotonic() < until
-            look = channel.take()
-            assert look.fields["number"] == number
-            assert (look.arrays["a"] == number).all()
+            message = channel.take()
+            assert message.fields["number"] == number
+            assert (message.arrays["a"] == number).all()
         assert process.wait(30) == 0
     channel.close()
 
@@ -216,10 +222,10 @@ def answering(operator, looks):
     control = FrameChannel(type(memory)(*map(os.dup, memory)))
 
     def answer():
-        for look in looks:
+        for message in looks:
             control.wait_for_question()
-            if look is not None:
-                control.answer(look)
+            if message is not None:
+                control.answer(message)
 
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
@@ -229,7 +235,7 @@ def answering(operator, looks):
 def test_what_the_operator_raised_is_raised_here():
     operator = RemoteOperator("Arm", SPEC)
     error = {"error": ["NotReady"], "rule": NotReady.rule, "what": "no picture yet"}
-    answering(operator, [Look({"error": error}), look_of(frame(), NAMES, "a")])
+    answering(operator, [FrameMessage({"error": error}), message_of_frame(frame(), NAMES, "a")])
 
     with pytest.raises(NotReady, match="no picture yet"):
         operator.get_frame()
@@ -271,6 +277,6 @@ def test_who_waits_for_a_frame_gives_up_when_the_control_process_is_gone():
     assert time.monotonic() - began < 1.0
     assert "does not run" in str(found)
     # The next process has memory of its own.
-    answering(operator, [look_of(frame(3), NAMES, "a")])
+    answering(operator, [message_of_frame(frame(3), NAMES, "a")])
     assert_same(operator.get_frame(), frame(3))
     operator.close()

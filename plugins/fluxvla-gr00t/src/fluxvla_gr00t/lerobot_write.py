@@ -303,20 +303,20 @@ def _n17_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step],
 
 def _tensors(checkpoint: ForeignCheckpoint, version: str) -> dict[str, Tensor]:
     """All weights under LeRobot's names, with those that nothing reads."""
-    found = {
+    tensors = {
         published_name(name, version): whole(tensor).contiguous()
         for name, tensor in checkpoint.tensors.items()
     }
     if version == "n1.7":
         text = "backbone.model.model.language_model."
-        embedding = found[f"{text}embed_tokens.weight"]
-        found[f"{text}norm.weight"] = torch.ones(embedding.shape[1], dtype=embedding.dtype)
+        embedding = tensors[f"{text}embed_tokens.weight"]
+        tensors[f"{text}norm.weight"] = torch.ones(embedding.shape[1], dtype=embedding.dtype)
     else:
         language = "backbone.eagle_model.language_model."
-        embedding = found[f"{language}model.embed_tokens.weight"]
-        found[f"{language}lm_head.weight"] = embedding.clone()
-        found |= _pooling(found)
-    return {PREFIX + name: tensor for name, tensor in found.items()}
+        embedding = tensors[f"{language}model.embed_tokens.weight"]
+        tensors[f"{language}lm_head.weight"] = embedding.clone()
+        tensors |= _pooling(tensors)
+    return {PREFIX + name: tensor for name, tensor in tensors.items()}
 
 
 def _pooling(found: Mapping[str, Tensor]) -> dict[str, Tensor]:

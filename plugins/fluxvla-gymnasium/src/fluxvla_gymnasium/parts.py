@@ -13,7 +13,7 @@ from fluxvla_core.errors import SpecMismatch
 Parts = Mapping[str, npt.NDArray[Any]]
 
 
-def parts(seen: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
+def parts(observation: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
     """Arrays by name, sorted; the names of nested ones are joined by dots. Texts are arrays, too.
 
     An observation that is one array has the name ``""``, or ``image`` if it is a picture.
@@ -21,17 +21,19 @@ def parts(seen: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
     Raises:
         SpecMismatch: a part is neither an array of numbers nor text.
     """
-    if isinstance(seen, (tuple, list)) and not all(np.isscalar(each) for each in seen):
-        seen = {str(number): each for number, each in enumerate(seen)}
-    if isinstance(seen, Mapping):
-        found: dict[str, npt.NDArray[Any]] = {}
-        for key in sorted(seen):
-            found |= parts(seen[key], f"{prefix}.{key}" if prefix else str(key))
-        return found
-    array = np.asarray(seen)
+    if isinstance(observation, (tuple, list)) and not all(
+        np.isscalar(each) for each in observation
+    ):
+        observation = {str(number): each for number, each in enumerate(observation)}
+    if isinstance(observation, Mapping):
+        arrays: dict[str, npt.NDArray[Any]] = {}
+        for key in sorted(observation):
+            arrays |= parts(observation[key], f"{prefix}.{key}" if prefix else str(key))
+        return arrays
+    array = np.asarray(observation)
     if array.dtype.kind not in "biufU":
         raise SpecMismatch(
-            f"the observation's part {prefix or 'as a whole'!r} is a {type(seen).__name__}: "
+            f"the observation's part {prefix or 'as a whole'!r} is a {type(observation).__name__}: "
             "no array of numbers, and no text",
             next="make the environment with a wrapper that gives arrays",
         )

@@ -36,14 +36,14 @@ def diffusion_name(name: str) -> str | None:
     ``rgb_encoders.0.backbone.layer1.0.conv1.weight``; a shared encoder is number 0."""
     if name.startswith(BUFFERS) or name.endswith(".pool.pos_grid"):
         return None
-    ours = name.removeprefix("diffusion.")
-    if ours.startswith("rgb_encoder."):
-        rest = ours.removeprefix("rgb_encoder.")
-        ours = f"rgb_encoders.{rest}" if rest[0].isdigit() else f"rgb_encoders.0.{rest}"
-    place = _BACKBONE.match(ours)
+    own_name = name.removeprefix("diffusion.")
+    if own_name.startswith("rgb_encoder."):
+        rest = own_name.removeprefix("rgb_encoder.")
+        own_name = f"rgb_encoders.{rest}" if rest[0].isdigit() else f"rgb_encoders.0.{rest}"
+    place = _BACKBONE.match(own_name)
     if place is None or place[2] not in _NETWORK:
-        return ours
-    return f"{place[1]}{_NETWORK[place[2]]}.{ours[place.end() :]}"
+        return own_name
+    return f"{place[1]}{_NETWORK[place[2]]}.{own_name[place.end() :]}"
 
 
 def published_act_name(name: str) -> str:

@@ -75,10 +75,10 @@ class LlavaVLA(VLA, nn.Module):
         }
         given = [name for name, part in halves.items() if part is not None]
         if len(given) != (3 if vlm_backbone is None else 0):
-            told = ", ".join([*given, *(["vlm_backbone"] if vlm_backbone is not None else [])])
+            names = ", ".join([*given, *(["vlm_backbone"] if vlm_backbone is not None else [])])
             raise ConfigError(
                 "LlavaVLA takes vlm_backbone, or all of vision_backbone, projector and "
-                f"llm_backbone; it was given {told or 'none of them'}"
+                f"llm_backbone; it was given {names or 'none of them'}"
             )
         frozen = {
             "vision_backbone": freeze_vision_backbone,
@@ -87,7 +87,7 @@ class LlavaVLA(VLA, nn.Module):
             "vlm_backbone": freeze_vlm_backbone,
         }
         used = ["vlm_backbone"] if vlm_backbone is not None else given
-        unused = [name for name, asked in frozen.items() if asked and name not in used]
+        unused = [name for name, freeze in frozen.items() if freeze and name not in used]
         if unused:
             raise ConfigError(f"freeze_{unused[0]}: the model has no {unused[0]}")
         if vlm_backbone is not None:

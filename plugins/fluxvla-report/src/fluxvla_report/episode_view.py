@@ -102,20 +102,20 @@ def clamp_note(episode: Episode) -> str:
 def legend(episode: Episode) -> list[tuple[str, str]]:
     """Classes and text of what is drawn in the joints' charts."""
     joints = episode.joints
-    found = [("s0", "command")]
+    entries = [("s0", "command")]
     if any(map(math.isfinite, (v for joint in joints for v in joint.states))):
-        found.append(("s1", "state"))
+        entries.append(("s1", "state"))
     if any(map(math.isfinite, (v for joint in joints for v in joint.wanted))):
-        found.append(("dash s5", "target before the limits"))
+        entries.append(("dash s5", "target before the limits"))
     if episode.clamped:
-        found.append((f"dot {clamp_css(episode)}", "command that a limit changed"))
+        entries.append((f"dot {clamp_css(episode)}", "command that a limit changed"))
     if episode.stops:
-        found.append(("bar bad", "safe stop"))
+        entries.append(("bar bad", "safe stop"))
     if any(joint.limits for joint in joints):
-        found.append(("limit s5", "limit of the joint"))
+        entries.append(("limit s5", "limit of the joint"))
     if any(span.name != "run" for span in episode.phases):
-        found.append(("area", "not the task: ramp, hold, stop"))
-    return found
+        entries.append(("area", "not the task: ramp, hold, stop"))
+    return entries
 
 
 def joint_chart(joint: JointTrace, episode: Episode) -> dict[str, Any]:

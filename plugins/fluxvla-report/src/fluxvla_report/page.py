@@ -145,12 +145,12 @@ def heading(facts: Facts) -> str:
 
 def tiles(facts: Facts) -> list[dict[str, str]]:
     """The figures at the top: name, figure, detail."""
-    found = []
+    cards = []
     for evaluation, group in ((e, g) for e in facts.evaluations for g in e.groups):
         score, does = group.total, "succeeds"
         if evaluation.scored_by_instruction(group):
             score, does = evaluation.obeyed[group.name], "follows the instruction"
-        found.append(
+        cards.append(
             {
                 "name": f"{group.label}: {does}" if does != "succeeds" else f"{group.label} {does}",
                 "figure": f"{score.rate:.0%}",
@@ -159,12 +159,12 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
             }
         )
     if facts.training is not None:
-        found.append(_training_tile(facts.training))
+        cards.append(_training_tile(facts.training))
     if is_recordings_only(facts):
-        found += _episode_tiles(facts.episodes)
+        cards += _episode_tiles(facts.episodes)
     if facts.dataset:
         data = facts.dataset
-        found.append(
+        cards.append(
             {
                 "name": "demonstrations",
                 "figure": str(data.get("total_episodes", "?")),
@@ -175,14 +175,14 @@ def tiles(facts: Facts) -> list[dict[str, str]]:
         )
     if facts.stages:
         total = sum(stage.seconds for stage in facts.stages)
-        found.append(
+        cards.append(
             {
                 "name": "total time",
                 "figure": duration(total) if total < 60 else f"{total / 60:.0f} min",
                 "detail": f"in {len(facts.stages)} stages",
             }
         )
-    return found
+    return cards
 
 
 def is_recordings_only(facts: Facts) -> bool:

@@ -189,11 +189,11 @@ class Settings:
             if not isinstance(value, dict):
                 raise self._wrong(f"input_features.{key}", value, "a table")
         keys = [key for key, value in features.items() if value.get("type") == "VISUAL"]
-        real = [key for key in keys if not _EMPTY.search(key)]
-        if not real:
+        present = [key for key in keys if not _EMPTY.search(key)]
+        if not present:
             raise CheckpointError("input_features: there is no camera", where=self.where)
         back = {theirs: ours for ours, theirs in robot_keys.items()}
-        names = (back.get(key, key) for key in real)
+        names = (back.get(key, key) for key in present)
         return (
             tuple(
                 n.removeprefix("observation.images.").removeprefix("observation.") for n in names

@@ -61,8 +61,8 @@ class PolicyClient(ABC):
     """Observes the robot and asks the policy, for one episode.
 
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
-    return at once, ``late`` after a tenth of a second. Calls come from one thread at a time, but
-    for ``ask``, which a control process has called from a thread of its own.
+    return at once, ``slowest_since`` after a tenth of a second. Calls come from one thread at a
+    time, but for ``ask``, which a control process has called from a thread of its own.
 
     Where another process observes and thinks, ``meanwhile`` is called again and again while
     ``first_state`` or ``reset`` waits for it, if it is set: an arm that is held hears commands.
@@ -108,5 +108,5 @@ class PolicyClient(ABC):
         """Called with an answer whose chunk is no motion for this arm."""
 
     @abstractmethod
-    def late(self, since: float) -> tuple[DelaySource, float]:
-        """What took longest since ``since`` (monotonic, in seconds), and how many seconds of it."""
+    def slowest_since(self, since: float) -> tuple[DelaySource, float]:
+        """The stage that took longest since ``since`` (monotonic, s), and its seconds."""

@@ -1,6 +1,6 @@
 """The one path from a target to a command that is sent: filters, limits, latch, control tick.
 
-``CommandFormer`` forms commands, for a robot and for a stepped environment alike;
+``CommandPipeline`` forms commands, for a robot and for a stepped environment alike;
 ``CommandSender`` sends them on a robot at its control rate.
 """
 
@@ -30,8 +30,8 @@ _THERE = 1e-9  # from a pose that is moved to, in the joints' units
 
 
 @dataclass(frozen=True)
-class Sent:
-    """One command that was sent: ``(D,)`` target as it was planned, and command as it was sent.
+class SentCommand:
+    """One command that was sent: the planned ``(D,)`` target and the command made of it.
 
     ``held``: there was no target, so the arm brakes or stays.
     """
@@ -42,8 +42,8 @@ class Sent:
     held: bool = False
 
 
-class CommandFormer:
-    """Makes commands of targets: the filters in their order, then the limits, always last.
+class CommandPipeline:
+    """Makes commands of targets: action filters in their order, then the limits, always last.
 
     Args:
         limiter: the robot's limits, or ``PassThrough`` where actions are no joint targets.
@@ -93,7 +93,7 @@ class CommandFormer:
 class CommandSender:
     """Plays targets on a robot; nothing else in a run sends commands.
 
-    A ``CommandFormer`` makes commands of targets. They are handed to ``execute`` (a runner's
+    A ``CommandPipeline`` makes commands of targets. They are handed to ``execute`` (a runner's
     ``_execute_actions``), which sends each and waits with ``rate.sleep()``; at that tick
     ``on_sent`` is called with the command.
 
@@ -101,7 +101,7 @@ class CommandSender:
         execute: called with ``(N, D)`` commands and the rate.
         rate: its ``on_tick`` is taken over.
         limiter: started before anything is played.
-        latch: while it is tripped only ``brake``, ``stay`` and ``lead`` send.
+        latch: while it is tripped only ``brake``, ``send_hold`` and ``rest_at`` send.
         filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
         on_sent: called at each tick with what was sent, None for a tick without a command.
         speed: tells, before each command, the share of the velocity limits that it may use, in
@@ -117,7 +117,7 @@ class CommandSender:
         limiter: CommandLimiter,
         latch: Latch,
         filters: Sequence[Filter] = (),
-        on_sent: Callable[[Sent | None], None] | None = None,
+        on_sent: Callable[[SentCommand | None], None] | None = None,
         speed: Callable[[], float] | None = None,
         one_by_one: bool = False,
     ) -> None:
@@ -125,11 +125,11 @@ class CommandSender:
         self.limiter = limiter
         self.latch = latch
         self._execute = execute
-        self._former = CommandFormer(limiter, filters)
+        self._pipeline = CommandPipeline(limiter, filters)
         self._on_sent = on_sent or (lambda sent: None)
         self._speed = speed
         self._one_by_one = one_by_one or speed is not None
-        self._rows: deque[Sent] = deque()
+        self._rows: deque[SentCommand] = deque()
         # When the arm had the command that ``on_sent`` gets, at the latest; of those that a loop
         # with ticks of its own plays, when the first was.
         self.sent_at = 0.0
@@ -154,7 +154,7 @@ class CommandSender:
         count = 1 if self._one_by_one else max(len(wanted), 1)
         for row in range(0, len(wanted), count):
             rows = wanted[row : row + count]
-            shaped = self._former.filtered(rows) if filtered else rows
+            shaped = self._pipeline.filtered(rows) if filtered else rows
             share = most if self._speed is None else min(self._speed(), most)
             self._play(rows, shaped, share)
 
@@ -162,7 +162,7 @@ class CommandSender:
         before = self.limiter.snapshot()
         self._played = 0
         try:
-            commands, clamps = self._former.limited(shaped, speed)
+            commands, clamps = self._pipeline.limited(shaped, speed)
             self._send(wanted, commands, clamps)
         finally:
             self._rows.clear()
@@ -188,21 +188,21 @@ class CommandSender:
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
         self.latch.check()
-        self.stay()
+        self.send_hold()
 
     def brake(self) -> None:
         """Come to rest; also while the latch is tripped."""
         for _ in range(self.limiter.longest_stop):
             if self.limiter.at_rest:
                 return
-            self.stay()
+            self.send_hold()
 
-    def stay(self) -> None:
-        """Send one command as ``hold`` does; also while the latch is tripped."""
+    def send_hold(self) -> None:
+        """Send one command as :meth:`hold` does; also while the latch is tripped."""
         before = self.limiter.last
         self._send(before[None], self.limiter.brake()[None], [[]], held=True)
 
-    def lead(self, goal: Array, most: int) -> None:
+    def rest_at(self, goal: Array, most: int) -> None:
         """Come to rest at the ``(D,)`` goal, or where the limits let it; also while tripped.
 
         Args:
@@ -226,7 +226,7 @@ class CommandSender:
         held: bool = False,
     ) -> None:
         rows = zip(wanted, commands, clamps, strict=True)
-        self._rows = deque(Sent(t, c, tuple(found), held) for t, c, found in rows)
+        self._rows = deque(SentCommand(t, c, tuple(found), held) for t, c, found in rows)
         handed = commands.copy()
         handed.flags.writeable = False
         ticks, self.sent_at = self.rate.ticks, self.rate.clock.now()
@@ -252,7 +252,7 @@ def come_to_rest(
     blocked: bool,
     patience_s: float,
 ) -> None:
-    """Brake, and hold each joint that was kept from following where it is; also while tripped.
+    """Brake, and hold each blocked joint where it is; also while the latch is tripped.
 
     A joint that does not obey is not braked, which would push on whatever blocks it: its command
     halts at once and goes back from there to where the joint is.
@@ -273,16 +273,16 @@ def come_to_rest(
     else:
         off = ~tracking.follows(limiter.last, found)
         limiter.halt(off)
-        sender.lead(np.where(off, tracking.positions(found), limiter.rest()), most)
+        sender.rest_at(np.where(off, tracking.positions(found), limiter.rest()), most)
     for _ in range(int(patience_s / limiter.period)):
         found = state()
-        if found is None or tracking.stayed(limiter.last, found).all():
+        if found is None or tracking.settled(limiter.last, found).all():
             return
-        sender.stay()
+        sender.send_hold()
     found = state()
     if found is not None:
-        stayed = tracking.stayed(limiter.last, found)
-        sender.lead(np.where(stayed, limiter.last, tracking.positions(found)), most)
+        stayed = tracking.settled(limiter.last, found)
+        sender.rest_at(np.where(stayed, limiter.last, tracking.positions(found)), most)
 
 
 def ramp(limiter: CommandLimiter, pose: npt.ArrayLike, speed: float) -> Array:

@@ -58,7 +58,7 @@ class TrackingWatch:
         """Which joints, ``(dim,)``, are as near to ``command`` as they must be."""
         return self._error(command, state) <= self._allowed
 
-    def stayed(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def settled(self, command: Array, state: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which joints, ``(dim,)``, are where ``command`` left them in a stop, droop and all."""
         return self._error(command, state) <= self._reach
 

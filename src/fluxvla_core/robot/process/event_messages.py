@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from fluxvla_core.robot.control.clamps import Clamp
 from fluxvla_core.robot.control.safety import Trip
-from fluxvla_core.robot.control.sender import Sent
+from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.events import (
     CommandSent,
     EpisodeEnded,
@@ -52,7 +52,7 @@ def event_of(message: Message) -> Event | None:
         case Kind.COMMAND:
             target, command, *state = message.arrays
             clamps = tuple(Clamp(**clamp) for clamp in fields["clamps"])
-            sent = Sent(target, command, clamps, fields["held"])
+            sent = SentCommand(target, command, clamps, fields["held"])
             return CommandSent(
                 fields["at"],
                 sent,

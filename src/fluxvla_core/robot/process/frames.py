@@ -71,8 +71,8 @@ def make_frame_memory(size: int) -> FrameMemory:
 
 
 @dataclass(frozen=True)
-class Look:
-    """One reading of a robot, as it is sent to the main process.
+class FrameMessage:
+    """A frame or observation as it is sent to the main process through shared memory.
 
     Args:
         fields: JSON values.
@@ -117,7 +117,7 @@ class FrameChannel:
             os.eventfd_read(self._descriptors.answered)
         return self._numbers[_ANSWERED] == self._numbers[_ASKED]
 
-    def take(self) -> Look:
+    def take(self) -> FrameMessage:
         """The answer, in fresh arrays."""
         length = self._numbers[_LENGTH]
         fields, layout = json.loads(self._data[:length].tobytes())
@@ -127,7 +127,7 @@ class FrameChannel:
             size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
             arrays[name] = self._data[at : at + size].view(dtype).reshape(shape).copy()
             at += _aligned(size)
-        return Look(fields, arrays)
+        return FrameMessage(fields, arrays)
 
     # The control process's end.
 
@@ -135,19 +135,19 @@ class FrameChannel:
         """Wait until a frame is asked for."""
         os.eventfd_read(self._descriptors.asked)
 
-    def fits(self, look: Look) -> bool:
+    def fits(self, message: FrameMessage) -> bool:
         """Whether there is room for it."""
         return len(self._data) >= sum(
-            [_aligned(len(_text(look))), *(_aligned(a.nbytes) for a in look.arrays.values())]
+            [_aligned(len(_text(message))), *(_aligned(a.nbytes) for a in message.arrays.values())]
         )
 
-    def answer(self, look: Look) -> None:
-        """Answer the question; ``look`` fits."""
-        text = _text(look)
+    def answer(self, message: FrameMessage) -> None:
+        """Answer the question; ``message`` fits."""
+        text = _text(message)
         self._numbers[_LENGTH] = len(text)
         self._data[: len(text)] = np.frombuffer(text, np.uint8)
         at = _aligned(len(text))
-        for array in look.arrays.values():
+        for array in message.arrays.values():
             room = self._data[at : at + array.nbytes]
             # numpy releases the GIL while it copies a picture.
             np.copyto(room.view(array.dtype).reshape(array.shape), array)
@@ -156,7 +156,7 @@ class FrameChannel:
         os.eventfd_write(self._descriptors.answered, 1)
 
 
-def look_of(frame: Frame, cameras: Iterable[str], source: str) -> Look:
+def message_of_frame(frame: Frame, cameras: Iterable[str], source: str) -> FrameMessage:
     """State, stamps, base, and the images and depth of ``cameras`` of a frame.
 
     Args:
@@ -183,20 +183,20 @@ def look_of(frame: Frame, cameras: Iterable[str], source: str) -> Look:
         }
         if frame.base is not None:
             arrays[_BASE] = _numbers(frame.base, f"the base of {source}")
-    return Look({"stamps": stamps}, arrays)
+    return FrameMessage({"stamps": stamps}, arrays)
 
 
-def frame_of(look: Look) -> Frame:
-    """The frame of ``look_of``."""
-    images, depths = _named(look, _PICTURE), _named(look, _DEPTH)
-    state, stamps = look.arrays[STATE], look.fields["stamps"]
-    return RobotFrame(state, images, stamps, depths, look.arrays.get(_BASE))
+def frame_of(message: FrameMessage) -> Frame:
+    """The frame of ``message_of_frame``."""
+    images, depths = _named(message, _PICTURE), _named(message, _DEPTH)
+    state, stamps = message.arrays[STATE], message.fields["stamps"]
+    return RobotFrame(state, images, stamps, depths, message.arrays.get(_BASE))
 
 
-def look_of_window(
+def message_of_observation(
     window: Mapping[str, Any], frame: Frame | None, cameras: Iterable[str], source: str
-) -> Look:
-    """What a runner's ``update_observation_window`` made of one look at the robot.
+) -> FrameMessage:
+    """What a runner's ``update_observation_window`` returned.
 
     Args:
         window: ``qpos`` and ``images``; None for what has not come yet. What else it has is arrays
@@ -210,7 +210,7 @@ def look_of_window(
     """
     images = window.get("images")
     if not isinstance(images, Mapping):
-        return Look({"window": None if images is None else repr(images)[:200]})
+        return FrameMessage({"window": None if images is None else repr(images)[:200]})
     shown = Frame(window.get("qpos"), images, {} if frame is None else frame.stamps)  # type: ignore[arg-type]
     more = {key: value for key, value in window.items() if key not in ("qpos", "images")}
     arrays = {_MORE + k: _numbers(v, f"{k} of {source}") for k, v in more.items() if _is_array(v)}
@@ -228,29 +228,29 @@ def look_of_window(
         waits.append(STATE)
     if isinstance(frame, RobotFrame):
         shown = RobotFrame(shown.state, shown.images, shown.stamps, frame.depths, frame.base)
-    look = look_of(shown, cameras, source)
+    message = message_of_frame(shown, cameras, source)
     if frame is not None:
         arrays[_MEASURED] = _numbers(frame.state, f"the state of {source}")
     fields = {"window": values, "waits": waits, "frame": frame is not None}
-    return Look({**look.fields, **fields}, {**look.arrays, **arrays})
+    return FrameMessage({**message.fields, **fields}, {**message.arrays, **arrays})
 
 
-def window_of(look: Look) -> tuple[dict[str, Any], Frame | None]:
-    """The window of ``look_of_window``, and the frame with the window's pictures."""
-    values = look.fields["window"]
+def observation_of(message: FrameMessage) -> tuple[dict[str, Any], Frame | None]:
+    """The observation of ``message_of_observation``, and the frame with its images."""
+    values = message.fields["window"]
     if not isinstance(values, dict):
         return {"images": values}, None
-    shown = frame_of(look)
-    more = _named(look, _MORE)
-    waits = look.fields["waits"]
+    shown = frame_of(message)
+    more = _named(message, _MORE)
+    waits = message.fields["waits"]
     images = {**shown.images, **{name: None for name in waits if name != STATE}}
     window = {"qpos": None if STATE in waits else shown.state, "images": images, **values, **more}
-    frame = replace(shown, state=look.arrays[_MEASURED]) if look.fields["frame"] else None
+    frame = replace(shown, state=message.arrays[_MEASURED]) if message.fields["frame"] else None
     return window, frame
 
 
-def _named(look: Look, kind: str) -> dict[str, AnyArray]:
-    return {k.removeprefix(kind): a for k, a in look.arrays.items() if k.startswith(kind)}
+def _named(message: FrameMessage, kind: str) -> dict[str, AnyArray]:
+    return {k.removeprefix(kind): a for k, a in message.arrays.items() if k.startswith(kind)}
 
 
 def _is_array(value: Any) -> bool:
@@ -264,9 +264,9 @@ def _numbers(value: Any, source: str) -> AnyArray:
     return found
 
 
-def _text(look: Look) -> bytes:
-    layout = [(name, array.dtype.str, array.shape) for name, array in look.arrays.items()]
-    return json.dumps([look.fields, layout], separators=(",", ":")).encode()
+def _text(message: FrameMessage) -> bytes:
+    layout = [(name, array.dtype.str, array.shape) for name, array in message.arrays.items()]
+    return json.dumps([message.fields, layout], separators=(",", ":")).encode()
 
 
 def _aligned(size: int) -> int:

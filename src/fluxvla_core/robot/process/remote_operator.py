@@ -12,11 +12,11 @@ from fluxvla_core.errors import NotReady, Rejected
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
     FrameMemory,
-    Look,
+    FrameMessage,
     frame_bytes,
     frame_of,
     make_frame_memory,
-    window_of,
+    observation_of,
 )
 from fluxvla_core.robot.process.messages import error_of
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -73,13 +73,13 @@ class RemoteOperator(Operator):
             NotReady: the control process does not run.
             FluxError: what the operator raised, or what is wrong with what it gave.
         """
-        return frame_of(self.look())
+        return frame_of(self.read_frame_message())
 
     def observe(self) -> tuple[dict[str, Any], Frame | None]:
         """The observation that the runner in the control process makes; raises as ``get_frame``."""
-        return window_of(self.look())
+        return observation_of(self.read_frame_message())
 
-    def look(self) -> Look:
+    def read_frame_message(self) -> FrameMessage:
         """Ask the control process for one reading of the robot; raises as ``get_frame``."""
         with self._lock:
             channel = self._channel
@@ -89,10 +89,10 @@ class RemoteOperator(Operator):
             while not channel.answered(_POLL_S):
                 if self._channel is not channel:
                     raise self._gone()
-            look = channel.take()
-        if "error" in look.fields:
-            raise error_of(look.fields["error"])
-        return look
+            message = channel.take()
+        if "error" in message.fields:
+            raise error_of(message.fields["error"])
+        return message
 
     def send_action(self, action: Any) -> None:
         """Raises Rejected: the control process commands the robot."""

@@ -63,7 +63,7 @@ class RemotePolicyClient(PolicyClient):
         assert isinstance(answer, RemoteAnswer)
         self._link.send(Kind.REFUSED, number=answer.number)
 
-    def late(self, since: float) -> tuple[DelaySource, float]:
+    def slowest_since(self, since: float) -> tuple[DelaySource, float]:
         own = self._robot.delays.longest(since)
         self._link.try_send(Kind.LATE, since=since)
         until = time.monotonic() + _LATE_S

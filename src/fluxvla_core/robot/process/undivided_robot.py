@@ -14,13 +14,13 @@ from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
-    Look,
+    FrameMessage,
     frame_of,
-    look_of,
-    look_of_window,
+    message_of_frame,
+    message_of_observation,
 )
 from fluxvla_core.robot.process.messages import error_fields
-from fluxvla_core.robot.robot import Measured, Robot, as_state, is_number
+from fluxvla_core.robot.robot import Robot, StateSample, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
@@ -44,7 +44,7 @@ class UndividedRobot(Robot):
         self._max_age_s = math.inf
         # When the call of ``get_frame`` that is under way began; None if none is.
         self._began: float | None = None
-        self._states: deque[Measured] = deque(maxlen=1)
+        self._states: deque[StateSample] = deque(maxlen=1)
 
     def observed_by(self, observe: Observe) -> None:
         """Have a runner make the observations, before ``serve``."""
@@ -64,9 +64,9 @@ class UndividedRobot(Robot):
             while True:
                 channel.wait_for_question()
                 self._began = time.monotonic()
-                look = self._look(channel)
+                message = self._read_message(channel)
                 self._began = None
-                channel.answer(look)
+                channel.answer(message)
 
         threading.Thread(target=answer, name="fluxvla-frames", daemon=True).start()
 
@@ -86,34 +86,34 @@ class UndividedRobot(Robot):
                 next=self.reading.next,
             )
 
-    def state(self) -> Measured | None:
+    def state(self) -> StateSample | None:
         """As ``Robot.state``; without ``get_state`` that of each frame, once."""
         measured = super().state()
         if measured is not None or not self._states:
             return measured
         return self._states.popleft()
 
-    def _look(self, channel: FrameChannel) -> Look:
+    def _read_message(self, channel: FrameChannel) -> FrameMessage:
         """The result of one ``get_frame``, or its error."""
         try:
-            look = self._seen()
-            if channel.fits(look):
-                return look
-            error: BaseException = self._too_large(look)
+            message = self._read()
+            if channel.fits(message):
+                return message
+            error: BaseException = self._too_large(message)
         except BaseException as raised:  # noqa: BLE001 - raised in the main process
             error = raised
-        look = Look({"error": error_fields(error)})
-        if channel.fits(look):
-            return look
+        message = FrameMessage({"error": error_fields(error)})
+        if channel.fits(message):
+            return message
         what = f"{self.reading.name} raised {type(error).__name__} with a very long message"
-        return Look({"error": error_fields(BadFrame(what))})
+        return FrameMessage({"error": error_fields(BadFrame(what))})
 
-    def _seen(self) -> Look:
+    def _read(self) -> FrameMessage:
         if self._observe is None:
             frame = self.frame()
-            look = look_of(frame, self._cameras, self.reading.name)
+            message = message_of_frame(frame, self._cameras, self.reading.name)
             self._keep_state(frame.state, frame.stamps.get(STATE))
-            return look
+            return message
         try:
             window, made_of = self._observe()
         except FluxError:
@@ -123,12 +123,14 @@ class UndividedRobot(Robot):
                 f"{self.reading.name}, or what the runner makes of it, "
                 f"raised {type(error).__name__}: {error}"
             ) from error
-        look = look_of_window(window, made_of, self._cameras, "update_observation_window()")
+        message = message_of_observation(
+            window, made_of, self._cameras, "update_observation_window()"
+        )
         if made_of is None:
             self._keep_state(window.get("qpos"), None)
         else:
             self._keep_state(made_of.state, made_of.stamps.get(STATE))
-        return look
+        return message
 
     def _keep_state(self, found: Any, stamp: float | None) -> None:
         """Keep a valid state for the tracking check; the main process reports an invalid one."""
@@ -137,14 +139,14 @@ class UndividedRobot(Robot):
         except FluxError:
             return
         timed = stamp is not None and is_number(stamp) and math.isfinite(stamp)
-        self._states.append(Measured(state, stamp if timed and stamp else self.clock.now()))
+        self._states.append(StateSample(state, stamp if timed and stamp else self.clock.now()))
 
-    def _too_large(self, look: Look) -> FluxError:
+    def _too_large(self, message: FrameMessage) -> FluxError:
         from fluxvla_core.robot.observation import check_frame  # rarely needed
 
         try:
-            check_frame(frame_of(look), self.embodiment, self._cameras)
+            check_frame(frame_of(message), self.embodiment, self._cameras)
         except BadFrame as error:
             return error
-        size = sum(array.nbytes for array in look.arrays.values())
+        size = sum(array.nbytes for array in message.arrays.values())
         return BadFrame(f"{self.reading.name} gave {size} bytes, more than its embodiment says")

@@ -24,8 +24,8 @@ from fluxvla_core.robot.events import (
     Event,
     FilterLeftOut,
     Observed,
-    Reading,
     Refused,
+    RobotReading,
     Stopped,
     StoppedWhileHeld,
 )
@@ -137,7 +137,7 @@ class EpisodeRecorder(EpisodeObserver):
             began=time.time(),
         )
 
-    def _observed(self, now: float, reading: Reading) -> None:
+    def _observed(self, now: float, reading: RobotReading) -> None:
         frame, images = reading.frame, reading.observation["images"]
         self._images = dict(images)
         pictures = images if frame is None else frame.images

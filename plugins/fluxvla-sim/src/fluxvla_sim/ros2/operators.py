@@ -194,20 +194,22 @@ class InSimulation(RosOperator):
         simulator reached from the episode's begin until it was judged. Below 0.95 a warning is
         logged: the control loop was faster than its robot then.
         """
-        kept = None
+        real_time_share = None
         if self._begun is not None and self._judged is not None:
             then, now = self._begun, self._judged
             wall = now[1] - then[1]
-            kept = (now[0] - then[0]) / (wall * self.real_time_factor) if wall > 0 else None
-        if kept is not None and kept < _KEPT:
+            real_time_share = (
+                (now[0] - then[0]) / (wall * self.real_time_factor) if wall > 0 else None
+            )
+        if real_time_share is not None and real_time_share < _KEPT:
             log.warning(
                 "the simulator kept %.0f %% of the time that it stated: this machine is too slow "
                 "for a real-time factor of %g",
-                100 * kept,
+                100 * real_time_share,
                 self.real_time_factor,
             )
-        kept = None if kept is None else round(kept, 3)
-        return {"real_time_factor": self.real_time_factor, "real_time_kept": kept}
+        real_time_share = None if real_time_share is None else round(real_time_share, 3)
+        return {"real_time_factor": self.real_time_factor, "real_time_kept": real_time_share}
 
     def _shows_episode(self) -> bool:
         """Whether everything that this operator reads is of the newest episode alone."""

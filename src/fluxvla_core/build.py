@@ -11,7 +11,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fluxvla_core.config.resolve import INJECTED
 from fluxvla_core.config.runtime_signature import misfits, option_fields
@@ -21,6 +21,8 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,28 @@ def build_from_cfg(
         # An annotation may be wrong: what really happened is reported too.
         explained.cause = f"the constructor raised {type(error).__name__}: {error}"
         raise explained from error
+
+
+def bind_options(kind: type[T], given: Mapping[str, Any], name: str, context: RunContext) -> T:
+    """The settings of a class whose constructor takes ``**options``: its dataclass ``Options``.
+
+    Args:
+        kind: that dataclass.
+        given: the constructor's keywords.
+        name: the class's.
+
+    Raises:
+        ConfigError: a key is unknown, or one that is required is missing.
+    """
+    try:
+        bound = inspect.signature(kind).bind(**given)
+    except TypeError as error:
+        raise ConfigError(
+            f"{name}: {error}",
+            where=context.where(context.section),
+            next=f"fluxvla plugins show {name}",
+        ) from error
+    return kind(*bound.args, **bound.kwargs)
 
 
 def takes(cfg: Any, registry: Registry, name: str) -> bool:

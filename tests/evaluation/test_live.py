@@ -129,8 +129,8 @@ def test_the_last_command_holds_while_time_passes(operator):
 @pytest.mark.parametrize(
     ("action", "text"),
     [
-        (np.zeros(2), r"actions have shape \(1,\), got \(2,\)"),
-        (np.array([np.nan]), "x: the command nan m is outside"),
+        (np.zeros(2), r"takes actions of shape \(1,\), got \(2,\)"),
+        (np.array([np.nan]), "x: the command is nan, not a finite number"),
         (np.array([2.5]), r"x: the command 2.5 m is outside \[-2, 2\]"),
     ],
 )

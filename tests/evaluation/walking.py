@@ -165,6 +165,9 @@ def little_model():
             self.mix = torch.nn.Linear(width + 1, width)
             self.out = torch.nn.Linear(width, 4)
 
+        def fsdp_units(self):
+            return [self.mix]
+
         def predict_action(self, images, states, noise):
             seen = torch.relu(self.see(images)).mean((2, 3))
             hidden = torch.tanh(self.mix(torch.cat([seen, states], 1)))

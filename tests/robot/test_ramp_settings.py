@@ -53,6 +53,22 @@ def test_where_the_arm_is_there_already_nothing_is_sent():
     assert ramp(limiter(0.5, 0.5), [0.5, 0.5], 0.25).shape == (0, 2)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_difference_below_rounding_is_no_way_to_go():
+    """The smallest float above 0: dividing a speed by it overflows."""
+    made = limiter(0.0, 0.5)
+    assert ramp(made, [5e-324, 0.5], 0.25).shape == (0, 2)
+    rows = ramp(made, [5e-324, 0.0], 0.25)
+    assert np.isfinite(rows).all()
+    np.testing.assert_array_equal(rows[-1], [5e-324, 0.0])
+    assert np.abs(np.diff(rows[:, 1])).max() * 50 <= 0.25
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_way_that_is_barely_there_is_gone_in_one_command():
+    np.testing.assert_array_equal(ramp(limiter(0.0, 0.5), [1e-15, 0.5], 0.25), [[1e-15, 0.5]])
+
+
 def test_a_pose_that_cannot_be_is_refused():
     with pytest.raises(ConfigError, match="prepare_pose puts b at 4, outside its limits"):
         ramp(limiter(0.0, 0.0), [0.0, 4.0], 0.25)

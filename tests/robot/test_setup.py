@@ -234,5 +234,5 @@ def test_task_descriptions_must_make_sense(bench, table, message):
 
 
 def test_an_unknown_keyword_is_no_silent_default(bench):
-    with pytest.raises(TypeError, match="max_publish_steps"):
+    with pytest.raises(ConfigError, match="max_publish_steps"):
         bench.runner(max_publish_steps=3)

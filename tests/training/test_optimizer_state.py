@@ -10,10 +10,9 @@ import torch
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.gradients import clip_
 from fluxvla_core.training.optimizer_state import named_state, torch_state
 from fluxvla_core.training.optimizers import AdamW
-from fluxvla_core.training.parameters import decay_groups
+from fluxvla_core.training.parameters import clip_, decay_groups
 
 
 def model():

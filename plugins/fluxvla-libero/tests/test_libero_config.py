@@ -102,7 +102,7 @@ def test_an_inference_runner_refuses_impossible_values(arguments, message):
         LiberoInferenceRunner(**arguments)
 
 
-def test_the_specifications_parameters_are_taken(tmp_path):
+def test_the_specifications_parameters_and_how_to_compute_are_taken(tmp_path):
     table = {
         "type": "LiberoEvalRunner",
         "task_suite_name": "libero_10",
@@ -118,12 +118,15 @@ def test_the_specifications_parameters_are_taken(tmp_path):
         "num_steps_wait": 10,
         "mixed_precision_dtype": "bf16",
         "enable_mixed_precision_training": True,
+        "execution": "compiled",
+        "quantization": "int8",
     }
     runner = build_runner_from_cfg(table, RunContext(work_dir=tmp_path, nproc=3))
     assert runner.workers == 3
-    assert runner._source.precision == "bf16"
-    assert runner._size == (224, 224)
-    assert runner._rollout.policy_seed == 7
+    assert runner.options.mixed_precision_dtype == "bf16"
+    assert (runner.options.execution, runner.options.quantization) == ("compiled", "int8")
+    assert runner.options.size == (224, 224)
+    assert runner.options.policy_seed == 7
     assert runner.model_family == "pi0"
 
 

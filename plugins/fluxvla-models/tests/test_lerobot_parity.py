@@ -203,6 +203,8 @@ def test_schedules(kind: str, betas: str, prediction: str, clip: bool) -> None:
         torch.from_numpy(fill.normal(n, (2, 4, 3))) for n in ("x", "output", "added")
     )
     assert schedule.timesteps == golden[f"{key} timesteps"].tolist()
-    steps = [schedule.step(output, step, x, added) for step in schedule.timesteps]
+    rows = schedule.coefficients()
+    drawn = [added if kind == "DDPM" and step else None for step in schedule.timesteps]
+    steps = [schedule.step(output, x, *each) for each in zip(rows, drawn, strict=True)]
     close(torch.stack(steps), golden[f"{key} steps"])
     close(schedule.add_noise(x, added, torch.tensor([3, 97])), golden[f"{key} noisy"])

@@ -106,8 +106,9 @@ class VLA(Contract):
     observe: Callable[..., Mapping[str, Any]]
     """What every denoising step needs of an observation: name -> tensor.
 
-    A method; its parameters are those of ``predict_action`` that belong to the observation. What
-    does not depend on the noisy actions is computed here, once.
+    A method; its parameters are those of ``predict_action`` that belong to the observation, and
+    ``noise`` if more noise follows from it. What does not depend on the noisy actions is computed
+    here, once.
     """
 
     def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:

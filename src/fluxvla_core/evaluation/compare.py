@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, flat, read_log, whole_lines
+from fluxvla_core.evaluation.episodes import DONE
+from fluxvla_core.evaluation.eval_log import FORMAT, FORMER, read_log, whole_lines
+from fluxvla_core.evaluation.results_file import flat
 from fluxvla_core.evaluation.success_rates import all_of, mcnemar_test, rate, verdict
 
 NAMED = 5

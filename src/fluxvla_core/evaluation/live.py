@@ -26,9 +26,10 @@ from fluxvla_core.contracts.environment import Environment, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.robot import Operator
-from fluxvla_core.errors import ConfigError, Rejected, SafetyStop
+from fluxvla_core.errors import ConfigError, SafetyStop
 from fluxvla_core.evaluation.rollout import check_step
 from fluxvla_core.robot.control.clock import MonotonicClock
+from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -153,7 +154,7 @@ class EnvironmentOperator(Operator):
         Raises:
             Rejected: another shape, not finite, or beyond the embodiment's limits.
         """
-        target = self._checked(action)
+        target = checked_action(self.embodiment, action)
         with self._lock:
             if self._began is None:
                 self._began = self.clock.now()
@@ -194,19 +195,6 @@ class EnvironmentOperator(Operator):
                 self.failed = error
                 raise
             self.ticks += 1
-
-    def _checked(self, action: Array) -> Array:
-        target = np.array(action, dtype=np.float64)
-        joints = self.embodiment.joints
-        if target.shape != (len(joints),):
-            raise Rejected(f"actions have shape ({len(joints)},), got {target.shape}")
-        for joint, value in zip(joints, target, strict=True):
-            if not joint.lower <= value <= joint.upper:  # refuses what is not finite, too
-                raise Rejected(
-                    f"{joint.name}: the command {value:.4g} {joint.unit} is outside "
-                    f"[{joint.lower:.4g}, {joint.upper:.4g}]"
-                )
-        return target
 
 
 class _TimedPolicy(Policy):

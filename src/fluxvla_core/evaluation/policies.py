@@ -39,6 +39,8 @@ class PolicySource:
         device: a torch device.
         precision: ``float32`` or ``bf16``.
         batch_size: rows of every forward pass; results follow from it.
+        execution, quantization: how its model computes, see ``load_policy``; results follow from
+            them, because rounding does.
     """
 
     policy: str | Mapping[str, Any]
@@ -49,17 +51,34 @@ class PolicySource:
     device: str = "cpu"
     precision: str = "float32"
     batch_size: int = 1
+    execution: str = "eager"
+    quantization: str | None = None
+
+    def check(self) -> None:
+        """Refuse what the model cannot be asked to do here, before anything is loaded.
+
+        Raises:
+            ConfigError: ``execution`` or ``quantization`` is unknown, or cannot be had here.
+        """
+        if self.execution == "eager" and self.quantization is None:
+            return  # without torch, which a process that serves no policy does not import
+        from fluxvla_core.policies.execution import check_execution
+        from fluxvla_core.policies.inference_weights import check_quantization
+
+        check_execution(self.execution)
+        check_quantization(self.quantization, self.device)
 
     def resolve(self, environment: Environment, work_dir: str | Path) -> PolicySource:
         """This source with the name of its policy resolved, and its checkpoint found and verified.
 
         Raises:
-            ConfigError: the environment names no expert.
+            ConfigError: the environment names no expert; or see ``check``.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
         """
         policy = resolve_policy(self.policy, environment)
         if policy not in FROM_CHECKPOINT:
             return replace(self, policy=policy)
+        self.check()
         found = chosen_checkpoint(self.ckpt_path, Path(work_dir))
         return replace(self, policy=policy, ckpt_path=found["path"])
 
@@ -103,15 +122,26 @@ def make_policy(source: PolicySource) -> Actor:
 def load(source: PolicySource) -> LocalPolicy:
     """The policy of a checkpoint, or its untrained baseline: the same model with fresh random
     weights and everything else unchanged, which shows what the pipeline does without training."""
+    from fluxvla_core.policies.inference_weights import ready
     from fluxvla_core.policies.loading import load_policy
 
     assert source.ckpt_path is not None
     dataset, denormalize = source.dataset, source.denormalize_action
     if source.norm_stats_key is not None:
         dataset, denormalize = _with_statistics(source)
-    policy = load_policy(source.ckpt_path, source.device, dataset, denormalize, source.precision)
+    precision, quantization = source.precision, source.quantization
+    policy = load_policy(
+        source.ckpt_path,
+        source.device,
+        dataset,
+        denormalize,
+        precision,
+        source.execution,
+        quantization,
+    )
     if source.policy == UNTRAINED:
-        policy.model = untrained_model(source.ckpt_path, policy.device)
+        model = untrained_model(source.ckpt_path, policy.device)
+        policy.model = ready(model, precision, quantization)
     policy.batch_size = source.batch_size
     return policy
 

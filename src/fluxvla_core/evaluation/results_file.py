@@ -14,7 +14,8 @@ from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluation.episodes import DONE, EvalLog, reason
+from fluxvla_core.evaluation.episodes import DONE, reason
+from fluxvla_core.evaluation.eval_log import EvalLog
 from fluxvla_core.evaluation.provenance import Code, provenance
 from fluxvla_core.evaluation.success_rates import (
     all_of,
@@ -236,6 +237,17 @@ def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path)
         )
     for video in results["videos"]:
         reporter.artifact("video", folder / video["path"])
+
+
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"operator": {"type": …}}`` as ``{"operator.type": …}``: rows for people."""
+    rows: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            rows |= flat(value, f"{prefix}{key}.")
+        else:
+            rows[f"{prefix}{key}"] = value
+    return rows
 
 
 def as_json(table: Any) -> Any:

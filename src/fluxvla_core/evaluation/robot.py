@@ -20,14 +20,8 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 from fluxvla_core.evaluation import results_file
-from fluxvla_core.evaluation.episodes import (
-    DONE,
-    ERROR,
-    EpisodeKey,
-    EvalLog,
-    flat,
-    open_eval_log,
-)
+from fluxvla_core.evaluation.episodes import DONE, ERROR, EpisodeKey
+from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log
 from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
 from fluxvla_core.evaluation.provenance import Code, code_of
 from fluxvla_core.evaluation.videos import choose_episodes, recorded_videos
@@ -172,7 +166,7 @@ class RobotEvalRunner(Runner):
     def _about(self) -> dict[str, Any]:
         """Everything in the config that outcomes follow from."""
         table = {k: v for k, v in self._table.items() if k not in ("seed", "ckpt_path")}
-        settings = {"section": self.section, **flat(results_file.as_json(table))}
+        settings = {"section": self.section, **results_file.flat(results_file.as_json(table))}
         return {
             "checkpoint": None if self._checkpoint is None else self._checkpoint["sha256"],
             "settings": settings,

@@ -1,9 +1,16 @@
-"""Worker processes of an evaluation: environment, policy, and one episode after another."""
+"""Episodes in worker processes: running those that are missing, and what a worker does.
+
+What an episode needs (a simulator, a policy) is made by a factory in each worker process. Its
+result must follow from the episode's key alone; then neither the number of workers nor an
+interruption changes anything but the time it takes.
+"""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -12,11 +19,14 @@ from typing import Any
 from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
+from fluxvla_core.evaluation.episodes import DONE, ERROR, POLICY, SWAPPED, EpisodeKey, reason
+from fluxvla_core.evaluation.eval_log import EvalLog
 from fluxvla_core.evaluation.live import LiveSettings, run_live
 from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
 from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
+from fluxvla_core.evaluation.pool import Outcome, WorkerPool
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
 from fluxvla_core.spec.embodiment import Camera
@@ -53,6 +63,64 @@ class Settings:
     video: VideoSettings = field(default_factory=VideoSettings)
     served: Mapping[str, PolicyFacts] = field(default_factory=dict)
     live: LiveSettings | None = None
+
+
+def run_in_pool(
+    pool: WorkerPool, keys: Sequence[EpisodeKey], log: EvalLog, reporter: Reporter
+) -> list[dict[str, Any]]:
+    """Run the episodes of ``keys`` that ``log`` does not have yet.
+
+    Args:
+        pool: its factory makes, in a worker process, a function from a key to a result: JSON
+            values with at least ``success`` (bool) and ``steps`` (int).
+
+    Returns:
+        One record for each key, in their order: the result with ``group``, ``task``, ``seed``,
+        ``attempts``, and ``status``, which is ``done``, or ``error`` with the reason in ``error``.
+
+    Raises:
+        RunFailed: workers cannot be started, or results cannot be kept.
+        FluxError: one that means bad input, from a worker.
+        KeyboardInterrupt: after the workers have been ended; finished episodes are kept.
+    """
+    missing = [key for key in keys if key not in log]
+    errors: dict[EpisodeKey, dict[str, Any]] = {}
+    done, began = len(keys) - len(missing), time.monotonic()
+    succeeded = sum(bool(record["success"]) for record in log.records(keys))
+    if done and missing:
+        reporter.info(f"{done} of {len(keys)} episodes are there already; running the others")
+    with closing(pool.run(missing)) as outcomes:
+        for outcome in outcomes:
+            key = missing[outcome.index]
+            record = _record(key, outcome)
+            log.add(record)
+            if record["status"] == ERROR:
+                errors[key] = record
+                reporter.warn(_error_line(record))
+            done += 1
+            succeeded += bool(record.get("success"))
+            reporter.event("episode", **record)
+            pace = 60 * (done - len(keys) + len(missing)) / (time.monotonic() - began)
+            reporter.progress(
+                "episodes", done, len(keys), successes=succeeded, per_minute=round(pace, 1)
+            )
+    return [errors[key] if key in errors else log.records([key])[0] for key in keys]
+
+
+def _record(key: EpisodeKey, outcome: Outcome) -> dict[str, Any]:
+    head = {"group": key.group, "task": key.task, "seed": key.seed}
+    if outcome.error is not None:
+        tail: dict[str, Any] = {"status": ERROR, "error": outcome.error}
+    else:
+        tail = {"status": DONE, **outcome.result}
+    return {**head, **tail, "attempts": outcome.attempts}
+
+
+def _error_line(record: dict[str, Any]) -> str:
+    return (
+        f"episode {record['group']}/{record['task']}/{record['seed']} gave no result "
+        f"after {record['attempts']} attempts: {reason(record['error'])}"
+    )
 
 
 class EpisodeWorker:

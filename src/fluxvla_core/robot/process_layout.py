@@ -75,7 +75,7 @@ _OBSERVING = ("get_ros_observation", "update_observation_window")
 # What the control process has no use for, or builds itself.
 _BUILT_APART = ("policy", "action_filters")
 # Of every class.
-_USUAL = ("_abc_impl", "api")
+_USUAL = ("_abc_impl", "api", "Options")
 
 
 @dataclass(frozen=True)

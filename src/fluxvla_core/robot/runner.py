@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fluxvla_core.build import (
     RunContext,
+    bind_options,
     build_operator_from_cfg,
     build_policy_from_cfg,
     takes,
@@ -37,6 +38,13 @@ from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
 from fluxvla_core.robot.make_engine import RunParts, make_engine
 from fluxvla_core.robot.observation import fit_cameras
+from fluxvla_core.robot.options import (
+    InferenceOptions,
+    build_filters,
+    check_latency,
+    check_state_dim,
+    checked_rate,
+)
 from fluxvla_core.robot.policy_calls import PolicyThread
 from fluxvla_core.robot.process_layout import (
     ControlTables,
@@ -49,15 +57,7 @@ from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.session import RobotSession
-from fluxvla_core.robot.settings import (
-    build_filters,
-    check_latency,
-    check_state_dim,
-    checked_joining,
-    checked_rate,
-)
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
-from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 FOLDER = "inference"
@@ -69,130 +69,45 @@ class BaseInferenceRunner(Runner):
     Args:
         cfg: the whole config (injected).
         context: what the run knows (injected): work dir, task, reporter.
-        seed: of the policy's noise; episode ``n`` uses ``seed + n``. Also of a simulated operator
-            whose table says no other.
-        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
-        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
-        policy: table or object of the Policy contract, instead of a checkpoint.
-        task_descriptions: id -> instruction; what ``--task`` may name, by either.
-        free_tasks: allow instructions that are none of ``task_descriptions``, as ``--free-task``
-            does; the policy may do anything then.
-        task_topic: ROS 2 topic (``std_msgs/String``) that tasks come from if the command line
-            names none; by default a person at the terminal is asked.
-        state_dim: checked against the robot's state, if given.
-        action_chunk: how many of a chunk's actions may be used; all by default.
-        publish_rate: commands a second; the embodiment's rate by default.
-        max_publish_step: commands after which an episode ends.
-        camera_names: the cameras that are observed; those that the policy looks at by default.
-        operator: table or object.
-        prepare_pose: where the arm goes before an episode, in the embodiment's units.
-        embodiment: of an operator that has none, or narrower limits for one that has.
-        execute_horizon: how many actions of a chunk are executed before the next is asked for.
-            By default all of them; while chunks are joined in motion, as few as the policy is
-            quick enough for (one, in a simulation whose time stands still meanwhile).
-        async_execution: think while moving: short for ``chunk_joining="latest_only"``.
-        chunk_joining: how chunks become one motion: a name of ``METHODS`` in
-            ``robot.control.joiners``, or a table with ``method = '<name>'`` and its parameters.
-            ``synchronous`` by default.
-        simulated_latency: seconds from an observation to its chunk, in a simulation whose time
-            stands still while the policy thinks: how the same policy would do on a slower computer.
-        gripper_threshold: gripper targets nearer to closed than this close the gripper wholly, so
-            that it presses on what it holds; in the gripper's unit. None leaves them as they are.
-        action_filters: tables or callables that may alter an action, in order, before the limits.
-        safety: thresholds, see ``SafetySettings``.
-        mixed_precision_dtype: ``float32`` or ``bf16``.
-        device: the torch device of the policy.
-        execution, quantization: how its model computes, see ``load_policy``.
-        record: folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play
-            and Foxglove and ROS 2 open; by default an episode leaves its events and videos in the
-            work dir.
-        record_fps: frames a second of the recorded videos, and of a simulation's recorded
-            pictures; None records none.
-        ready_timeout: seconds that the robot may take to give its first reading.
-        control_process: let a process of its own command the robot, so that nothing that the
-            policy or a hook does keeps the arm from being held. By default wherever that is
-            possible (docs/control.md). An operator that cannot be divided
-            (``Operator.without_cameras``) runs there as a whole, its pictures included.
+        **options: the settings, by the fields of ``InferenceOptions``.
 
     Raises:
         ConfigError, PluginError: the operator cannot be built, or the values do not fit it.
     """
 
     api: ClassVar[str] = "1.0"
+    Options: ClassVar[type[InferenceOptions]] = InferenceOptions
+    """The settings: its fields are the constructor's further keywords."""
 
     def __init__(
         self,
         cfg: Mapping[str, Any] | None = None,
         context: RunContext | None = None,
-        seed: int = 7,
-        ckpt_path: str | None = None,
-        dataset: Any = None,
-        denormalize_action: Any = None,
-        policy: Any = None,
-        task_descriptions: Mapping[str, str] | None = None,
-        task_topic: str | None = None,
-        state_dim: int | None = None,
-        action_chunk: int | None = None,
-        publish_rate: float | None = None,
-        max_publish_step: int = 10000,
-        camera_names: Sequence[str] | None = None,
-        operator: Any = None,
-        prepare_pose: Sequence[float] | None = None,
-        embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
-        execute_horizon: int | None = None,
-        async_execution: bool = False,
-        chunk_joining: str | Mapping[str, Any] | None = None,
-        simulated_latency: float = 0.0,
-        gripper_threshold: float | None = None,
-        action_filters: Sequence[Any] = (),
-        safety: Mapping[str, Any] | None = None,
-        mixed_precision_dtype: str = "float32",
-        device: str = "cpu",
-        execution: str = "eager",
-        quantization: str | None = None,
-        record: str | None = None,
-        record_fps: float | None = 10.0,
-        ready_timeout: float = 10.0,
-        free_tasks: bool = False,
-        control_process: bool | None = None,
+        **options: Any,
     ) -> None:
         self.cfg = cfg
         self.context = context or RunContext(config=cfg or {})
-        self.seed = seed
-        self.ckpt_path = ckpt_path
-        self.dataset = dataset
-        self.denormalize_action = denormalize_action
-        self.policy: Any = build_policy_from_cfg(policy, context)
-        self.task_descriptions = check_descriptions(task_descriptions)
-        self.free_tasks = free_tasks or self.context.free_task
-        self.task_topic = task_topic
-        self.action_chunk = action_chunk
-        self.execute_horizon = execute_horizon
-        self.max_publish_step = max_publish_step
-        self.camera_names = None if camera_names is None else tuple(camera_names)
-        self.prepare_pose = prepare_pose
-        self.async_execution = async_execution
-        self.chunk_joining = checked_joining(chunk_joining, async_execution, self.config_error)
-        self.simulated_latency = simulated_latency
-        self.gripper_threshold = gripper_threshold
-        self.mixed_precision_dtype = mixed_precision_dtype
-        self.device = device
-        self.execution, self.quantization = execution, quantization
-        self.record = record
-        self.record_fps = record_fps
-        self.ready_timeout = ready_timeout
-        self.safety = SafetySettings.of(safety)
-        self._layout = self._choose_layout(
-            operator, action_filters, embodiment, control_process, context
-        )
+        wrong = self.config_error
+        name = type(self).__name__
+        self.options = given = bind_options(self.Options, options, name, self.context)
+        given.check(wrong)
+        # Subclasses may change these when their constructor goes on.
+        self.seed, self.prepare_pose = given.seed, given.prepare_pose
+        self.max_publish_step, self.action_chunk = given.max_publish_step, given.action_chunk
+        self.camera_names = None if given.camera_names is None else tuple(given.camera_names)
+        self.task_descriptions = check_descriptions(given.task_descriptions)
+        self.free_tasks = given.free_tasks or self.context.free_task
+        self.policy: Any = build_policy_from_cfg(given.policy, context)
+        self.chunk_joining = given.joining
+        self.safety = SafetySettings.of(given.safety)
+        self._layout = self._choose_layout(context)
         self.ros_operator, self.robot = self._layout.operator, self._layout.robot
         self.embodiment = self.robot.embodiment
-        wrong = self.config_error
-        self.publish_rate = checked_rate(publish_rate, self.robot, wrong)
-        check_state_dim(state_dim, self.embodiment, wrong)
-        check_latency(simulated_latency, self.robot, wrong)
+        self.publish_rate = checked_rate(given.publish_rate, self.robot, wrong)
+        check_state_dim(given.state_dim, self.embodiment, wrong)
+        check_latency(given.simulated_latency, self.robot, wrong)
         self.action_filters = build_filters(
-            action_filters, gripper_threshold, self.embodiment, context
+            given.action_filters, given.gripper_threshold, self.embodiment, context
         )
         self.latch = Latch(self.robot.clock.now)
         self._frame: Frame | None = None
@@ -200,15 +115,9 @@ class BaseInferenceRunner(Runner):
         """The recorder of the last episode."""
         self._history = RunHistory()
 
-    def _choose_layout(
-        self,
-        operator: Any,
-        action_filters: Sequence[Any],
-        embodiment: EmbodimentSpec | Mapping[str, Any] | None,
-        control_process: bool | None,
-        context: RunContext | None,
-    ) -> ProcessLayout:
+    def _choose_layout(self, context: RunContext | None) -> ProcessLayout:
         """Choose which process commands the robot, and build this process's operator."""
+        given, operator = self.options, self.options.operator
         if operator is None:
             raise ConfigError(
                 f"{type(self).__name__} has no operator: which robot is it to drive?",
@@ -216,22 +125,18 @@ class BaseInferenceRunner(Runner):
                 next=f"--set '{self.context.section}.operator={{type = \"CLASS\"}}'; "
                 "fluxvla plugins list shows the operators",
             )
-        for name in ("action_chunk", "execute_horizon", "max_publish_step"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise self.config_error(name, f"must be at least 1, got {value}")
         # A robot does not begin from a seed: configs that are for both leave it out of its table.
         scene = {"seed": self.seed} if takes(operator, OPERATORS, "seed") else {}
         table = {**scene, **operator} if isinstance(operator, Mapping) else operator
         layout = choose_layout(
             lambda: build_operator_from_cfg(operator, context, **scene),
-            ControlTables(table, list(action_filters), self.gripper_threshold),
+            ControlTables(table, list(given.action_filters), given.gripper_threshold),
             self.context.config,
-            embodiment,
+            given.embodiment,
             RunnerOverrides.of(type(self), BaseInferenceRunner, self.context),
-            "control_process is False" if control_process is False else None,
+            "control_process is False" if given.control_process is False else None,
         )
-        if control_process and layout.why_single_process is not None:
+        if given.control_process and layout.why_single_process is not None:
             raise self.config_error("control_process", f"is True, and {layout.why_single_process}")
         return layout
 
@@ -244,18 +149,19 @@ class BaseInferenceRunner(Runner):
             SpecMismatch: the policy is for another robot, or for other views.
             ConfigError, UsageError: a pose, a camera or the task does not fit.
         """
-        if self.record is not None:
+        given = self.options
+        if given.record is not None:
             typestore()  # before anything moves: what recording needs is installed
         if self.context.task is not None or self.context.task_file is not None:
             self._task_source()
         if self.policy is None:
             from fluxvla_core.policies.loading import find_checkpoint, load_policy
 
-            place = find_checkpoint(self.ckpt_path, self.context.work_dir)
+            place = find_checkpoint(given.ckpt_path, self.context.work_dir)
             self.context.reporter.info(f"policy: {place}")
             self.policy = load_policy(
-                place, self.device, self.dataset, self.denormalize_action,
-                self.mixed_precision_dtype, self.execution, self.quantization,
+                place, given.device, given.dataset, given.denormalize_action,
+                given.mixed_precision_dtype, given.execution, given.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
@@ -371,10 +277,11 @@ class BaseInferenceRunner(Runner):
         """One task, from the start pose to the hold at its end; what ``episode.json`` holds."""
         assert self.policy is not None, "run_setup() comes before run()"
         reporter = self.context.reporter
-        root = Path(self.context.work_dir) / FOLDER if self.record is None else Path(self.record)
+        fps, folder = self.options.record_fps, self.options.record
+        root = Path(self.context.work_dir) / FOLDER if folder is None else Path(folder)
         self.recorder = EpisodeRecorder(
-            next_folder(root, task.name), self.robot, self.policy, self._cameras, self.record_fps,
-            self.record is not None, reporter,
+            next_folder(root, task.name), self.robot, self.policy, self._cameras, fps,
+            folder is not None, reporter,
         )  # fmt: skip
         reporter.info(f"task: {task.instruction}")
         self._session.play(task, (self.recorder, *self._observers), self.recorder.folder)
@@ -385,14 +292,14 @@ class BaseInferenceRunner(Runner):
         policy = self.policy
         assert policy is not None, "run_setup() comes before run()"
         # Played in motion, a chunk is left when the next is there, not before.
-        horizon = None if self._joiner().streamed else self.execute_horizon
+        horizon = None if self._joiner().streamed else self.options.execute_horizon
         used = () if policy.whole_motion else (self.action_chunk, horizon)
         settings = EpisodeSettings(
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
             max_actions=min((n for n in used if n is not None), default=None),
-            latency_s=self.simulated_latency,
+            latency_s=self.options.simulated_latency,
             max_steps=self.max_publish_step,
             action_rate_hz=policy.action_rate_hz,
         )
@@ -401,7 +308,7 @@ class BaseInferenceRunner(Runner):
             policy=policy,
             observe=self._observe,
             cameras=self._cameras,
-            ready_s=self.ready_timeout,
+            ready_s=self.options.ready_timeout,
             filters=self.action_filters,
             joining=self._joining(),
             execute=self._execute_actions,
@@ -430,9 +337,8 @@ class BaseInferenceRunner(Runner):
 
     def _task_source(self) -> TaskSource:
         domain_id = Operator.adapt(self.ros_operator).domain_id
-        return task_source(
-            self.context, self.task_descriptions, self.task_topic, domain_id, self.free_tasks
-        )
+        topic = self.options.task_topic
+        return task_source(self.context, self.task_descriptions, topic, domain_id, self.free_tasks)
 
     def _joiner(self) -> ChunkJoiner:
         return make_joiner(*self._joining())
@@ -440,7 +346,7 @@ class BaseInferenceRunner(Runner):
     def _joining(self) -> tuple[Any, float]:
         """The method, and how far apart observations are at least, from ``execute_horizon``."""
         assert self.policy is not None, "run_setup() comes before run()"
-        least = self.execute_horizon or (1 if self.robot.lockstep else 0)
+        least = self.options.execute_horizon or (1 if self.robot.lockstep else 0)
         return self.chunk_joining, least / self.policy.action_rate_hz
 
     def config_error(self, key: str, what: str) -> ConfigError:

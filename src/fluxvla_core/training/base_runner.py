@@ -7,13 +7,13 @@ without it.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.build import (
     RunContext,
+    bind_options,
     build_collator_from_cfg,
     build_metric_from_cfg,
     build_optimizer_from_cfg,
@@ -64,15 +64,8 @@ class BaseTrainRunner(Strategy):
     ) -> None:
         self.context = context or RunContext(config=cfg or {}, section="runner")
         self.cfg: Mapping[str, Any] = self.context.config if cfg is None else cfg
-        try:
-            bound = inspect.signature(self.Options).bind(**options)
-        except TypeError as error:
-            raise ConfigError(
-                f"{type(self).__name__}: {error}",
-                where=self.context.where(self.context.section),
-                next=f"fluxvla plugins show {type(self).__name__}",
-            ) from error
-        self.options = given = self.Options(*bound.args, **bound.kwargs)
+        name = type(self).__name__
+        self.options = given = bind_options(self.Options, options, name, self.context)
         given.check(self.context)
         self.loader_options = LoaderOptions.read(self.cfg, self.context)
         self.lora = given.lora_options(self.context)

@@ -70,7 +70,12 @@ def compile_units(model: nn.Module, dynamic: bool | None = None, backend: str = 
     Raises:
         ConfigError: the model names no units.
     """
-    for unit in _named_blocks(model, "compile_blocks", "blocks to compile"):
+    units = _named_blocks(model, "compile_blocks", "blocks to compile")
+    # Blocks of one class share a method, of which torch compiles only so many sizes; it would run
+    # the blocks of further sizes as they are.
+    limits = torch._dynamo.config
+    limits.recompile_limit = max(limits.recompile_limit, len(units))
+    for unit in units:
         unit.__dict__["forward"] = torch.compile(unit.forward, dynamic=dynamic, backend=backend)
 
 

@@ -1,12 +1,14 @@
-"""Trainable parameters of a model, and their groups for weight decay."""
+"""Trainable parameters of a model: their groups for weight decay, and clipping their gradients."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
+from fluxvla_core.checkpoints.tensors import full_tensor
 from fluxvla_core.errors import ConfigError
 
 
@@ -49,3 +51,22 @@ def decay_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
         {"params": rest, "weight_decay": 0.0},
     ]
     return [group for group in groups if group["params"]]
+
+
+def gradient_norm(parameters: list[nn.Parameter]) -> Tensor:
+    """The norm of all gradients over all ranks, a scalar on the device."""
+    return full_tensor(
+        torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    )
+
+
+def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:
+    """Scale gradients in place so that their norm over all ranks is at most ``max_norm``.
+
+    Returns:
+        The norm before, a scalar on the device.
+    """
+    # Gathered once, here: torch.nn.utils.clip_grad_norm_ would do it again for the caller.
+    norm = gradient_norm(parameters)
+    torch.nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
+    return norm

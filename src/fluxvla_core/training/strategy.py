@@ -156,7 +156,7 @@ class Strategy(TrainRunner):
         Where ``clip_grad_norm`` returns None it is computed here: gradients that are not finite
         must not go unseen.
         """
-        from fluxvla_core.training.gradients import gradient_norm
+        from fluxvla_core.training.parameters import gradient_norm
 
         norm = self.clip_grad_norm()
         if norm is None:
@@ -179,7 +179,7 @@ class Strategy(TrainRunner):
 
         None says nothing of the norm, as where there is no ``max_grad_norm``.
         """
-        from fluxvla_core.training.gradients import clip_
+        from fluxvla_core.training.parameters import clip_
 
         return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
 

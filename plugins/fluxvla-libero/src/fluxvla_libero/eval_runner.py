@@ -31,13 +31,10 @@ class LiberoEvalRunner(EvalRunner):
         cfg: the whole config (injected).
         context: what the run knows (injected): work dir, reporter.
         seed: of the policy; trial ``n`` uses ``seed + n``.
-        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
         model_family: no effect; upstream FluxVLA's configs have it, and it is written to
             ``results.json``.
         task_suite_name: libero_spatial, _object, _goal, _10, _90, or one of LIBERO-PRO's.
         tasks: which of the suite's, by index or name; all by default.
-        dataset, denormalize_action: instead of what the checkpoint says, see ``load_policy``.
-        norm_stats_key: which of the checkpoint's statistics.
         eval_chunk_size: how many actions of a chunk are executed before the next query.
         resize_size: side of the policy's pictures, which are drawn in that size; as it was
             trained by default.
@@ -48,16 +45,12 @@ class LiberoEvalRunner(EvalRunner):
             say which; see :class:`~fluxvla_libero.environment.LiberoEnvironment`.
         max_steps: instead of the suite's limit.
         mixed_precision_dtype, enable_mixed_precision_training: ``bf16`` inference, if enabled.
-        policy: ``checkpoint``, or ``expert``, ``untrained``, ``random`` for comparison.
         instruction_swap: repeat every episode with the instruction of another task that could be
             done in the same scene, and test whether the right one does better.
-        baseline: repeat every episode with the same model before training.
         render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones (nor details),
             or LIBERO's own: ``reference``.
-        workers, batch_size, serve_policy, device, episode_timeout_s, reuse: see
-            :class:`EvalRunner`.
-        record_videos: how many episodes to show: failures first, then successes.
         video_fps: at most 20.
+        **options: as ``EvalRunner`` takes them.
 
     Raises:
         ConfigError: a value is impossible.
@@ -69,48 +62,35 @@ class LiberoEvalRunner(EvalRunner):
         self,
         cfg: Mapping[str, Any] | None = None,
         context: RunContext | None = None,
+        *,
         seed: int = 7,
-        ckpt_path: str | None = None,
         model_family: str | None = None,
         task_suite_name: str = "libero_object",
         tasks: Sequence[int | str] | None = None,
-        dataset: Any = None,
-        denormalize_action: Any = None,
-        norm_stats_key: str | None = None,
         eval_chunk_size: int = 8,
         resize_size: int | None = None,
         num_trials_per_task: int = TRIALS,
         num_steps_wait: int = NUM_STEPS_WAIT,
         protocol: str = FLUXVLA,
-        max_steps: int | None = None,
         mixed_precision_dtype: str = "bf16",
         enable_mixed_precision_training: bool = False,
-        policy: str | Mapping[str, Any] = "checkpoint",
-        instruction_swap: bool = False,
-        baseline: bool = False,
         render: str = "cheap",
-        workers: int = 2,
-        batch_size: int = 1,
-        serve_policy: bool | None = None,
-        record_videos: int = 4,
         video_fps: float = 10.0,
-        device: str = "cpu",
-        episode_timeout_s: float = 1800.0,
-        reuse: bool = False,
+        **options: Any,
     ) -> None:
         self.context = context or RunContext(config=cfg or {})
         try:
             check_suite(task_suite_name)
         except ConfigError as error:
             raise self.config_error("task_suite_name", f"is wrong: {error.what}") from error
-        if render not in RENDERS:
-            raise self.config_error(
-                "render", f"{render!r} is unknown; choose one of {', '.join(RENDERS)}"
-            )
-        if protocol not in (FLUXVLA, OPENVLA):
-            raise self.config_error(
-                "protocol", f"{protocol!r} is unknown; choose one of {FLUXVLA}, {OPENVLA}"
-            )
+        for name, value, known in (
+            ("render", render, RENDERS),
+            ("protocol", protocol, (FLUXVLA, OPENVLA)),
+        ):
+            if value not in known:
+                raise self.config_error(
+                    name, f"{value!r} is unknown; choose one of {', '.join(known)}"
+                )
         if not 1 <= num_trials_per_task <= TRIALS:
             raise self.config_error(
                 "num_trials_per_task", f"must be 1 to {TRIALS}, got {num_trials_per_task}"
@@ -119,14 +99,14 @@ class LiberoEvalRunner(EvalRunner):
             raise self.config_error(
                 "video_fps", f"must be at most {CONTROL_HZ:g}, got {video_fps:g}"
             )
-        for name, value, least in (
+        for name, number, least in (
             ("seed", seed, 0),
             ("eval_chunk_size", eval_chunk_size, 1),
             ("num_steps_wait", num_steps_wait, 0),
             ("resize_size", resize_size, 16),
         ):
-            if value is not None and value < least:
-                raise self.config_error(name, f"must be at least {least}, got {value}")
+            if number is not None and number < least:
+                raise self.config_error(name, f"must be at least {least}, got {number}")
         self.model_family = model_family
         self._suite = task_suite_name
         self._chosen = tasks
@@ -141,34 +121,22 @@ class LiberoEvalRunner(EvalRunner):
                 "num_steps_wait": num_steps_wait,
                 "protocol": protocol,
             },
-            policy=policy,
-            ckpt_path=ckpt_path,
             episodes=num_trials_per_task,
             seed=0,
+            swap_seed=None,
             policy_seed=seed,
+            live=False,
             replan_every=eval_chunk_size,
-            max_steps=max_steps,
-            instruction_swap=instruction_swap,
-            baseline=baseline,
-            workers=workers,
-            batch_size=batch_size,
-            serve_policy=serve_policy,
-            record_videos=record_videos,
             video_cameras=SCENE_CAMERAS,
             video_height=256,
             video_width=256,
             video_fps=video_fps,
-            dataset=dataset,
-            denormalize_action=denormalize_action,
-            norm_stats_key=norm_stats_key,
             height=resize_size,
             width=resize_size,
-            device=device,
             mixed_precision_dtype=(
                 mixed_precision_dtype if enable_mixed_precision_training else "float32"
             ),
-            episode_timeout_s=episode_timeout_s,
-            reuse=reuse,
+            **options,
         )
 
     def run_setup(self) -> None:

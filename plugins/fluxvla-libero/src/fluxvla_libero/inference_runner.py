@@ -64,7 +64,7 @@ class LiberoInferenceRunner:
         task_descriptions: id -> instruction.
         dataset, denormalize_action, norm_stats_key: see ``LiberoEvalRunner``.
         eval_chunk_size, resize_size, num_steps_wait, max_steps, render: see there.
-        mixed_precision_dtype, enable_mixed_precision_training: see there.
+        mixed_precision_dtype, enable_mixed_precision_training, execution, quantization: see there.
         policy: ``checkpoint``, ``expert``, ``untrained``, ``random``, or a registered one's table.
         live_port: also show the episode, while it happens, to any browser on this machine.
         video_size: side of the videos' pictures.
@@ -97,6 +97,8 @@ class LiberoInferenceRunner:
         max_steps: int | None = None,
         mixed_precision_dtype: str = "bf16",
         enable_mixed_precision_training: bool = False,
+        execution: str = "eager",
+        quantization: str | None = None,
         policy: str | Mapping[str, Any] = "checkpoint",
         render: str = "cheap",
         live_port: int | None = None,
@@ -133,6 +135,8 @@ class LiberoInferenceRunner:
             norm_stats_key=norm_stats_key,
             device=device,
             precision=mixed_precision_dtype if enable_mixed_precision_training else "float32",
+            execution=execution,
+            quantization=quantization,
         )
         self._policy: Any = None
 

@@ -147,7 +147,11 @@ class ConditionalUNet(nn.Module):
 
     def forward(self, x: Tensor, timesteps: Tensor, condition: Tensor) -> Tensor:
         """``(B, T, D)``, steps ``(B,)`` and condition ``(B, C)`` -> ``(B, T, D)``."""
-        known = torch.cat([self.diffusion_step_encoder(timesteps), condition], dim=-1)
+        return self.at_step(x, self.diffusion_step_encoder(timesteps), condition)
+
+    def at_step(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
+        """As ``forward``, for steps that are embedded already, ``(B, step_dim)``."""
+        known = torch.cat([step, condition], dim=-1)
         y = x.transpose(1, 2)
         skips: list[Tensor] = []
         for first, second, shrink in self.down_modules:

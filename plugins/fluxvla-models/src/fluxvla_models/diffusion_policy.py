@@ -186,18 +186,47 @@ class DiffusionPolicy(VLA, nn.Module):
             step_noise: ``(B, steps - 1, T, D)``, what DDPM adds on its way; by default it follows
                 from ``noise``, sample by sample.
         """
-        condition = self._condition(images, states, None)
-        schedule, x = self.schedule, noise
-        steps = schedule.timesteps
-        if schedule.kind == "DDPM" and step_noise is None and len(steps) > 1:
-            step_noise = following(noise, len(steps) - 1)
-        for place, step in enumerate(steps):
-            timesteps = torch.full((len(x),), step, device=x.device)
-            added = None
-            if step_noise is not None and place < len(steps) - 1:
-                added = step_noise[:, place]
-            x = schedule.step(self.unet(x, timesteps, condition), step, x, added)
+        seen = self.observe(images, states, noise, step_noise)
+        return self.denoise(seen, noise, self.step_tables())
+
+    def observe(
+        self, images: Tensor, states: Tensor, noise: Tensor, step_noise: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """What the steps need: ``condition`` ``(B, C)`` and, for DDPM, ``step_noise``."""
+        seen = {"condition": self._condition(images, states, None)}
+        added = self.schedule.count - 1
+        if self.schedule.kind == "DDPM" and added:
+            seen["step_noise"] = following(noise, added) if step_noise is None else step_noise
+        return seen
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """All steps from ``noise`` ``(B, T, D)`` to normalised actions ``(B, T, D)``."""
+        # Of the kind and the strides that later steps have: others are compiled apart.
+        x = noise.clone(memory_format=torch.contiguous_format)
+        added = seen.get("step_noise")
+        for place in range(self.schedule.count):
+            step = tables["steps"][place].expand(len(x), -1)
+            output = self.unet.at_step(x, step, seen["condition"])
+            last = place == self.schedule.count - 1
+            drawn = None if added is None or last else added[:, place]
+            x = self.schedule.step(output, x, tables["coefficients"][place], drawn)
         return x
+
+    def step_tables(self) -> dict[str, Tensor]:
+        """``steps`` ``(count, C)``, embeddings, and the schedule's ``coefficients``."""
+        device = next(self.parameters()).device
+        steps = torch.tensor(self.schedule.timesteps, device=device)
+        return {
+            "steps": self.unet.diffusion_step_encoder(steps),
+            "coefficients": self.schedule.coefficients().to(device),
+        }
+
+    @property
+    def observe_is_capturable(self) -> bool:
+        """Not where noise of DDPM's steps is drawn, which happens on the host."""
+        return self.schedule.kind == "DDIM" or self.schedule.count == 1
 
     @property
     def action_shape(self) -> tuple[int, int]:

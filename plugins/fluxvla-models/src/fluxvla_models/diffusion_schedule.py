@@ -80,31 +80,43 @@ class DiffusionSchedule:
         share = share.reshape(-1, *[1] * (clean.ndim - 1))
         return share.sqrt() * clean + (1 - share).sqrt() * noise
 
-    def step(self, output: Tensor, timestep: int, x: Tensor, noise: Tensor | None) -> Tensor:
-        """From ``x`` at ``timestep`` one step back, by the network's ``output`` there.
+    def coefficients(self) -> Tensor:
+        """What :meth:`step` needs of each step in :attr:`timesteps`, ``(count, 5)`` float32.
+
+        ``sqrt(a_t)`` and ``sqrt(1 - a_t)``; what the estimate of the data is multiplied by, and
+        what the rest is: the noise in ``x`` (DDIM) or ``x`` itself (DDPM); the deviation of the
+        noise that DDPM adds.
+        """
+        steps = torch.tensor(self.timesteps)
+        shares = self.shares()
+        now, before = shares[steps], steps - self._stride
+        earlier = torch.where(before >= 0, shares[before.clamp(min=0)], 1.0)
+        if self.kind == "DDIM":
+            clean, rest, added = earlier.sqrt(), (1 - earlier).sqrt(), torch.zeros_like(now)
+        else:
+            beta = 1 - now / earlier
+            clean = earlier.sqrt() * beta / (1 - now)
+            rest = (now / earlier).sqrt() * (1 - earlier) / (1 - now)
+            added = ((1 - earlier) / (1 - now) * beta).clamp(min=1e-20).sqrt()
+        return torch.stack([now.sqrt(), (1 - now).sqrt(), clean, rest, added], dim=1)
+
+    def step(self, output: Tensor, x: Tensor, coefficients: Tensor, noise: Tensor | None) -> Tensor:
+        """From ``x`` one step back, by the network's ``output`` there.
 
         Args:
-            noise: standard normal like ``x``, for DDPM; not used in its last step.
+            coefficients: ``(5,)``, the step's row of :meth:`coefficients`.
+            noise: standard normal like ``x``, for DDPM; None in its last step.
         """
-        shares = self.shares()
-        before = timestep - self._stride
-        now = shares[timestep]
-        earlier = shares[before] if before >= 0 else torch.ones(())
+        signal, spread, clean_share, rest_share, deviation = coefficients.unbind()
         if self.prediction == "epsilon":
-            clean, predicted = (x - (1 - now).sqrt() * output) / now.sqrt(), output
+            clean, predicted = (x - spread * output) / signal, output
         else:
-            clean, predicted = output, (x - now.sqrt() * output) / (1 - now).sqrt()
+            clean, predicted = output, (x - signal * output) / spread
         if self.clip is not None:
             clean = clean.clamp(-self.clip, self.clip)
-        if self.kind == "DDIM":
-            return earlier.sqrt() * clean + (1 - earlier).sqrt() * predicted
-        beta = 1 - now / earlier
-        mean = (earlier.sqrt() * beta / (1 - now)) * clean
-        mean = mean + ((now / earlier).sqrt() * (1 - earlier) / (1 - now)) * x
-        if timestep == 0 or noise is None:
-            return mean
-        variance = ((1 - earlier) / (1 - now) * beta).clamp(min=1e-20)
-        return mean + variance.sqrt() * noise
+        rest = predicted if self.kind == "DDIM" else x
+        found = clean_share * clean + rest_share * rest
+        return found if noise is None else found + deviation * noise
 
     @property
     def _stride(self) -> int:

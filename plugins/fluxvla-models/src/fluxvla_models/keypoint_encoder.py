@@ -25,13 +25,13 @@ class Keypoints(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         height, width = maps.shape[-2:]
         weights = self.nets(maps).flatten(2).softmax(-1)
-        return (weights @ position_grid(height, width).to(weights)).flatten(1)
+        return (weights @ position_grid(height, width, weights.device).to(weights)).flatten(1)
 
 
-def position_grid(height: int, width: int) -> Tensor:
+def position_grid(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
     """x and y of each place of a map, ``(height * width, 2)`` float32 in -1..1."""
-    rows = torch.linspace(-1.0, 1.0, height, dtype=torch.float64, device="cpu")
-    columns = torch.linspace(-1.0, 1.0, width, dtype=torch.float64, device="cpu")
+    rows = torch.linspace(-1.0, 1.0, height, dtype=torch.float64, device=device)
+    columns = torch.linspace(-1.0, 1.0, width, dtype=torch.float64, device=device)
     grid = torch.stack([columns.repeat(height), rows.repeat_interleave(width)], dim=1)
     return grid.float()
 

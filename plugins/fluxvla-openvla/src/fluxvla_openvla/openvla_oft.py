@@ -147,7 +147,8 @@ class OpenVLAOFT(Prismatic):
             steps, drawn = time[:, 0].long(), noise[:, 0]
             kept = kept_share(self.num_train_steps).to(steps.device)[steps, None, None]
             noised = kept.sqrt() * actions + (1 - kept).sqrt() * drawn
-            errors = (self._head(seen, prompt, noised, steps) - drawn).square()
+            step = step_embedding(steps, seen.shape[2])
+            errors = (self._head(seen, prompt, noised, step) - drawn).square()
         if action_masks is not None:
             errors = errors * action_masks.unsqueeze(-1)
         return {"loss": errors.mean(), "sample_losses": errors.detach().mean((1, 2))}
@@ -161,19 +162,57 @@ class OpenVLAOFT(Prismatic):
         noise: Tensor | None = None,
     ) -> Tensor:
         """Observation, and for diffusion ``noise`` ``(B, T, D)`` -> normalised ``(B, T, D)``."""
+        seen = self.observe(images, lang_tokens, lang_masks, states)
+        return self.denoise(seen, noise, self.step_tables())
+
+    def observe(
+        self,
+        images: Tensor,
+        lang_tokens: Tensor,
+        lang_masks: Tensor,
+        states: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """Pictures and state ``context`` ``(B, P, width)``, and the prompt, split."""
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
-        seen = self._context(images, prompt, states)
+        context = self._context(images, prompt, states)
+        return {"context": context, **vars(prompt)}
+
+    def denoise(
+        self, seen: Mapping[str, Tensor], noise: Tensor | None, tables: Mapping[str, Tensor]
+    ) -> Tensor:
+        """The passes of the language model: one (L1), or one for each step of the diffusion.
+
+        All tokens attend to all others, the noised actions among them, so that nothing of a pass
+        can be kept for the next.
+        """
+        prompt = Prompt(seen["first"], seen["rest"], seen["mask"])
         if self.head == "l1":
-            return self._head(seen, prompt)
+            return self._head(seen["context"], prompt)
         assert noise is not None
-        stride = self.num_train_steps // self.num_inference_steps
-        kept = kept_share(self.num_train_steps).to(noise.device)
-        for step in reversed(range(0, stride * self.num_inference_steps, stride)):
-            steps = torch.full((len(noise),), step, device=noise.device)
-            found = self._head(seen, prompt, noise, steps)
-            after = kept[step - stride] if step >= stride else torch.ones_like(kept[0])
-            noise = denoise(noise, found, kept[step], after)
+        for place in range(self.num_inference_steps):
+            step = tables["steps"][place].expand(len(noise), -1)
+            found = self._head(seen["context"], prompt, noise, step)
+            noise = denoise(noise, found, *tables["kept"][place].unbind())
         return noise
+
+    def step_tables(self) -> dict[str, Tensor]:
+        """For the diffusion: embedded ``steps`` ``(count, width)``, and of each the share ``kept``
+        in it and in the next, ``(count, 2)``."""
+        if self.head == "l1":
+            return {}
+        device = self.language_model.model.embed_tokens.weight.device
+        stride = self.num_train_steps // self.num_inference_steps
+        steps = torch.arange(self.num_inference_steps - 1, -1, -1) * stride
+        kept = torch.cat([kept_share(self.num_train_steps)[steps], torch.ones(1)])
+        return {
+            "steps": step_embedding(steps.to(device), self.size.hidden_size),
+            "kept": torch.stack([kept[:-1], kept[1:]], 1).to(device),
+        }
+
+    @property
+    def observe_is_capturable(self) -> bool:
+        """Whether ``observe`` only launches operations on tensors: it does."""
+        return True
 
     def _context(self, images: Tensor, prompt: Prompt, states: Tensor | None) -> Tensor:
         """Pictures and state: ``(B, P, width)``."""
@@ -193,18 +232,18 @@ class OpenVLAOFT(Prismatic):
         seen: Tensor,
         prompt: Prompt,
         noised: Tensor | None = None,
-        steps: Tensor | None = None,
+        step: Tensor | None = None,
     ) -> Tensor:
         """One pass: actions ``(B, T, D)``, or the noise in ``noised`` ``(B, T, D)``.
 
-        Places of actions hold zeros, or their noised numbers, one a token.
+        Places of actions hold zeros, or their noised numbers, one a token; ``step`` ``(B, width)``
+        says how much noise there is.
         """
         batch, count = len(seen), self.horizon * self.action_dim
         places = torch.zeros(batch, count, seen.shape[2], dtype=seen.dtype, device=seen.device)
-        if noised is not None and steps is not None:
+        if noised is not None and step is not None:
             places = self.noisy_action_projector(noised.reshape(batch, count, 1))
-            step = step_embedding(steps, seen.shape[2]).to(seen.dtype)
-            seen = torch.cat([seen, step.unsqueeze(1)], 1)
+            seen = torch.cat([seen, step.to(seen.dtype).unsqueeze(1)], 1)
         front = [self.embed(prompt.first), seen]
         back = [places, self.embed(self.stop_tokens(batch))]
         embeddings = torch.cat([*front, self.embed(prompt.rest), *back], 1)

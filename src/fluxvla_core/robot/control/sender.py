@@ -306,7 +306,8 @@ def ramp(limiter: CommandLimiter, pose: npt.ArrayLike, speed: float) -> Array:
     target = check_pose(pose, limiter.embodiment)
     start = limiter.last
     way = target - start
-    moving = way != 0.0
+    # Less than a float's rounding is no motion, and dividing by it could overflow.
+    moving = np.abs(way) > np.finfo(np.float64).eps
     if not moving.any():
         return np.empty((0, len(way)))
     distance = np.abs(way[moving])

@@ -26,9 +26,9 @@ from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RU
 from fluxvla_core.robot.control.safety import SafetySettings
 from fluxvla_core.robot.control.sender import Execute
 from fluxvla_core.robot.episode import EpisodeSettings
+from fluxvla_core.robot.options import build_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.settings import build_filters
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 

@@ -115,7 +115,9 @@ class OpenVLA(Prismatic):
 
     def _sequence(self, images: Tensor, prompt: Prompt) -> tuple[Tensor, Tensor]:
         """Embeddings ``(B, S, width)`` of pictures and prompt, and which of them are real."""
-        seen = self.see(images, prompt)
-        embeddings = torch.cat([self.embed(prompt.first), seen, self.embed(prompt.rest)], 1)
-        front = torch.ones(len(seen), 1 + seen.shape[1], dtype=torch.bool, device=seen.device)
+        features = self.encode_images(images, prompt)
+        embeddings = torch.cat([self.embed(prompt.first), features, self.embed(prompt.rest)], 1)
+        front = torch.ones(
+            len(features), 1 + features.shape[1], dtype=torch.bool, device=features.device
+        )
         return embeddings, torch.cat([front, prompt.mask], 1)

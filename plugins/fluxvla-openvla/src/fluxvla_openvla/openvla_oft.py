@@ -138,17 +138,17 @@ class OpenVLAOFT(Prismatic):
         """
         self.check_actions(actions)
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
-        seen = self._context(images, prompt, states)
+        context = self._context(images, prompt, states)
         if self.head == "l1":
-            errors = (self._head(seen, prompt) - actions).abs()
+            errors = (self._head(context, prompt) - actions).abs()
         else:
             assert noise is not None
             assert time is not None
             steps, drawn = time[:, 0].long(), noise[:, 0]
             kept = kept_share(self.num_train_steps).to(steps.device)[steps, None, None]
             noised = kept.sqrt() * actions + (1 - kept).sqrt() * drawn
-            step = step_embedding(steps, seen.shape[2])
-            errors = (self._head(seen, prompt, noised, step) - drawn).square()
+            step = step_embedding(steps, context.shape[2])
+            errors = (self._head(context, prompt, noised, step) - drawn).square()
         if action_masks is not None:
             errors = errors * action_masks.unsqueeze(-1)
         return {"loss": errors.mean(), "sample_losses": errors.detach().mean((1, 2))}
@@ -216,20 +216,20 @@ class OpenVLAOFT(Prismatic):
 
     def _context(self, images: Tensor, prompt: Prompt, states: Tensor | None) -> Tensor:
         """Pictures and state: ``(B, P, width)``."""
-        seen = self.see(images, prompt)
+        features = self.encode_images(images, prompt)
         if not self.state_dim:
-            return seen
+            return features
         if states is None or states.shape[-1] != self.state_dim:
             shape = None if states is None else tuple(states.shape)
             raise ConfigError(
                 f"OpenVLAOFT: states have shape {shape}, state_dim is {self.state_dim}",
                 cause="the model was made for another robot, or its state is not in the batch",
             )
-        return torch.cat([seen, self.proprio_projector(states).unsqueeze(1)], 1)
+        return torch.cat([features, self.proprio_projector(states).unsqueeze(1)], 1)
 
     def _head(
         self,
-        seen: Tensor,
+        context: Tensor,
         prompt: Prompt,
         noised: Tensor | None = None,
         step: Tensor | None = None,
@@ -239,16 +239,18 @@ class OpenVLAOFT(Prismatic):
         Places of actions hold zeros, or their noised numbers, one a token; ``step`` ``(B, width)``
         says how much noise there is.
         """
-        batch, count = len(seen), self.horizon * self.action_dim
-        places = torch.zeros(batch, count, seen.shape[2], dtype=seen.dtype, device=seen.device)
+        batch, count = len(context), self.horizon * self.action_dim
+        places = torch.zeros(
+            batch, count, context.shape[2], dtype=context.dtype, device=context.device
+        )
         if noised is not None and step is not None:
             places = self.noisy_action_projector(noised.reshape(batch, count, 1))
-            seen = torch.cat([seen, step.to(seen.dtype).unsqueeze(1)], 1)
-        front = [self.embed(prompt.first), seen]
+            context = torch.cat([context, step.to(context.dtype).unsqueeze(1)], 1)
+        front = [self.embed(prompt.first), context]
         back = [places, self.embed(self.stop_tokens(batch))]
         embeddings = torch.cat([*front, self.embed(prompt.rest), *back], 1)
-        real = torch.ones(embeddings.shape[:2], dtype=torch.bool, device=seen.device)
-        begin = 1 + seen.shape[1]
+        real = torch.ones(embeddings.shape[:2], dtype=torch.bool, device=context.device)
+        begin = 1 + context.shape[1]
         real[:, begin : begin + prompt.mask.shape[1]] = prompt.mask
         states = hidden_states(self.language_model, embeddings, real, causal=False)
         # As with tokens, an action's numbers are read at the places before them.

@@ -95,7 +95,7 @@ class Prismatic(VLA, nn.Module):
         """Token ids ``(B, L)`` -> embeddings ``(B, L, width)``."""
         return self.language_model.model.embed_tokens(tokens)
 
-    def see(self, images: Tensor, prompt: Prompt) -> Tensor:
+    def encode_images(self, images: Tensor, prompt: Prompt) -> Tensor:
         """Pictures ``(B, 3N, H, W)`` in -1..1 -> ``(B, N * patches, width)``.
 
         With FiLM by the mean of the prompt's embeddings, the stop token's among them, padding not.

@@ -245,12 +245,12 @@ def infer(work_dir, listener, task, **arguments):
 
 
 def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener, monkeypatch):
-    pictures = []
+    images = []
 
     def look(view_info):
         if view_info.startswith("live at "):
             stream = urllib.request.urlopen(view_info.removeprefix("live at "), timeout=60)
-            pictures.append(stream)
+            images.append(stream)
         listener.lines.append(view_info)
 
     monkeypatch.setattr(listener, "info", look)
@@ -268,7 +268,7 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     assert len(lines[0]["command"]) == 7
     assert {line["phase"] for line in lines} == {"run"}
     assert f"success after {summary['steps']} steps" in listener.lines
-    shown = pictures[0].read()
+    shown = images[0].read()
     assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
     assert shown.count(b"\xff\xd8\xff") >= 1, "JPEG"
 

@@ -66,7 +66,7 @@ class EnvironmentConformance:
     steps: ClassVar[int] = 12
     """Control steps of each episode here."""
     picture: ClassVar[tuple[int, int] | None] = (48, 64)
-    """Height and width of the pictures here; None for environments that draw in one size only."""
+    """Height and width of the images here; None for environments that draw in one size only."""
     seeds_differ: ClassVar[bool] = True
     """Whether another seed makes another episode."""
 
@@ -165,10 +165,10 @@ class EnvironmentConformance:
                     f"{sorted(seen['images'])}, expected that one: the policy looks at it"
                 )
                 assert image.dtype == np.uint8, (
-                    f"the picture of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
+                    f"the image of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
                 )
                 assert image.shape == (camera.height, camera.width, 3), (
-                    f"the picture of {camera.name} has the shape {image.shape}, expected "
+                    f"the image of {camera.name} has the shape {image.shape}, expected "
                     f"{(camera.height, camera.width, 3)}, as asked for"
                 )
             unasked = environment.observe(())["images"]
@@ -271,7 +271,7 @@ class EnvironmentConformance:
         seen = self.episode(environment, task, cameras=self.cameras(environment))
         differ = unequal_keys(unseen, seen)
         assert not differ, (
-            f"an episode with pictures has another {', '.join(differ)} than one without, expected "
+            f"an episode with images has another {', '.join(differ)} than one without, expected "
             "the same: observe() moves the world, or draws from its generator"
         )
 

@@ -40,9 +40,9 @@ class ModelConformance(Conformance):
     state_dim: ClassVar[int] = 7
     """Numbers of a state."""
     cameras: ClassVar[int] = 2
-    """Pictures of an observation, whose channels stand one behind the other."""
+    """Images of an observation, whose channels stand one behind the other."""
     picture: ClassVar[tuple[int, int]] = (32, 32)
-    """Height and width of a picture."""
+    """Height and width of an image."""
     words: ClassVar[int] = 8
     """Tokens of a prompt."""
     steps: ClassVar[int] = 40

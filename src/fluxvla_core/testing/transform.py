@@ -38,9 +38,9 @@ class TransformConformance(Conformance):
     horizon: ClassVar[int] = 4
     """Actions of a chunk."""
     cameras: ClassVar[int] = 2
-    """Pictures of a sample."""
+    """Images of a sample."""
     picture: ClassVar[tuple[int, int]] = (24, 32)
-    """Height and width of a picture."""
+    """Height and width of an image."""
     draws: ClassVar[bool] = True
     """Whether one with ``needs_rng`` gives another result with another generator."""
 

@@ -28,18 +28,18 @@ from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize
 
 
 class OpenVLAOFT(Prismatic):
-    """Pictures, instruction and joint state in, an action chunk out.
+    """Images, instruction and joint state in, an action chunk out.
 
     The defaults are the published LIBERO policies: chunks of 8 actions of 7 dimensions, two
-    pictures, a state of 8 numbers, L1 regression.
+    images, a state of 8 numbers, L1 regression.
 
     Args:
         horizon, action_dim: of a chunk.
-        num_images: pictures of an observation, the third-person one first.
+        num_images: images of an observation, the third-person one first.
         state_dim: numbers of the state; 0 for a policy that does not see it.
         head: ``l1`` or ``diffusion``.
         use_film: modulate the vision features by the instruction (OpenVLA-OFT+, for ALOHA).
-        image_size: pixels of a picture's side.
+        image_size: pixels of an image's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         num_train_steps, num_inference_steps: of the diffusion, in training and acting.
         freeze_vision_backbone: do not train the towers that see.
@@ -134,7 +134,7 @@ class OpenVLAOFT(Prismatic):
             ``loss``, scalar, and ``sample_losses`` ``(B,)``.
 
         Raises:
-            ConfigError: pictures, actions or states of another shape.
+            ConfigError: images, actions or states of another shape.
         """
         self.check_actions(actions)
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
@@ -172,7 +172,7 @@ class OpenVLAOFT(Prismatic):
         lang_masks: Tensor,
         states: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Pictures and state ``context`` ``(B, P, width)``, and the prompt, split."""
+        """Images and state ``context`` ``(B, P, width)``, and the prompt, split."""
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
         context = self._context(images, prompt, states)
         return {"context": context, **vars(prompt)}
@@ -215,7 +215,7 @@ class OpenVLAOFT(Prismatic):
         return True
 
     def _context(self, images: Tensor, prompt: Prompt, states: Tensor | None) -> Tensor:
-        """Pictures and state: ``(B, P, width)``."""
+        """Images and state: ``(B, P, width)``."""
         features = self.encode_images(images, prompt)
         if not self.state_dim:
             return features

@@ -31,7 +31,7 @@ def launch(
 
     Args:
         setup: what it is built from.
-        frames: for the pictures of an operator that runs there as a whole; remains open.
+        frames: for the images of an operator that runs there as a whole; remains open.
 
     Raises:
         OSError: the system has no room for it.

@@ -43,6 +43,7 @@ NEEDS = (
     "protobuf",
     "pyarrow",
     "safetensors",
+    "scipy",
     "sentencepiece",
     "termcolor",
     "transformers==5.5.4",
@@ -54,6 +55,7 @@ POLICIES = (
     "groot.modeling_groot",
     "pi0.modeling_pi0",
     "pi05.modeling_pi05",
+    "pi0_fast.modeling_pi0_fast",
     "smolvla.modeling_smolvla",
 )
 TRY_POLICIES = "\n".join(f"import lerobot.policies.{name}" for name in POLICIES)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fluxvla_core.config.resolve import INJECTED
-from fluxvla_core.config.runtime_signature import misfits, option_fields
+from fluxvla_core.config.runtime_signature import misfits, option_names
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
@@ -157,7 +157,7 @@ def parameters(cls: type) -> set[str]:
         names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
         kwargs = [n for n, p in found.items() if p.kind is p.VAR_KEYWORD]
         if kwargs == [OPTIONS_KEYWORDS]:
-            names |= {one.name for one in option_fields(cls)}
+            names |= option_names(cls)
         if not kwargs:
             break
     return names - {"self"}

@@ -140,6 +140,31 @@ def test_a_runner_that_evaluates_has_a_kit(fluxvla: Fluxvla) -> None:
     assert ended.out.splitlines()[-1] == "EvalRunner: 11 ok, 1 FAILED"
 
 
+PLANNER = """
+import numpy as np
+from fluxvla_core import POLICIES, EmbodimentSpec, Joint
+
+@POLICIES.register_module()
+class CheckedPolicy:
+    api = "1.0"
+    embodiment = EmbodimentSpec("arm", (Joint("a", "rad", -1, 1, 2, 8),), (), rate_hz=50)
+    action_rate_hz, horizon = 10.0, 3
+    def reset(self, seed): ...
+    def predict_action(self, observation):
+        return np.zeros((3, 4)) @ observation["qpos"]
+"""
+
+
+def test_a_class_of_another_shape_is_told_in_words_once(fluxvla: Fluxvla, tmp_path: Path) -> None:
+    path = tmp_path / "planner.py"
+    path.write_text(PLANNER)
+    ended = fluxvla("plugins", "check", "CheckedPolicy", "--plugin", str(path))
+    assert ended.code == 1
+    said = " ".join(ended.out.split())
+    assert said.count("(planner.py:12); it was given qpos (1,) float32, images {},") == 1
+    assert "FAILED an episode follows from its seed as a chunk has its shape" in said
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

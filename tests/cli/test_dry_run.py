@@ -208,3 +208,18 @@ def test_data_of_another_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "the dataset's actions have 3 numbers, those of aloha 14",
         "aloha has no camera front",
     ]
+
+
+@pytest.mark.parametrize("log_format", ["text", "json"])
+def test_a_batch_that_the_model_does_not_take_ends_it(
+    log_format: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = written(tmp_path)
+    config = tmp_path / "c.py"
+    config.write_text(config.read_text().replace("keys=['images',", "keys=['img_masks', 'images',"))
+    assert main([*words, "--log-format", log_format]) == 2
+    told = capsys.readouterr()
+    assert "img_masks" in told.out  # the batch is shown
+    assert "c.py:" in told.err
+    assert "runner.collator: DryVLA.forward takes no 'img_masks'" in told.err
+    assert "move what only describes from the collator's keys to meta_keys" in told.err

@@ -58,6 +58,19 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
     return made
 
 
+def test_a_stand_in_begins_within_limits_that_leave_zero_out(rendered: Rendered) -> None:
+    program = """
+from dataclasses import replace
+import fluxvla_spec_operator.driver as driver
+first, second, *others = driver.SPEC.joints
+moved = replace(first, lower=0.3), replace(second, upper=-0.1)
+driver.SPEC = replace(driver.SPEC, joints=(*moved, *others))
+print(driver.SimulatedDriver().positions()[0][:3].tolist())
+"""
+    done = rendered.python("-c", program)
+    assert done.stdout == "[0.3, -0.1, 0.0]\n", done.stderr
+
+
 @pytest.fixture(scope="module")
 def outcomes(rendered: Rendered) -> dict[str, list[ElementTree.Element]]:
     """Kind -> the cases of its own tests, all run in one process: it imports torch once.

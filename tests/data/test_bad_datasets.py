@@ -53,8 +53,8 @@ def edit_column(root, file, name, change):
 
 def test_missing(tmp_path):
     text = refused(tmp_path / "nowhere")
-    assert f"{tmp_path / 'nowhere'}: no dataset here: the folder does not exist" in text
-    assert "check data_root_path" in text
+    assert f"{tmp_path / 'nowhere'}: there is no dataset here: the folder does not exist" in text
+    assert "in a config it is data_root_path" in text
 
 
 def test_a_file_or_another_folder(tmp_path, dataset):

@@ -105,7 +105,7 @@ def test_many_tasks_are_not_all_listed(dataset, fluxvla):
 def test_no_dataset(command, tmp_path, fluxvla):
     code, out, err = fluxvla(command, tmp_path / "none")
     assert (code, out) == (2, "")
-    assert "no dataset here: the folder does not exist" in err
+    assert "there is no dataset here: the folder does not exist" in err
     code, _, err = fluxvla(command)
     assert code == 2
     assert "the following arguments are required: DIR" in err

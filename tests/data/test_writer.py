@@ -221,6 +221,28 @@ def test_odd_sizes_cannot_be_video(tmp_path, spec):
     assert "height and width must be even" in str(caught.value)
 
 
+def test_a_first_frame_that_is_refused_leaves_nothing(tmp_path, spec):
+    odd = frame(images={"top": np.zeros((33, 48, 3), np.uint8)})
+    with pytest.raises(DataError), LeRobotWriter(tmp_path / "d", 10, spec()) as writer:
+        writer.add_frame(**odd)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_saved_episodes_outlive_a_frame_that_is_refused(tmp_path, spec):
+    odd = frame(images={"top": np.zeros((34, 48, 3), np.uint8)})
+
+    def record():
+        with LeRobotWriter(tmp_path / "d", 10, spec()) as writer:
+            writer.add_frame(**frame())
+            writer.save_episode()
+            writer.add_frame(**odd)
+
+    with pytest.raises(DataError):
+        record()
+    with LeRobotWriter(tmp_path / "d", 10, spec(), recover=True) as writer:
+        assert writer.episodes == 1
+
+
 def test_an_unknown_codec_is_refused(tmp_path, spec):
     with pytest.raises(ConfigError, match="video_codec 'mpeg' is not one of h264, libsvtav1"):
         LeRobotWriter(tmp_path / "d", 10, spec(), video_codec="mpeg")

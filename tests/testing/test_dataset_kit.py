@@ -51,6 +51,13 @@ FAULTS = {
          "a_sample_follows_from_index_and_epoch", *REPEATED,
          "it_says_which_robot_its_actions_are_for"),
     ),
+    "too few": Fault(
+        "samples_can_be_stacked", "normal(size=(9, 3))", "normal(size=(8, 3))",
+        "it was given index 8, epoch 0: len() is 9, expected a sample for each index below it",
+        ("numbers_are_finite_and_not_double", "a_sample_follows_from_index_and_epoch",
+         "another_process_has_the_same_samples", "several_at_once_are_the_same",
+         "its_seed_can_be_set"),
+    ),
     "a key that comes and goes": Fault(
         "samples_can_be_stacked", '"task_description": "wave"}',
         '"task_description": "wave", **({"depth": 1.0} if index else {})}', "differ in the keys",

@@ -37,7 +37,7 @@ FAULTS = {
     ),
     "a key of others": Fault(
         "a_training_can_be_watched", "self.seen += 1", 'self.seen += metrics["mfu"]',
-        "raised KeyError: 'mfu'",
+        "it was given step 1, metrics {loss 1.0, lr 0.001,",
     ),
     "acts": Fault(
         "a_robot_can_be_watched", "self.rows.append(chunk.mean())", "chunk += 0.1",

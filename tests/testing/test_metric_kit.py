@@ -43,6 +43,17 @@ FAULTS = {
         "a_training_calls_it", "        pass\n", "        raise OSError('no disk')\n", "no disk",
         ("it_goes_on_from_a_checkpoint", "it_may_end_without_a_step"),
     ),
+    "wants a setting": Fault(
+        "a_training_calls_it", "self.step = step", 'self.step = config["runner"]["colour"]',
+        "it was given step 0, config {runner {type 'MyTrainRunner', max_steps 4}}: which keys",
+        ("numbers_of_any_name_are_taken", "the_record_belongs_to_the_caller",
+         "its_state_goes_into_a_checkpoint", "it_goes_on_from_a_checkpoint",
+         "a_state_is_not_changed_later", "it_may_end_without_a_step"),
+    ),
+    "writes into the config": Fault(
+        "the_record_belongs_to_the_caller", "self.step = step",
+        'self.step = config["runner"].pop("max_steps")', "start() changed the config",
+    ),
     "knows all names": Fault(
         "numbers_of_any_name_are_taken", "        self.losses.append(loss)",
         '        self.losses.append(loss)\n        if "new" in more: raise KeyError("new")',

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import pytest
+from torch import nn
+
+from fluxvla_core.testing.model import ModelConformance, Sizes
 
 from .specimens import Fault, Outcomes, check_fault, check_good, outcomes
 
@@ -75,6 +81,11 @@ FAULTS = {
         "gave the loss inf, expected a finite one",
         ("it_learns_one_batch", "what_it_learns_is_in_its_state_dict", "it_trains_in_bf16"),
     ),
+    "another width": Fault(
+        "forward_gives_a_loss", "nn.Linear(5, width)", "nn.Linear(6, width)",
+        "it was given states (2, 5) float32, actions (2, 4, 3) float32, noise (2, 4, 3) float32: "
+        "set state_dim, cameras", (*TRAINING[1:], *ACTING),
+    ),
     "asks for more": Fault(
         "forward_gives_a_loss", "def forward(self, states, actions, noise)",
         "def forward(self, states, actions, noise, depth)", "needs depth", TRAINING[1:],
@@ -144,6 +155,38 @@ FAULTS = {
         ("an_answer_can_be_repeated", "rows_do_not_depend_on_each_other"),
     ),
 }  # fmt: skip
+
+
+class Sized(nn.Module):
+    def __init__(
+        self,
+        max_state_dim: int = 14,
+        num_cameras: int = 3,
+        image_size: tuple[int, int] = (48, 64),
+        vocab_size: int = 50,
+    ) -> None:
+        super().__init__()
+
+
+class Nested(nn.Module):
+    def __init__(self, vision: Mapping[str, Any], state_dim: int = 9) -> None:
+        super().__init__()
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "sizes"),
+    [
+        (Sized, {}, Sizes(14, 3, (48, 64), 8, 50)),
+        (Sized, {"arguments": {"vocab_size": 20}, "words": 5}, Sizes(14, 3, (48, 64), 5, 20)),
+        (Sized, {"state_dim": 2, "picture": (8, 4)}, Sizes(2, 3, (8, 4), 8, 50)),
+        (Nested, {"arguments": {"vision": {"image_size": 16}}}, Sizes(9, 2, (16, 16), 8, 100)),
+    ],
+)
+def test_a_batch_has_the_sizes_of_the_constructor(
+    model: type, settings: dict[str, Any], sizes: Sizes
+) -> None:
+    kit = type("Kit", (ModelConformance,), {"component": lambda self: model, **settings})
+    assert kit().sizes() == sizes
 
 
 @pytest.fixture(scope="module")

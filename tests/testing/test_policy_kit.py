@@ -43,6 +43,14 @@ FAULTS = {
         "reach=0.2, **more):\n        self.reach",
         "expected every parameter by name",
     ),
+    "takes more": Fault(
+        "it_says_what_driving_a_robot_takes", "reach: float = 0.2):", "reach: float):",
+        "missing a required argument: 'reach'; set arguments",
+        ("a_chunk_has_its_shape", "actions_are_in_the_unit_of_the_joints",
+         "an_episode_follows_from_its_seed", "another_object_gives_the_same_episode",
+         "the_observation_belongs_to_the_caller", "chunks_are_fresh_arrays",
+         "it_continues_a_chunk"),
+    ),
     "no rate": Fault(
         "it_says_what_driving_a_robot_takes", "action_rate_hz, horizon = SPEC, 10.0, 3",
         "action_rate_hz, horizon = SPEC, -1.0, 3", "must be positive and finite",
@@ -57,6 +65,13 @@ FAULTS = {
     "float32": Fault(
         "a_chunk_has_its_shape", STEPS, f"return ({STEPS[7:]}).astype(np.float32)",
         "gave float32, expected float64",
+    ),
+    "another width": Fault(
+        "a_chunk_has_its_shape", STEPS, 'return np.zeros((3, 2, 5)) @ observation["qpos"] + steps',
+        "it was given qpos (2,) float32, images {front (4, 6, 3) uint8}, task_description",
+        ("actions_are_in_the_unit_of_the_joints", "an_episode_follows_from_its_seed",
+         "another_object_gives_the_same_episode", "the_observation_belongs_to_the_caller",
+         "chunks_are_fresh_arrays", "it_continues_a_chunk"),
     ),
     "too wide": Fault(
         "a_chunk_has_its_shape", STEPS, f"return np.pad({STEPS[7:]}, ((0, 0), (0, 1)))",

@@ -40,6 +40,14 @@ FAULTS = {
          "training_and_robot_see_the_same", "it_keeps_images_if_it_says_so",
          "its_normalisation_can_be_undone"),
     ),
+    "another width": Fault(
+        "it_gives_a_sample", FOUND, '        found["states"].reshape(2, 7)\n' + FOUND,
+        "it was given states (7,) float32, actions (4, 7) float32",
+        ("what_it_was_given_is_untouched", "a_result_does_not_depend_on_earlier_samples",
+         "random_numbers_come_from_its_generator", "a_robot_can_use_it",
+         "training_and_robot_see_the_same", "it_keeps_images_if_it_says_so",
+         "its_normalisation_can_be_undone"),
+    ),
     "in place": Fault(
         "what_it_was_given_is_untouched", FOUND, '        sample["states"] *= 0.9\n' + FOUND,
         "wrote into states",
@@ -82,7 +90,7 @@ FAULTS = {
     ),
     "reads images": Fault(
         "it_keeps_images_if_it_says_so", FOUND, '        len(sample["images"])\n' + FOUND,
-        "raised KeyError: 'images', expected no use",
+        "without 'images' it raised KeyError: 'images' (specimen_",
     ),
     "changes images": Fault(
         "it_keeps_images_if_it_says_so", FOUND,

@@ -10,6 +10,7 @@ from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
 from fluxvla_core.data import resolve_model_path
+from fluxvla_core.errors import ConfigError
 
 SMALL = {
     "vision_backbone": {"type": "ConvEncoder", "image_size": (32, 48), "channels": (8, 8, 16)},
@@ -194,7 +195,7 @@ def test_one_encoder_serves_several_cameras():
     swapped = encoder(torch.cat([images[:, 3:], images[:, :3]], 1))
     half = encoder.out_dim // 2
     torch.testing.assert_close(found[:, :half], swapped[:, half:])
-    with pytest.raises(ValueError, match="img_keys and num_cameras disagree"):
+    with pytest.raises(ConfigError, match="set num_cameras to the number of"):
         encoder(images[:, :3])
 
 

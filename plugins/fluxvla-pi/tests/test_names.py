@@ -11,6 +11,7 @@ import pytest
 import torch
 from fluxvla_pi.names import LEROBOT, OPENPI, TRANSFORMERS, layout_of, published, sources
 from fluxvla_pi.pi0 import PI0FlowMatching
+from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.pi05 import PI05FlowMatching
 
 from fluxvla_core.errors import CheckpointError
@@ -21,6 +22,7 @@ FILES = {
     "pi05-openpi": (PI05FlowMatching, OPENPI),
     "pi0-lerobot061": (PI0FlowMatching, LEROBOT),
     "pi05-lerobot061": (PI05FlowMatching, LEROBOT),
+    "pi0_fast-lerobot061": (PI0FAST, LEROBOT),
     "pi0-transformers5.23": (PI0FlowMatching, TRANSFORMERS),
 }
 HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
@@ -42,6 +44,7 @@ def listed(name):
 def full():
     with torch.device("meta"):
         models = {kind: kind() for kind in (PI0FlowMatching, PI05FlowMatching)}
+        models[PI0FAST] = PI0FAST({}, tied_head=False)
     return {
         kind: {name: tuple(p.shape) for name, p in model.state_dict().items()}
         for kind, model in models.items()
@@ -65,7 +68,7 @@ def test_parameters_are_as_many_as_published(full, name):
     tied = {twin for pair in facts["tied"] for twin in pair[1:]}
     assert sum(prod(s) for key, s in shapes.items() if key not in tied) == facts["parameters"]
     unused = sum(prod(shapes[key]) for key in layout.unused if key in shapes)
-    untied = prod(shapes[layout.head]) if layout is LEROBOT else 0
+    untied = prod(shapes[layout.head]) if layout is LEROBOT and kind is not PI0FAST else 0
     assert sum(map(prod, full[kind].values())) + unused + untied == facts["parameters"]
 
 
@@ -104,6 +107,31 @@ def test_full_size_shapes_fit_together(kind):
     assert losses["loss"].shape == ()
     assert losses["sample_losses"].shape == (2,)
     assert chunk.shape == (2, 50, 32)
+
+
+def test_pi0_fast_has_paligemmas_parameters():
+    """2.92 billion: 3.45 with a head of its own, as LeRobot trains it."""
+    with torch.device("meta"):
+        tied = PI0FAST({})
+    count = sum(p.numel() for p in tied.parameters())
+    assert count == listed("pi0_fast-lerobot061")[0]["parameters"] - 257152 * 2048
+    assert round(count / 1e9, 2) == 2.92
+
+
+def test_full_size_shapes_of_pi0_fast_fit_together():
+    with torch.device("meta"):
+        model = PI0FAST({}, n_action_steps=10)
+        seen = {
+            "images": torch.empty(2, 6, 224, 224),
+            "lang_tokens": torch.zeros(2, 64, dtype=torch.int64),
+            "lang_masks": torch.ones(2, 64, dtype=torch.bool),
+        }
+        tokens = torch.zeros(2, 96, dtype=torch.int64)
+        losses = model(**seen, action_tokens=tokens, action_token_masks=tokens.bool())
+        chunk = model.predict_action(**seen)
+    assert losses["loss"].shape == ()
+    assert losses["sample_losses"].shape == (2,)
+    assert chunk.shape == (2, 10, 7)
 
 
 def test_a_file_with_the_head_only_gives_the_embedding(full):

@@ -42,7 +42,7 @@ def test_a_published_checkpoint_comes_in_and_goes_out(tmp_path, monkeypatch):
     assert LeRobotPiFormat().recognizes(tmp_path / "exported")
 
 
-@pytest.mark.parametrize("name", ["pi05_aloha", "pi05_ur", "pi0_libero"])
+@pytest.mark.parametrize("name", ["pi05_aloha", "pi05_ur", "pi0_libero", "pi0_fast_libero"])
 def test_its_configs_have_no_problems(name, capsys):
     assert f"configs/{name}.py" in README
     assert main(["config", "check", str(ROOT / "configs" / f"{name}.py")]) == 0

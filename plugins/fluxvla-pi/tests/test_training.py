@@ -14,8 +14,12 @@ from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner, checkpoint_differences, run_ranks
 
 from .oracles.pi_inputs import (
+    ACTION_WORDS,
     ACTIONS,
     CAMERAS,
+    FAST_SIZES,
+    FAST_TOKENS,
+    FAST_WORDS,
     HORIZON,
     SIZES,
     STATES,
@@ -23,19 +27,14 @@ from .oracles.pi_inputs import (
     VOCABULARY,
     WORDS,
 )
+from .tiny import FAST
 
-KEYS = (
-    "images",
-    "img_masks",
-    "lang_tokens",
-    "lang_masks",
-    "states",
-    "actions",
-    "action_masks",
-    "noise",
-    "time",
-)
+SEEN = ("images", "img_masks", "lang_tokens", "lang_masks")
+FLOW = ("states", "actions", "action_masks", "noise", "time")
+SAID = ("action_tokens", "action_token_masks")
+LEARNED = {"pi0": FLOW, "pi05": FLOW, "pi0_fast": SAID}
 MODELS = {
+    "pi0_fast": {"type": "PI0FAST", **FAST_SIZES, "tokenizer": FAST},
     "pi0": {"type": "PI0FlowMatching", **SIZES, "max_state_dim": STATES},
     "pi05": {"type": "PI05FlowMatching", **SIZES},
 }
@@ -65,11 +64,16 @@ class Samples:
         sample = {key: value.astype(np.float32) for key, value in sample.items()}
         sample["lang_tokens"] = rng.integers(0, VOCABULARY, WORDS)
         sample["lang_masks"], sample["img_masks"] = words, np.array([True, index % 3 > 0])
+        said = np.arange(FAST_TOKENS) < 9 + index % 12
+        sample["action_tokens"] = rng.integers(3, FAST_WORDS, FAST_TOKENS) * said
+        sample["action_tokens"][0] = ACTION_WORDS["bos"]
+        sample["action_token_masks"] = said
         return sample
 
 
 def train(work_dir, family, runner, batch, resume=None):
     """One run of four steps."""
+    learned = LEARNED[family]
     config = {
         "model": MODELS[family],
         "train_dataloader": {"per_device_batch_size": batch},
@@ -82,7 +86,11 @@ def train(work_dir, family, runner, batch, resume=None):
             "max_keep_ckpts": 0,
             "seed": 3,
             "enable_mixed_precision_training": False,
-            "collator": {"type": "DictCollator", "keys": list(KEYS)},
+            "collator": {
+                "type": "DictCollator",
+                "keys": [*SEEN, *learned],
+                "meta_keys": [key for key in (*FLOW, *SAID) if key not in learned],
+            },
             **runner,
         },
     }
@@ -111,7 +119,10 @@ def every_strategy(root, family):
     train(root / "goes_on", family, STRATEGIES["fsdp"], 4, middle)
 
 
-@pytest.fixture(scope="module", params=["pi05", pytest.param("pi0", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module",
+    params=["pi05", "pi0_fast", pytest.param("pi0", marks=pytest.mark.slow)],
+)
 def trained(request, tmp_path_factory):
     root = Path(tmp_path_factory.mktemp(request.param))
     assert run_ranks(2, every_strategy, root, request.param) == [0, 0]

@@ -10,6 +10,7 @@ from fluxvla_core.cli.config_commands import listing, used
 from fluxvla_core.cli.plan import Plan
 
 if TYPE_CHECKING:
+    from fluxvla_core.errors import FluxError
     from fluxvla_core.spec.embodiment import EmbodimentSpec
     from fluxvla_core.training.footprint import Footprint
     from fluxvla_core.training.rehearsal import Rehearsal
@@ -30,16 +31,17 @@ _ROWS = {
 }
 
 
-def outline(plan: Plan, log_format: str, nproc: int | None) -> str:
-    """What ``--dry-run`` prints, for people or as one JSON object.
+def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxError | None]:
+    """What ``--dry-run`` prints, for people or as one JSON object; what the run would end with.
 
     Args:
         log_format: ``text`` or ``json``.
         nproc: processes of the training; None for a few numbers of them.
     """
     rehearsal = _rehearsal(plan, nproc) if plan.trains and "model" in plan.config.tree else None
+    refused = None if rehearsal is None or isinstance(rehearsal, str) else rehearsal.refused
     if log_format == "json":
-        return json.dumps(_as_json(plan, rehearsal))
+        return json.dumps(_as_json(plan, rehearsal)), refused
     lines = [
         f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
         f"work dir: {plan.work_dir}",
@@ -52,7 +54,7 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> str:
         lines += ["pipeline:", f"  {rehearsal}"]
     elif rehearsal is not None:
         lines += ["pipeline:", *(f"  {line}" for line in _pipeline(rehearsal)), *_memory(rehearsal)]
-    return "\n".join(lines)
+    return "\n".join(lines), refused
 
 
 def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:

@@ -70,7 +70,7 @@ print(json.dumps({"works": True, "renderer": GL.glGetString(GL.GL_RENDERER).deco
 
 
 def facts(limit_s: float | None, environ: Mapping[str, str] = os.environ) -> dict[str, Any]:
-    """JSON values; docs/writing-a-plugin.md documents the keys.
+    """JSON values; docs/files.md documents the keys.
 
     Args:
         limit_s: seconds that one import may take; None imports nothing, and what only an import

@@ -116,7 +116,7 @@ def describe(plugin: Plugin) -> str:
 
 
 def record(plugin: Plugin) -> dict[str, Any]:
-    """JSON values for ``plugins show --json``; docs/writing-a-plugin.md has its keys."""
+    """JSON values for ``plugins show --json``; docs/files.md has its keys."""
     from fluxvla_core.config.resolve import INJECTED
 
     signature, problem = _signature(plugin)

@@ -104,7 +104,10 @@ class Run:
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
 
-            say(outline(plan, args.log_format, args.nproc))
+            text, refused = outline(plan, args.log_format, args.nproc)
+            say(text)
+            if refused is not None:
+                raise refused
             return 0
         if plan.trains:
             ranks.refuse_lost_work_dir()

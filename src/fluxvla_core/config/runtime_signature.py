@@ -89,13 +89,24 @@ def option_fields(cls: type) -> tuple[Parameter, ...]:
     options: Any = options_class(cls)
     if options is None:
         return ()
-    owners = {n: base for base in reversed(options.__mro__) for n in inspect.get_annotations(base)}
-    names = {field.name for field in dataclasses.fields(options) if field.init}
+    names = option_names(cls)
+    places: dict[str, str] = {}
+    for base in reversed(options.__mro__):
+        own = names & set(inspect.get_annotations(base))
+        places |= dict.fromkeys(own, _class_place(base) if own else "")
     return tuple(
-        replace(parameter, place=_class_place(owners[parameter.name]))
+        replace(parameter, place=places[parameter.name])
         for parameter in _runtime_init(options.__init__).parameters
         if parameter.name in names
     )
+
+
+def option_names(cls: type) -> set[str]:
+    """The names of the fields of a class's ``Options``; none where it has no such class."""
+    options: Any = options_class(cls)
+    if options is None:
+        return set()
+    return {field.name for field in dataclasses.fields(options) if field.init}
 
 
 def _runtime_meanings(cls: type) -> dict[str, str]:

@@ -320,6 +320,10 @@ class Tokenizer(Contract):
     def save_pretrained(self, folder: Any) -> Any:
         """Write what is needed to load it again; goes into checkpoints."""
 
+    def encode_actions(self, actions: Any) -> Sequence[int]:
+        """Token ids of a chunk of normalised actions ``(T, D)``."""
+        raise NotImplementedError(f"{type(self).__name__} is no tokenizer of actions")
+
 
 class Metric(Contract):
     """Keeps the numbers of a training and hands them to trackers; called on the first rank only."""

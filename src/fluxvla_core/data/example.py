@@ -132,6 +132,10 @@ class StandInTokenizer(Tokenizer):
         ids = [3 + zlib.crc32(part.encode()) % 997 for part in _MARK.findall(text)]
         return ids if text.startswith("<") else [1, *ids]
 
+    def encode_actions(self, actions: Any) -> Sequence[int]:
+        """A number for every fourth of a chunk's."""
+        return [number % 997 for number in range(max(1, np.size(actions) // 4))]
+
 
 def _with_tokenizers(table: Mapping[str, Any], assumed: list[str]) -> dict[str, Any]:
     """A dataset's table in which tokenizers are built, or stand in for one that is not there."""

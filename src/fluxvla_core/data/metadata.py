@@ -223,10 +223,10 @@ def read_metadata(root: Path) -> Metadata:
 def _read_info(root: Path) -> dict[str, Any]:
     if not root.exists():
         raise DataError(
-            f"{root}: no dataset here: the folder does not exist",
+            f"{root}: there is no dataset here: the folder does not exist",
             cause=_unfinished(root),
-            next="check data_root_path, which is relative to the folder that the command runs in: "
-            "--set train_dataloader.dataset.data_root_path=DIR",
+            next="check the path, which is relative to the folder that the command runs in; in a "
+            "config it is data_root_path: --set train_dataloader.dataset.data_root_path=DIR",
         )
     path = root / lerobot.INFO
     if not path.is_file():

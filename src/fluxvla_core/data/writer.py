@@ -195,8 +195,11 @@ class LeRobotWriter:
     ) -> None:
         if kind is None:
             self.finalize()
-        else:
-            self.discard_episode()
+            return
+        self.discard_episode()
+        # Frames of the first episode were refused: there is nothing to continue with.
+        if isinstance(error, DataError) and not any(self._staging.rglob("episode-*")):
+            shutil.rmtree(self._staging, ignore_errors=True)
 
     def _continue_recording(self, recover: bool) -> None:
         saved = sorted(self._staging.glob("episode-*"))

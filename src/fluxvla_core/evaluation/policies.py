@@ -280,9 +280,9 @@ def untrained_model(ckpt_path: str, device: str) -> Any:
     """
     import torch
 
-    from fluxvla_core.build import build_vla_from_cfg
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.training.weights import model_of
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return build_vla_from_cfg(Checkpoint.open(ckpt_path).config()["model"]).to(device).eval()
+        return model_of(Checkpoint.open(ckpt_path)).to(device).eval()

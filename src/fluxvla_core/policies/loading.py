@@ -12,7 +12,6 @@ from typing import Any
 from fluxvla_core.build import (
     build_dataset_from_cfg,
     build_transform_from_cfg,
-    build_vla_from_cfg,
     parameters,
 )
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whole
@@ -92,7 +91,7 @@ def load_policy(
         import torch
 
         device = own_device(os.environ, torch.cuda.device_count())
-    model = ready(_model(config, checkpoint, device), mixed_precision_dtype, quantization)
+    model = ready(_model(checkpoint, device), mixed_precision_dtype, quantization)
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     return LocalPolicy(
         model=model,
@@ -149,14 +148,10 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
     )
 
 
-def _model(config: Mapping[str, Any], checkpoint: Checkpoint, device: str) -> Any:
-    from fluxvla_core.training.weights import load_for_inference
+def _model(checkpoint: Checkpoint, device: str) -> Any:
+    from fluxvla_core.training.weights import load_for_inference, model_of
 
-    if "model" not in config:
-        raise CheckpointError(
-            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
-        )
-    model = build_vla_from_cfg(config["model"])
+    model = model_of(checkpoint)
     load_for_inference(model, checkpoint)
     return model.to(device).eval()
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import json
-from collections.abc import Mapping
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +17,10 @@ from fluxvla_core.config.runtime_signature import inspect_signature
 from fluxvla_core.contracts.check import check_class
 from fluxvla_core.errors import FluxError
 from fluxvla_core.plugins.registry import BY_NAME
+
+_LIBRARIES = frozenset({"torch", "numpy"})
+_KIT = Path(__file__).parent
+_LISTED = 12
 
 
 class Conformance:
@@ -31,7 +39,22 @@ class Conformance:
 
     def make(self) -> Any:
         """A new one, as it is; override it for one that takes more than ``arguments``."""
-        return self.component()(**self.arguments)
+        cls, problem = self.component(), ""
+        try:
+            inspect.signature(cls).bind(**self.arguments)
+        except TypeError as error:
+            problem = str(error)
+        assert not problem, (
+            f"{cls.__name__} cannot be made of arguments = {dict(self.arguments)}: {problem}; set "
+            "arguments of this kit's subclass (fluxvla plugins check: --set KEY=VALUE)"
+        )
+        return cls(**self.arguments)
+
+    def stated(self) -> dict[str, Any]:
+        """What the constructor is called with, and its defaults where it is not."""
+        parameters = inspect.signature(self.component()).parameters.values()
+        defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+        return {**defaults, **self.arguments}
 
     def test_is_complete(self) -> None:
         cls, problem = self.component(), ""
@@ -64,6 +87,62 @@ def capability(has: bool, what: str) -> None:
     """
     if not has:
         pytest.skip(what)
+
+
+@contextmanager
+def calling(what: str, given: Mapping[str, Any], hint: str) -> Iterator[None]:
+    """Whatever is raised inside says what was called, and with values of which shapes.
+
+    Args:
+        what: the call, as people write it.
+        given: name -> value.
+        hint: what of the kit decides about these values.
+
+    Raises:
+        AssertionError: something was raised inside.
+    """
+    try:
+        yield
+    except Exception as error:
+        raise AssertionError(
+            f"{what} raised {raised(error)}; it was given {shapes(given)}: {hint}"
+        ) from error
+
+
+def raised(error: Exception) -> str:
+    """An exception with its place in the code that is tested: ``KeyError: 'top' (arm.py:7)``."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [f for f in frames if not _LIBRARIES & {*Path(f.filename).parts}]
+    last = own[-1] if own else None
+    known = last is not None and Path(last.filename).parent != _KIT
+    place = f" ({Path(last.filename).name}:{last.lineno})" if last is not None and known else ""
+    return f"{type(error).__name__}: {error}{place}"
+
+
+def shapes(values: Mapping[str, Any]) -> str:
+    """Names with shapes and types: ``states (2, 7) float32, images {top (4, 6, 3) uint8}``."""
+    return ", ".join(f"{name} {_shape(value)}" for name, value in values.items())
+
+
+def _shape(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, Mapping):
+        return f"{{{shapes(value)}}}"
+    if isinstance(value, (list, tuple)) and value:
+        return f"[{len(value)} of {_shape(value[0])}]"
+    return f"{value!r:.40}"
+
+
+def numbers(values: Mapping[str, Any]) -> str:
+    """The sizes among arguments: ``state_dim = 14, image_size = (48, 64)``."""
+    found = [f"{k} = {v!r}" for k, v in values.items() if type(v) is int or _is_size(v)]
+    more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    return ", ".join(found[:_LISTED]) + more
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and bool(value) and all(type(n) is int for n in value)
 
 
 def is_json(value: Any) -> bool:

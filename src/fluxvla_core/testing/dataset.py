@@ -28,6 +28,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.testing._conformance import (
     Conformance,
     as_array,
+    calling,
     capability,
     equal,
     is_json,
@@ -66,9 +67,13 @@ class DatasetConformance(Conformance):
 
     def sample(self, dataset: Dataset, index: int, epoch: int) -> dict[str, Any]:
         """One sample, by whichever of the two methods the class has."""
-        if implements(dataset, Dataset, "get_sample"):
-            return dataset.get_sample(index, epoch)
-        return dataset.get_samples([SampleKey(epoch, index)])[0]
+        one = implements(dataset, Dataset, "get_sample")
+        what = f"{self.entry_point}.{'get_sample' if one else 'get_samples'}()"
+        hint = f"len() is {len(dataset)}, expected a sample for each index below it in every epoch"
+        with calling(what, {"index": index, "epoch": epoch}, hint):
+            if one:
+                return dataset.get_sample(index, epoch)
+            return dataset.get_samples([SampleKey(epoch, index)])[0]
 
     def test_it_has_samples(self, dataset: Dataset) -> None:
         length = len(dataset)
@@ -145,7 +150,9 @@ class DatasetConformance(Conformance):
 
     def test_several_at_once_are_the_same(self, dataset: Dataset) -> None:
         indices = self.indices(dataset)
-        found = dataset.get_samples([SampleKey(1, index) for index in indices])
+        with calling(f"{self.entry_point}.get_samples()", {"indices": indices, "epoch": 1}, "keys "
+                     "have index and epoch"):  # fmt: skip
+            found = dataset.get_samples([SampleKey(1, index) for index in indices])
         assert len(found) == len(indices), (
             f"get_samples() of {len(indices)} keys gave {len(found)}, expected one for each key"
         )

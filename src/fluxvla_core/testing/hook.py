@@ -28,7 +28,7 @@ from fluxvla_core.contracts.runner import Hook
 from fluxvla_core.errors import nearest
 from fluxvla_core.hooks import NAMES
 from fluxvla_core.plugins.registry import HOOKS
-from fluxvla_core.testing._conformance import Conformance
+from fluxvla_core.testing._conformance import Conformance, raised, shapes
 
 Call = tuple[str, Mapping[str, Any]]
 _NEAR = 0.75
@@ -41,6 +41,10 @@ class HookConformance(Conformance):
     registry = "hooks"
     at_most_s: ClassVar[float] = 0.02
     """Seconds that a call may take: a command interval at 50 Hz."""
+    joints: ClassVar[int] = 2
+    """Of the robot that it watches: numbers of a state and of an action."""
+    cameras: ClassVar[Mapping[str, tuple[int, int]]] = {"front": (4, 6)}
+    """Of the robot: name -> height and width of its images."""
 
     @pytest.fixture
     def watched(self, tmp_path: Path) -> Watched:
@@ -50,6 +54,10 @@ class HookConformance(Conformance):
     def make_in(self, context: RunContext) -> Any:
         """A new hook, as the run builds it: with the context, if it asks for that."""
         return build_from_cfg({"type": self.entry_point, **self.arguments}, HOOKS, context)
+
+    def robot(self) -> list[Call]:
+        """What is called in an episode of a robot."""
+        return robot(self.joints, self.cameras)
 
     def test_every_method_is_a_hook(self) -> None:
         own = [n for n, f in vars(self.component()).items() if callable(f) and n[:1] != "_"]
@@ -65,8 +73,11 @@ class HookConformance(Conformance):
         assert not watched.problems, watched.told("a training")
 
     def test_a_robot_can_be_watched(self, watched: Watched) -> None:
-        watched.calls(robot(), "ok")
-        assert not watched.problems, watched.told("a robot's run")
+        watched.calls(self.robot(), "ok")
+        assert not watched.problems, (
+            watched.told("a robot's run")
+            + "; the robot has joints and cameras as this kit's subclass sets them"
+        )
 
     @pytest.mark.parametrize("outcome", ["failed", "interrupted"])
     def test_a_run_may_end_at_once(self, watched: Watched, outcome: str) -> None:
@@ -82,7 +93,7 @@ class HookConformance(Conformance):
         )
 
     def test_it_is_quick_enough(self, watched: Watched) -> None:
-        watched.calls(10 * robot() + 10 * training(watched.context.work_dir), "ok")
+        watched.calls(10 * self.robot() + 10 * training(watched.context.work_dir), "ok")
         for name, taken in watched.taken.items():
             middle = float(np.median(taken))
             assert middle < self.at_most_s, (
@@ -94,7 +105,7 @@ class HookConformance(Conformance):
 
     def test_nothing_is_left_running(self, watched: Watched) -> None:
         before = set(threading.enumerate())
-        watched.calls(robot(), "ok")
+        watched.calls(self.robot(), "ok")
         left = [t.name for t in threading.enumerate() if t not in before and not t.daemon]
         assert not left, (
             f"after run_finished() the threads {', '.join(left)} still run, expected them ended: "
@@ -132,8 +143,8 @@ class Watched:
         try:
             method(**values)
         except Exception as error:  # noqa: BLE001 - said in the assertion
-            message = f"hook {self._name}.{name} raised {type(error).__name__}: {error}"
-            self.problems.append(message)
+            message = f"hook {self._name}.{name} raised {raised(error)}"
+            self.problems.append(f"{message}; it was given {shapes(arguments)}")
         self.taken.setdefault(name, []).append(time.perf_counter() - start)
 
     def told(self, what: str) -> str:
@@ -156,13 +167,14 @@ def training(work_dir: Path) -> list[Call]:
     return [*calls, ("checkpoint_saved", {"path": path, "step": 2})]
 
 
-def robot() -> list[Call]:
+def robot(joints: int, cameras: Mapping[str, tuple[int, int]]) -> list[Call]:
     """What is called in an episode of two chunks on a robot; arrays are read-only."""
-    chunk, state = np.zeros((3, 2)), np.zeros(2, np.float32)
-    image = np.zeros((4, 6, 3), np.uint8)
-    for array in (chunk, state, image):
+    chunk, state = np.zeros((3, joints)), np.zeros(joints, np.float32)
+    images = {name: np.zeros((*side, 3), np.uint8) for name, side in cameras.items()}
+    arrays: list[np.ndarray[Any, Any]] = [chunk, state, *images.values()]
+    for array in arrays:
         array.flags.writeable = False
-    seen: Observation = {"qpos": state, "images": {"front": image}, "task_description": "wave"}
+    seen: Observation = {"qpos": state, "images": images, "task_description": "wave"}
     calls: list[Call] = [("episode_started", {"task": "wave", "stamp": 0.0})]
     for _ in range(2):
         calls.append(("observed", {"observation": seen, "stamp": 0.0}))

@@ -19,7 +19,12 @@ import pytest
 from fluxvla_core.build import RunContext, build_from_cfg
 from fluxvla_core.contracts.training import Metric
 from fluxvla_core.plugins.registry import METRICS
-from fluxvla_core.testing._conformance import Conformance, is_json
+from fluxvla_core.testing._conformance import Conformance, calling, is_json
+
+_ANY = (
+    "which keys there are depends on the run, so use those that are there (config() and "
+    "record(step) of this kit's subclass set what it is given)"
+)
 
 
 class MetricConformance(Conformance):
@@ -53,18 +58,25 @@ class MetricConformance(Conformance):
     def commit(self, metric: Metric, first: int, last: int) -> None:
         """The steps from ``first`` to ``last``, each pushed."""
         for step in range(first, last + 1):
-            metric.commit(**self.record(step))
+            with calling(f"{self.entry_point}.commit()", self.record(step), _ANY):
+                metric.commit(**self.record(step))
             metric.push()
 
+    def start(self, metric: Metric, step: int = 0) -> None:
+        """The training begins after ``step``."""
+        given = {"step": step, "config": self.config()}
+        with calling(f"{self.entry_point}.start()", given, _ANY):
+            metric.start(step, self.config())
+
     def test_a_training_calls_it(self, metric: Metric) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         self.commit(metric, 1, 3)
         metric.push()  # there may be nothing new
         metric.sync()
         metric.finalize()
 
     def test_numbers_of_any_name_are_taken(self, metric: Metric) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         problem = ""
         try:
             metric.commit(**{**self.record(1), "val_loss": 0.7, "loss/second": 0.1, "new": 1.0})
@@ -77,16 +89,17 @@ class MetricConformance(Conformance):
         metric.finalize()
 
     def test_the_record_belongs_to_the_caller(self, metric: Metric) -> None:
-        metric.start(0, self.config())
         record, config = self.record(1), dict(self.config())
-        metric.commit(**record)
+        with calling(f"{self.entry_point}.start() or commit()", record, _ANY):
+            metric.start(0, config)
+            metric.commit(**record)
         metric.push()
         assert record == self.record(1), "commit() changed the numbers that it was given"
         assert config == self.config(), "start() changed the config that it was given"
         metric.finalize()
 
     def test_its_state_goes_into_a_checkpoint(self, metric: Metric) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         self.commit(metric, 1, 3)
         state = metric.state_dict()
         metric.finalize()
@@ -96,7 +109,7 @@ class MetricConformance(Conformance):
         )
 
     def test_it_goes_on_from_a_checkpoint(self, metric: Metric, tmp_path: Path) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         self.commit(metric, 1, 2)
         metric.sync()
         saved = metric.state_dict()
@@ -105,7 +118,7 @@ class MetricConformance(Conformance):
         metric.finalize()
         resumed = self.make_in(tmp_path)
         resumed.load_state_dict(saved)
-        resumed.start(2, self.config())
+        self.start(resumed, 2)
         self.commit(resumed, 3, 4)
         found = resumed.state_dict()
         resumed.finalize()
@@ -116,7 +129,7 @@ class MetricConformance(Conformance):
         )
 
     def test_a_state_is_not_changed_later(self, metric: Metric) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         self.commit(metric, 1, 2)
         state = metric.state_dict()
         kept = repr(state)
@@ -128,7 +141,7 @@ class MetricConformance(Conformance):
         )
 
     def test_it_may_end_without_a_step(self, metric: Metric) -> None:
-        metric.start(0, self.config())
+        self.start(metric)
         metric.push()
         metric.sync()
         metric.finalize()

@@ -15,6 +15,8 @@ from __future__ import annotations
 import inspect
 import random
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,11 +26,22 @@ from torch import Tensor, nn
 
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.testing._conformance import Conformance, capability, equal
+from fluxvla_core.testing._conformance import Conformance, calling, capability, equal, numbers
 
 _CLOSE = 1e-4
 # Keys of a batch that a robot's observations do not have.
 _LEARNT_FROM = ("actions", "action_masks", "time", "sample_ids")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of a batch of the kit, by the attributes of ``ModelConformance`` that set them."""
+
+    state_dim: int
+    cameras: int
+    picture: tuple[int, int]
+    words: int
+    vocabulary: int
 
 
 class ModelConformance(Conformance):
@@ -37,14 +50,17 @@ class ModelConformance(Conformance):
     registry = "vlas"
     action_shape: ClassVar[tuple[int, int]] = (4, 7)
     """``(T, D)`` of a chunk, for a model that has no ``action_shape`` itself."""
-    state_dim: ClassVar[int] = 7
-    """Numbers of a state."""
-    cameras: ClassVar[int] = 2
-    """Images of an observation, whose channels stand one behind the other."""
-    picture: ClassVar[tuple[int, int]] = (32, 32)
-    """Height and width of an image."""
+    state_dim: ClassVar[int | None] = None
+    """Numbers of a state; None: the constructor's ``state_dim`` or ``max_state_dim``, else 7."""
+    cameras: ClassVar[int | None] = None
+    """Images of an observation, whose channels stand one behind the other; None: the
+    constructor's ``num_cameras``, else 2."""
+    picture: ClassVar[tuple[int, int] | None] = None
+    """Height and width of an image; None: the constructor's ``image_size``, else 32 and 32."""
     words: ClassVar[int] = 8
     """Tokens of a prompt."""
+    vocabulary: ClassVar[int | None] = None
+    """Tokens that there are; None: the constructor's ``vocab_size``, else 100."""
     steps: ClassVar[int] = 40
     """Steps in which the loss of one batch must fall by a tenth."""
     learning_rate: ClassVar[float] = 1e-2
@@ -67,6 +83,22 @@ class ModelConformance(Conformance):
         """``(T, D)`` of its chunks."""
         return VLA.adapt(model).action_shape or self.action_shape
 
+    def sizes(self) -> Sizes:
+        """The sizes of a batch: as set here, or else as the constructor has them."""
+        stated = self.stated()
+
+        def known(own: Any, names: Sequence[str], other: Any) -> Any:
+            return next((v for v in (own, *_named(stated, names)) if v is not None), other)
+
+        side = known(self.picture, ("image_size",), (32, 32))
+        return Sizes(
+            state_dim=known(self.state_dim, ("state_dim", "max_state_dim"), 7),
+            cameras=known(self.cameras, ("num_cameras",), 2),
+            picture=(side, side) if isinstance(side, int) else tuple(side),
+            words=self.words,
+            vocabulary=known(self.vocabulary, ("vocab_size",), 100),
+        )
+
     def batch(self, model: nn.Module, size: int = 2) -> dict[str, Tensor]:
         """``size`` samples with every key that datasets and transforms of the core give.
 
@@ -74,13 +106,13 @@ class ModelConformance(Conformance):
         """
         length, dim = self.shape_of(model)
         draw = torch.Generator().manual_seed(1)
-        height, width = self.picture
+        of = self.sizes()
         return {
-            "states": torch.randn(size, self.state_dim, generator=draw),
-            "images": torch.rand(size, 3 * self.cameras, height, width, generator=draw),
-            "img_masks": torch.ones(size, self.cameras, dtype=torch.bool),
-            "lang_tokens": torch.randint(1, 100, (size, self.words), generator=draw),
-            "lang_masks": torch.ones(size, self.words, dtype=torch.bool),
+            "states": torch.randn(size, of.state_dim, generator=draw),
+            "images": torch.rand(size, 3 * of.cameras, *of.picture, generator=draw),
+            "img_masks": torch.ones(size, of.cameras, dtype=torch.bool),
+            "lang_tokens": torch.randint(1, of.vocabulary, (size, of.words), generator=draw),
+            "lang_masks": torch.ones(size, of.words, dtype=torch.bool),
             "embodiment_ids": torch.zeros(size, dtype=torch.int64),
             "actions": torch.randn(size, length, dim, generator=draw),
             "action_masks": torch.ones(size, length),
@@ -128,7 +160,8 @@ class ModelConformance(Conformance):
     def loss(self, model: nn.Module, batch: Mapping[str, Tensor], seed: int = 3) -> Tensor:
         """The loss of ``batch``, with whatever the model draws following from ``seed``."""
         _seed(seed)
-        output = model(**batch)
+        with self._calling("forward()", batch):
+            output = model(**batch)
         loss = output.get("loss") if isinstance(output, Mapping) else None
         assert isinstance(loss, Tensor), (
             f"forward() gave {_said(output)}, expected a mapping with 'loss': the training step "
@@ -154,10 +187,20 @@ class ModelConformance(Conformance):
             optimizer.step()
         return losses
 
+    def _calling(self, what: str, batch: Mapping[str, Any]) -> AbstractContextManager[None]:
+        stated = numbers(self.stated())
+        takes = f"; {self.entry_point} was made with {stated}" if stated else ""
+        hint = (
+            "set state_dim, cameras, image, words, vocabulary and action_shape of this kit's "
+            "subclass to what it takes, or override batch(model, size) (fluxvla plugins check: "
+            f"--kit FILE with such a subclass){takes}"
+        )
+        return calling(f"{self.entry_point}.{what}", batch, hint)
+
     def predicted(self, model: nn.Module, batch: Mapping[str, Any]) -> Tensor:
         """``predict_action`` as a robot's policy calls it."""
         method: Any = model.eval().predict_action
-        with torch.inference_mode():
+        with torch.inference_mode(), self._calling("predict_action()", batch):
             found: Tensor = method(**batch)
         assert isinstance(found, Tensor), (
             f"predict_action() gave {_said(found)}, expected a tensor (B, T, D): it is moved to "
@@ -320,6 +363,14 @@ def _seed(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)
     torch.manual_seed(seed)
+
+
+def _named(table: Mapping[str, Any], names: Sequence[str]) -> Iterator[Any]:
+    """Values of these names in ``table``, then in the tables of its parts."""
+    yield from (table[name] for name in names if name in table)
+    for part in table.values():
+        if isinstance(part, Mapping):
+            yield from _named(part, names)
 
 
 def _flat(units: Sequence[Any]) -> Iterator[nn.Module]:

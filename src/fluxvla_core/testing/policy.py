@@ -24,7 +24,7 @@ from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor, Continuation
 from fluxvla_core.errors import FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.testing._conformance import Conformance, capability, equal
+from fluxvla_core.testing._conformance import Conformance, calling, capability, equal
 
 Chunk = npt.NDArray[np.float64]
 SEED = 11
@@ -96,7 +96,17 @@ class PolicyConformance(Conformance):
         """Its answers to the first observations of an episode."""
         policy.reset(seed)
         seen = (self.observation(policy, number) for number in range(_QUESTIONS))
-        return [np.array(policy.predict_action(one)) for one in seen]
+        return [np.array(self.asked(policy, one)) for one in seen]
+
+    def asked(self, policy: Actor, observation: Observation) -> Any:
+        """What ``predict_action`` answers."""
+        hint = (
+            "the state follows from spec, its own embodiment by default, and the images are those "
+            "of its cameras; set these, or override observation(policy, number) in this kit's "
+            "subclass (fluxvla plugins check: --kit FILE with such a subclass)"
+        )
+        with calling(f"{self.entry_point}.predict_action()", dict(observation), hint):
+            return policy.predict_action(observation)
 
     def test_it_says_what_driving_a_robot_takes(self, policy: Actor) -> None:
         names = ", ".join(ON_A_ROBOT)
@@ -112,7 +122,7 @@ class PolicyConformance(Conformance):
         policy.reset(SEED)
         dim = self.embodiment(policy).dim
         for number in range(_QUESTIONS):
-            chunk = policy.predict_action(self.observation(policy, number))
+            chunk = self.asked(policy, self.observation(policy, number))
             assert isinstance(chunk, np.ndarray), (
                 f"predict_action() gave a {type(chunk).__name__}, expected a numpy array of shape "
                 f"(T, {dim}): chunks are joined and limited as arrays"
@@ -176,7 +186,7 @@ class PolicyConformance(Conformance):
     def test_the_observation_belongs_to_the_caller(self, policy: Actor) -> None:
         policy.reset(SEED)
         observation, untouched = self.observation(policy), self.observation(policy)
-        policy.predict_action(observation)
+        self.asked(policy, observation)
         assert equal(dict(observation), dict(untouched)), (
             "predict_action() changed the observation that it was given, expected it untouched: "
             "the same arrays go into recordings and to hooks"
@@ -184,9 +194,9 @@ class PolicyConformance(Conformance):
 
     def test_chunks_are_fresh_arrays(self, policy: Actor) -> None:
         policy.reset(SEED)
-        first = policy.predict_action(self.observation(policy))
+        first = self.asked(policy, self.observation(policy))
         kept = first.copy()
-        second = policy.predict_action(self.observation(policy, 1))
+        second = self.asked(policy, self.observation(policy, 1))
         assert np.array_equal(first, kept), (
             "a second predict_action() changed the chunk that the first gave, expected fresh "
             "arrays: the first chunk is still being played"

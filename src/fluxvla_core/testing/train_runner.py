@@ -109,8 +109,8 @@ class TrainRunnerConformance(Conformance):
         codes = self.start(*wholes, cuts[0])
         for number, run in enumerate(cuts):
             assert -signal.SIGKILL in codes, (
-                f"run {number} was to be killed, and its processes ended with {codes}: the "
-                "signal that a rank sends itself never came (see the output above)"
+                f"run {number} was to be killed, and its processes ended with {codes}: it failed "
+                "before that, or the resumed one before it did (see the output above)"
             )
             assert 0 not in codes, (
                 f"one process of run {number} was killed, and the exit codes are {codes}, expected "
@@ -247,6 +247,10 @@ class TrainRunnerConformance(Conformance):
             codes = self.start(run)
             assert codes == [0] * self.ranks, _ended("a model with such a parameter", codes)
             saved = Checkpoint.open(folders(tmp_path / "trained")[-1]).tensors(MODEL)
+            assert "gain" in saved, (
+                f"a checkpoint has {', '.join(sorted(saved))}, expected the parameter 'gain' among "
+                "them: the names are those of the model itself (unwrap_model)"
+            )
             shape = tuple(saved["gain"].shape)
             assert shape == (), (
                 f"a parameter without dimensions was saved with the shape {shape}, expected (): "

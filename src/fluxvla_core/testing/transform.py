@@ -21,7 +21,14 @@ import pytest
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import Transform
-from fluxvla_core.testing._conformance import Conformance, capability, equal, unequal_keys
+from fluxvla_core.testing._conformance import (
+    Conformance,
+    calling,
+    capability,
+    equal,
+    raised,
+    unequal_keys,
+)
 
 SEED = 5
 # What a robot's observation does not have.
@@ -82,6 +89,15 @@ class TransformConformance(Conformance):
 
     def apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:
         """Call it as the pipeline does."""
+        hint = (
+            "set state_dim, horizon, cameras and image of this kit's subclass to what it takes, "
+            "or override sample(number) for one that comes after other transforms (fluxvla "
+            "plugins check: --kit FILE with such a subclass)"
+        )
+        with calling(self.entry_point, dict(sample), hint):
+            return self._apply(transform, sample, seed)
+
+    def _apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:
         if transform.needs_rng:
             result: Sample = transform(sample, np.random.default_rng(seed))
         else:
@@ -144,9 +160,9 @@ class TransformConformance(Conformance):
         )
         problem = ""
         try:
-            self.apply(transform, self.observation())
+            self._apply(transform, self.observation())
         except Exception as error:  # noqa: BLE001 - said in the assertion
-            problem = f"{type(error).__name__}: {error}"
+            problem = raised(error)
         assert not problem, (
             f"called with a robot's observation, which has {', '.join(self.observation())}, it "
             f"raised {problem}; expected a result: only training has actions; leave alone what is "
@@ -171,9 +187,9 @@ class TransformConformance(Conformance):
         given = {key: value for key, value in self.sample().items() if key != "images"}
         problem = ""
         try:
-            self.apply(transform, given)
+            self._apply(transform, given)
         except Exception as error:  # noqa: BLE001 - said in the assertion
-            problem = f"{type(error).__name__}: {error}"
+            problem = raised(error)
         assert not problem, (
             f"keeps_images is True, and without 'images' it raised {problem}, expected no use of "
             "them: they may be normalised after it"

@@ -12,13 +12,17 @@ import hashlib
 from pathlib import Path
 
 from fluxvla_core.atomic import prepare_folder, refuse_content
-from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
+from fluxvla_core.training.weights import (
+    LeftOut,
+    load_for_inference,
+    model_of,
+    weights_by_name,
+)
 from fluxvla_core.untrusted import read_bytes
 
 TRAINING_ONLY = ("runner", "val_dataloader")
@@ -47,16 +51,12 @@ def export(source: str | Path, target: str | Path) -> Path:
     checkpoint.config()  # of the right types
     config = checkpoint.json(ckpt.CONFIG)
     tree = {k: v for k, v in config["config"].items() if k not in TRAINING_ONLY}
-    if "model" not in tree:
-        raise CheckpointError(
-            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
-        )
     origins = {
         key: place
         for key, place in config.get("origins", {}).items()
         if key.partition(".")[0] not in TRAINING_ONLY
     }
-    model = build_vla_from_cfg(tree["model"])
+    model = model_of(checkpoint)
     load_for_inference(model, checkpoint)
     if target.exists():
         target.rmdir()

@@ -31,7 +31,12 @@ from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER
-from fluxvla_core.training.weights import LeftOut, load_for_inference, weights_by_name
+from fluxvla_core.training.weights import (
+    LeftOut,
+    load_for_inference,
+    model_of,
+    weights_by_name,
+)
 from fluxvla_core.untrusted import read_json
 
 _ORIGIN = "import-checkpoint"
@@ -172,13 +177,13 @@ def _as_foreign(checkpoint: Checkpoint) -> ForeignCheckpoint:
     dataset = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
     facts = checkpoint.policy()
     if checkpoint.has(ckpt.EMA) or checkpoint.has(ADAPTER):
-        model = build_vla_from_cfg(config["model"])
+        model = model_of(checkpoint)
         load_for_inference(model, checkpoint)
         tensors: dict[str, Tensor] = {n: t.detach() for n, t in weights_by_name(model).items()}
     else:  # as they were saved, in the dtype that they have there
         tensors = checkpoint.tensors(ckpt.MODEL)
     return ForeignCheckpoint(
-        model=config["model"],
+        model=redirected([config["model"]], checkpoint.processors)[0],
         tensors=tensors,
         img_keys=tuple(camera_name(key) for key in dataset.get("img_keys", ())),
         transforms=redirected(dataset.get("transforms", ()), checkpoint.processors),

@@ -22,7 +22,7 @@ from fluxvla_core.build import (
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, example
-from fluxvla_core.errors import FluxError
+from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
@@ -60,6 +60,7 @@ class Rehearsal:
         notes: what is not known, or does not fit.
         skeleton: the model without memory, with its adapters.
         inputs: the batch itself.
+        refused: with what the training would end at its first batch.
     """
 
     robot: EmbodimentSpec | None = None
@@ -75,6 +76,7 @@ class Rehearsal:
     notes: list[str] = field(default_factory=list)
     skeleton: nn.Module | None = None
     inputs: Mapping[str, Any] | None = None
+    refused: FluxError | None = None
 
 
 def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
@@ -99,6 +101,11 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     batch = _batch(context, rehearsal, runner)
     rehearsal.skeleton, rehearsal.inputs = model, batch
     _compare(rehearsal)
+    if model is not None and batch is not None:
+        try:
+            ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
+        except ConfigError as error:
+            rehearsal.refused, batch = error, None
     if model is None or runner is None or not processes:
         return rehearsal
     if not rehearsal.trained:
@@ -182,6 +189,9 @@ def _count(
         try:
             found.memory = memory_of(model, runner, inputs, processes, device_type)
         except Exception as error:  # noqa: BLE001 - another's model; an estimate must not end the run
+            if isinstance(error, ConfigError) and inputs is not None:
+                found.refused = error
+                continue
             what = "activations are" if inputs is not None else "memory is"
             found.notes.append(f"{what} not known: {_told(error)}")
             continue

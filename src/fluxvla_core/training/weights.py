@@ -12,10 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
 from fluxvla_core.checkpoints.foreign import foreign_folder
 from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import check_names, read_tensors, shard_like
+from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, run_on_rank0
@@ -153,6 +155,25 @@ def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
             cause="another version of the package or file that they come from is installed",
             next="environment.json in the checkpoint's folder has the versions that made it",
         )
+
+
+def model_of(checkpoint: Checkpoint) -> nn.Module:
+    """The model that a checkpoint's config describes, without the checkpoint's weights.
+
+    A tokenizer of the model's own is that of the checkpoint's processors.
+
+    Raises:
+        CheckpointError: the config has no section ``model``.
+        ConfigError, PluginError: the model cannot be built here.
+    """
+    config = checkpoint.config()
+    if "model" not in config:
+        raise CheckpointError(
+            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
+        )
+    (table,) = redirected([config["model"]], checkpoint.processors)
+    built: nn.Module = build_vla_from_cfg(table)
+    return built
 
 
 def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fluxvla_aloha.arms import ARMS
 from fluxvla_aloha.base import TIMEOUT_S, BaseDrive
 from fluxvla_aloha.embodiment import CAMERAS, GRIPPERS, RATE_HZ, aloha_spec
-from fluxvla_aloha.presets import PRESETS
+from fluxvla_aloha.presets import PRESETS, Preset
 from fluxvla_core.errors import ConfigError, NotReady, Rejected
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
 from fluxvla_core.ros2 import (
@@ -76,9 +76,9 @@ class AlohaOperator(RosOperator):
             them :meth:`connect` refuses.
         embodiment: in place of ``arms``, the spec of others (as ``EmbodimentSpec.to_dict`` gives
             it), with seven joints an arm, left first, gripper last.
-        domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.RosOperator``.
         context: what the run knows (injected).
+        **connection: as ``fluxvla_core.ros2.RosOperator`` takes it: ``domain_id``, how long to wait
+            for streams, how old they may be.
 
     Raises:
         ConfigError: an unknown preset, or a value out of its range.
@@ -120,17 +120,10 @@ class AlohaOperator(RosOperator):
         camera_rate_hz: float | None = None,
         arms: str | None = None,
         embodiment: Mapping[str, Any] | None = None,
-        domain_id: int | None = None,
-        connect_timeout_s: float = 10.0,
-        max_age_s: float = 0.5,
-        max_skew_s: float = 0.1,
-        sync_on: str = "stamp",
-        rate_window_s: float = 1.0,
         context: RunContext | None = None,
+        **connection: Any,
     ) -> None:
-        super().__init__(
-            domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s
-        )
+        super().__init__(**connection)
         known = PRESETS.get(preset)
         if known is None:
             raise ConfigError(f"unknown ALOHA preset {preset!r}; known are {', '.join(PRESETS)}")
@@ -161,12 +154,9 @@ class AlohaOperator(RosOperator):
         self._names = tuple(joint_names or known.joints)
         if len(self._names) != _ARM:
             raise ConfigError(f"joint_names are {_ARM} names of one arm, got {list(self._names)}")
-        own_ends = None if kind is None else ARMS[kind].gripper_ends
-        closed, opened = own_ends or (known.gripper_closed, known.gripper_open)
-        self._gripper_closed = closed if gripper_closed is None else gripper_closed
-        self._gripper_open = opened if gripper_open is None else gripper_open
-        if not 0 < abs(self._gripper_open - self._gripper_closed) < float("inf"):
-            raise ConfigError("gripper_closed and gripper_open must be different finite numbers")
+        self._gripper_closed, self._gripper_open = _gripper_ends(
+            known, kind, gripper_closed, gripper_open
+        )
         self._arm_message = arm_message or known.arm_message
         self._gripper_message = gripper_message or known.gripper_message
         self._camera_hz = camera_rate_hz
@@ -329,6 +319,18 @@ def fill_command(message: Any, names: Sequence[str], values: Array, group: str) 
 
 def _given(preset: Sequence[str], *topics: str | None) -> tuple[str, ...]:
     return tuple(topic or default for topic, default in zip(topics, preset, strict=True))
+
+
+def _gripper_ends(
+    preset: Preset, arms: str | None, closed: float | None, opened: float | None
+) -> tuple[float, float]:
+    """A gripper's raw values, closed and open: the config's, the arms', or the preset's."""
+    own = None if arms is None else ARMS[arms].gripper_ends
+    usual = own or (preset.gripper_closed, preset.gripper_open)
+    ends = usual[0] if closed is None else closed, usual[1] if opened is None else opened
+    if not 0 < abs(ends[1] - ends[0]) < float("inf"):
+        raise ConfigError("gripper_closed and gripper_open must be different finite numbers")
+    return ends
 
 
 def _spec(

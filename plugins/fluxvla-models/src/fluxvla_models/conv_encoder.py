@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fluxvla_core.errors import ConfigError
+
 GROUPS = 8
 """Channels are normalised in groups: unlike a batch's, their statistics do not depend on which
 samples share a step, so that a result is the same on one process and on many."""
@@ -93,9 +95,10 @@ class ConvEncoder(nn.Module):
         """``(B, 3 * num_cameras, H, W)`` float, about -1..1 -> ``(B, out_dim)``."""
         batch, stacked, height, width = images.shape
         if stacked != 3 * self.num_cameras:
-            raise ValueError(
-                f"expected {3 * self.num_cameras} image channels for {self.num_cameras} "
-                f"camera(s), got {stacked}: img_keys and num_cameras disagree"
+            raise ConfigError(
+                f"ConvEncoder: num_cameras is {self.num_cameras}, the batch has {stacked} image "
+                f"channels ({stacked // 3} cameras)",
+                next="set num_cameras to the number of the dataset's img_keys",
             )
         x = images.reshape(batch * self.num_cameras, 3, height, width)
         # oneDNN's convolutions are up to twice as fast on this layout.

@@ -23,36 +23,11 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA
 from fluxvla_pi.acting import Seen, expert_step, seen_of
 from fluxvla_pi.gemma import GemmaDecoder, Rope, rope_of
+from fluxvla_pi.paligemma import Prefix, embed_prefix
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, siglip_size
 
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
-
-
-@dataclass(frozen=True)
-class Prefix:
-    """What is seen and asked, as the model's layers take it.
-
-    Args:
-        hidden: ``(B, P, W)`` embedded tokens.
-        real: ``(B, P)`` bool, False on padding.
-    """
-
-    hidden: Tensor
-    real: Tensor
-
-    @property
-    def rope_positions(self) -> Tensor:
-        """``(B, P)``: padding takes no place."""
-        return self.real.long().cumsum(1) - 1
-
-    @property
-    def mask(self) -> Tensor:
-        """``(B, 1, 1, P)``: every token attends to every real one.
-
-        Padding does so, too: nobody attends to it, and a row without any key has no softmax.
-        """
-        return self.real[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -348,15 +323,8 @@ class PiFlowMatching(VLA, nn.Module):
         lang_masks: Tensor,
     ) -> Prefix:
         """Pictures ``(B, 3N, H, W)`` and words ``(B, L)`` as one row of tokens, pictures first."""
-        batch, cameras = len(images), images.shape[1] // 3
-        seen = self.vision_backbone(images.reshape(batch * cameras, 3, *images.shape[2:]))
-        seen = self.projector(seen).unflatten(0, (batch, cameras)).flatten(1, 2)
-        words = self.llm_backbone.embed(lang_tokens)
-        if img_masks is None:
-            img_masks = torch.ones(batch, cameras, dtype=torch.bool, device=images.device)
-        patches = self.vision_backbone.size.patches
-        real = torch.cat([img_masks.bool().repeat_interleave(patches, 1), lang_masks.bool()], dim=1)
-        return Prefix(torch.cat([seen, words.to(seen.dtype)], dim=1), real)
+        parts = (self.vision_backbone, self.projector, self.llm_backbone)
+        return embed_prefix(*parts, images, img_masks, lang_tokens, lang_masks)
 
     def _joint(self, prefix: Prefix, suffix: Suffix, draws: int) -> Tensor:
         """The velocity ``(B * K, T, D)``, both run layer by layer."""

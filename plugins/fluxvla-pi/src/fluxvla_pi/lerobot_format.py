@@ -74,7 +74,7 @@ class LeRobotPiFormat(CheckpointFormat):
                 raise CheckpointError(f"{key} is {config[key]!r}; {value!r} is read", where=where)
         family = config["type"]
         inputs, outputs = (
-            _features(config, f"{way}_features", where) for way in ("input", "output")
+            features_of(config, f"{way}_features", where) for way in ("input", "output")
         )
         old = [name for name in safetensors_in(folder) if name.startswith(BUFFERS)]
         weights = weights_in(folder, old)
@@ -83,33 +83,31 @@ class LeRobotPiFormat(CheckpointFormat):
                 f"type is {family}, the weights are those of {weights.family}", where=where
             )
         widths = {
-            STATE: _width(inputs, STATE, where),
-            ACTION: _width(outputs, ACTION, where),
+            STATE: width_of(inputs, STATE, where),
+            ACTION: width_of(outputs, ACTION, where),
         }
         default = 48 if family == "pi0" else 200
-        max_length = _whole(config, "tokenizer_max_length", default, where)
+        max_length = count_of(config, "tokenizer_max_length", default, where)
         if os.path.lexists(folder / f"{PREPROCESSOR}.json"):
             preparation = from_files(folder, widths)
         else:
             preparation = from_buffers(folder, config, widths, max_length)
-        horizon = _whole(config, "chunk_size", 50, where)
+        horizon = count_of(config, "chunk_size", 50, where)
         model = {
             **weights.model,
             "n_action_steps": horizon,
-            "num_steps": _whole(config, "num_inference_steps", 10, where),
+            "num_steps": count_of(config, "num_inference_steps", 10, where),
             "ori_action_dim": widths[ACTION],
         }
-        size = config.get("image_resolution", [224, 224])
-        if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
-            raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
+        size = resolution_of(config, where)
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=without_cameras(_cameras(inputs, where), absent, where),
+            img_keys=without_cameras(cameras_in(inputs, where), absent, where),
             transforms=_transforms(model, preparation, size, tokenizer),
-            statistics={"private": _statistics(preparation, widths)},
+            statistics={"private": statistics_of(preparation, widths)},
             horizon=horizon,
-            notes=_notes(preparation, tokenizer),
+            notes=notes_of(preparation, tokenizer),
         )
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
@@ -128,28 +126,39 @@ class LeRobotPiFormat(CheckpointFormat):
         (folder / CONFIG).write_text(json.dumps(config, indent=4), encoding="utf-8")
 
 
-def _whole(config: Mapping[str, Any], key: str, default: int, where: str) -> int:
+def resolution_of(config: Mapping[str, Any], where: str) -> list[int]:
+    """Height and width that pictures are brought to."""
+    size = config.get("image_resolution", [224, 224])
+    if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
+        raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
+    return size
+
+
+def count_of(config: Mapping[str, Any], key: str, default: int, where: str) -> int:
+    """A setting that is a number from 1."""
     value = config.get(key, default)
     if not isinstance(value, int) or value < 1:
         raise CheckpointError(f"{key} is {value!r}, not a number from 1", where=where)
     return value
 
 
-def _features(config: Mapping[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:
+def features_of(config: Mapping[str, Any], key: str, where: str) -> dict[str, dict[str, Any]]:
+    """``input_features`` or ``output_features``."""
     features = config.get(key)
     if not isinstance(features, dict) or not all(isinstance(f, dict) for f in features.values()):
         raise CheckpointError(f"{key} is no table of features", where=where)
     return features
 
 
-def _width(features: Mapping[str, Mapping[str, Any]], key: str, where: str) -> int:
+def width_of(features: Mapping[str, Mapping[str, Any]], key: str, where: str) -> int:
+    """The width of a feature that is a row of numbers."""
     shape = features.get(key, {}).get("shape")
     if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
         raise CheckpointError(f"the feature {key!r} has no shape of one number", where=where)
     return shape[0]
 
 
-def _cameras(features: Mapping[str, Mapping[str, Any]], where: str) -> list[str]:
+def cameras_in(features: Mapping[str, Mapping[str, Any]], where: str) -> list[str]:
     """Cameras in the model's order, without those that are never there: they are masked."""
     found = [
         key
@@ -167,40 +176,44 @@ def _transforms(
     size: Sequence[int],
     tokenizer: str | None,
 ) -> list[dict[str, Any]]:
-    height, width = size
-    numbers: dict[str, Any] = {
-        "type": "NormalizeStatesAndActions",
-        "norm_type": preparation.modes[ACTION],
-        "state_norm_type": preparation.modes[STATE],
-        "action_dim": model["max_action_dim"],
-        "epsilon": preparation.epsilon,
-        "epsilon_if_zero": preparation.epsilon_if_zero,
-    }
+    numbers = {**normalization(preparation), "action_dim": model["max_action_dim"]}
     if "max_state_dim" in model:
         numbers["state_dim"] = model["max_state_dim"]
         prompt: dict[str, Any] = {"type": "PreparePrompt", "clean": False}
     else:
         prompt = {"type": "PreparePromptWithState"}
+    return [*of_pictures(size), numbers, prompt, of_words(preparation, tokenizer)]
+
+
+def of_pictures(size: Sequence[int]) -> list[dict[str, Any]]:
+    """The transforms that bring pictures to ``size``, height and width."""
+    height, width = size
+    resize = {"type": "ResizeImagesWithPad", "height": height, "width": width}
+    return [{**resize, "interpolation": "linear"}, {"type": "SimpleNormalizeImages"}]
+
+
+def normalization(preparation: Preparation) -> dict[str, Any]:
+    """The transform that normalises, without widths that it pads to."""
+    return {
+        "type": "NormalizeStatesAndActions",
+        "norm_type": preparation.modes[ACTION],
+        "state_norm_type": preparation.modes[STATE],
+        "epsilon": preparation.epsilon,
+        "epsilon_if_zero": preparation.epsilon_if_zero,
+    }
+
+
+def of_words(preparation: Preparation, tokenizer: str | None) -> dict[str, Any]:
+    """The transform that makes tokens of the prompt."""
     path = tokenizer or preparation.tokenizer
-    return [
-        {
-            "type": "ResizeImagesWithPad",
-            "height": height,
-            "width": width,
-            "interpolation": "linear",
-        },
-        {"type": "SimpleNormalizeImages"},
-        numbers,
-        prompt,
-        {
-            "type": "ProcessPrompts",
-            "tokenizer": {"type": "PretrainedTokenizer", "model_path": path},
-            "max_len": preparation.max_length,
-        },
-    ]
+    return {
+        "type": "ProcessPrompts",
+        "tokenizer": {"type": "PretrainedTokenizer", "model_path": path},
+        "max_len": preparation.max_length,
+    }
 
 
-def _statistics(preparation: Preparation, widths: Mapping[str, int]) -> dict[str, Any]:
+def statistics_of(preparation: Preparation, widths: Mapping[str, int]) -> dict[str, Any]:
     """Of each of our entries; zeros and ones where nothing is normalised."""
     found: dict[str, Any] = {}
     for key, entry in KEYS.items():
@@ -216,7 +229,8 @@ def _statistics(preparation: Preparation, widths: Mapping[str, int]) -> dict[str
     return found
 
 
-def _notes(preparation: Preparation, tokenizer: str | None) -> list[str]:
+def notes_of(preparation: Preparation, tokenizer: str | None) -> list[str]:
+    """What a user should know of the import."""
     notes = []
     none = [key for key in KEYS if not preparation.statistics.get(key)]
     if none:

@@ -46,6 +46,8 @@ _KNOWN = {
     "to_batch_processor",
     "pi0_new_line_processor",
     "pi05_prepare_state_tokenizer_processor_step",
+    "pi0_fast_prepare_state_tokenizer_processor_step",
+    "action_tokenizer_processor",
     "tokenizer_processor",
     "device_processor",
     "relative_actions_processor",

@@ -67,6 +67,7 @@ def _joined(root: str) -> Layout:
         "projector.": f"{_PALIGEMMA}model.multi_modal_projector.linear.",
         "llm_backbone.": f"{_PALIGEMMA}model.language_model.",
         "llm_expert.": f"{_EXPERT}model.",
+        "lm_head.": f"{_PALIGEMMA}lm_head.",
     }
     unused = (f"{root}{_EXPERT}lm_head.weight",)
     return Layout(prefixes, root, unused, f"{root}{_PALIGEMMA}lm_head.weight", "vision_model.")

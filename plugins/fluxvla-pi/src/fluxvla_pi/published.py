@@ -9,18 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import Stored, safetensors_in
 from fluxvla_pi.flow_matching import PiFlowMatching
 from fluxvla_pi.names import Layout, actual_names, layout_of, sources
 from fluxvla_pi.pi0 import PI0FlowMatching
+from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.pi05 import PI05FlowMatching
 from fluxvla_pi.sizes import GEMMA, SIGLIP, GemmaSize, SiglipSize
 
+FAST = "pi0_fast"
 FAMILIES: Mapping[str, type[PiFlowMatching]] = {"pi0": PI0FlowMatching, "pi05": PI05FlowMatching}
 # Neither follows from shapes: all published towers have 16 heads, and all their code 1 key.
 VISION_HEADS, KEY_HEADS = 16, 1
+_EMBEDDING = "llm_backbone.embed_tokens.weight"
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,9 @@ class Weights:
     """The weights of a file.
 
     Args:
-        family: ``pi0`` or ``pi05``.
-        model: the config's table, without ``n_action_steps``, which no shape tells.
+        family: ``pi0``, ``pi05`` or ``pi0_fast``.
+        model: the config's table, without ``n_action_steps`` and, of PI0-FAST, ``action_dim`` and
+            ``tokenizer``, which no shape tells.
         tensors: by our names.
     """
 
@@ -53,10 +58,10 @@ def weights_in(folder: Path, besides: Iterable[str] = ()) -> Weights:
     layout = layout_of(tensors, where)
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
     found = _Shapes(shapes, layout, where)
-    family = "pi05" if found.has("time_mlp_in.weight") else "pi0"
+    family = found.family()
     table = found.table(family)
     with torch.device("meta"):
-        wanted = FAMILIES[family](**table).state_dict()
+        wanted = _built(family, table).state_dict()
     names = sources(wanted, tensors, where)
     wrong = [
         f"{theirs}: {shapes[theirs]}, expected {tuple(wanted[ours].shape)}"
@@ -65,7 +70,8 @@ def weights_in(folder: Path, besides: Iterable[str] = ()) -> Weights:
     ]
     if wrong:
         raise CheckpointError(f"tensors of another size: {'; '.join(wrong[:5])}", where=where)
-    model = {"type": FAMILIES[family].__name__, **table}
+    kind = PI0FAST if family == FAST else FAMILIES[family]
+    model = {"type": kind.__name__, **table}
     return Weights(family, model, {ours: tensors[theirs] for ours, theirs in names.items()})
 
 
@@ -80,17 +86,26 @@ class _Shapes:
     def has(self, ours: str) -> bool:
         return self._layout.theirs(ours) in self._shapes
 
+    def family(self) -> str:
+        """Which model it is: only some have a time or an expert."""
+        if not self.has("action_out_proj.weight") and not self.has("llm_expert.norm.weight"):
+            return FAST
+        return "pi05" if self.has("time_mlp_in.weight") else "pi0"
+
     def table(self, family: str) -> dict[str, Any]:
         """The model's arguments that shapes tell."""
-        action, _ = self._two("action_out_proj.weight")
         vocabulary, _ = self._two(self._embedding())
         table: dict[str, Any] = {
             "variant": _named(self._gemma("llm_backbone"), GEMMA),
-            "expert_variant": _named(self._gemma("llm_expert"), GEMMA),
             "vision_variant": _named(self._siglip(), SIGLIP),
-            "max_action_dim": action,
             "vocab_size": vocabulary,
         }
+        if family == FAST:
+            both = self.has(_EMBEDDING) and self.has("lm_head.weight")
+            return {**table, "tied_head": not both}
+        action, _ = self._two("action_out_proj.weight")
+        table["expert_variant"] = _named(self._gemma("llm_expert"), GEMMA)
+        table["max_action_dim"] = action
         if family == "pi0":
             table["max_state_dim"] = self._two("state_proj.weight")[1]
         return table
@@ -118,9 +133,9 @@ class _Shapes:
         return depth
 
     def _embedding(self) -> str:
-        name = "llm_backbone.embed_tokens.weight"
         head = self._layout.head
-        return name if self.has(name) or not head else head.removeprefix(self._layout.root)
+        known = self.has(_EMBEDDING) or not head
+        return _EMBEDDING if known else head.removeprefix(self._layout.root)
 
     def _two(self, ours: str) -> tuple[int, int]:
         rows, columns = self._shape(ours, 2)
@@ -137,6 +152,13 @@ class _Shapes:
                 cause="the file is damaged, or of another model",
             )
         return shape
+
+
+def _built(family: str, table: Mapping[str, Any]) -> nn.Module:
+    """The model, where its weights take no memory."""
+    if family != FAST:
+        return FAMILIES[family](**table)
+    return PI0FAST({}, words={"vocab_size": table["vocab_size"]}, **table)
 
 
 def _named(size: Any, known: Mapping[str, Any]) -> Any:

@@ -104,3 +104,76 @@ def first_noise():
     """``(1, T, D)``: what a policy here draws in an episode of ``SEED`` for its first chunk."""
     generator = np.random.Generator(np.random.Philox(key=np.array([SEED, 0], np.uint64)))
     return generator.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32)
+
+
+# -- PI0-FAST ------------------------------------------------------------------------------------
+
+FAST_WORDS, FAST_VOCABULARY = 576, 288
+FAST_TOKENS, FAST_STEPS = 24, 12
+_FAST_TEXT = ["<pad>", "<eos>", "<bos>", "<unk>", *LETTERS, "|"]
+ACTION_WORDS = {
+    "vocab_size": FAST_WORDS,
+    "skipped": 128,
+    "bos": 2,
+    "begin": [_FAST_TEXT.index(letter) for letter in "Action: "],
+    "stop": _FAST_TEXT.index("|"),
+    "eos": 1,
+}
+FAST_SIZES = {
+    "variant": GEMMA,
+    "vision_variant": VISION,
+    "vocab_size": FAST_WORDS,
+    "n_action_steps": HORIZON,
+    "action_dim": ROBOT_ACTIONS,
+    "words": ACTION_WORDS,
+    "max_decoding_steps": FAST_STEPS,
+}
+
+
+def fast_text_tokenizer(template="<bos> $A"):
+    """As :func:`tokenizer`, with more words, which no text has: they are for actions."""
+    from tokenizers import Regex, Tokenizer, models, pre_tokenizers, processors
+
+    words = [*_FAST_TEXT, *(f"<word{i}>" for i in range(len(_FAST_TEXT), FAST_WORDS))]
+    made = Tokenizer(models.WordLevel({w: i for i, w in enumerate(words)}, unk_token="<unk>"))
+    made.pre_tokenizer = pre_tokenizers.Split(Regex(r"[\s\S]"), "isolated")
+    special = [(word, words.index(word)) for word in ("<bos>", "<eos>") if word in template]
+    made.post_processor = processors.TemplateProcessing(template, None, special)
+    made.add_special_tokens(_FAST_TEXT[:4])
+    return made
+
+
+def fast_chunks():
+    """What the FAST tokenizer is fitted to: ``(400, T, D)``."""
+    return 2 * fill.normal("fast.chunks", (400, HORIZON, ROBOT_ACTIONS))
+
+
+def fast_inputs():
+    """A batch as :func:`inputs`; answers have 24, 13 and 18 tokens."""
+    found = inputs()
+    real = np.arange(FAST_TOKENS)[None] < np.array([[24], [13], [18]])
+    tokens = fill.integers("action_tokens", (BATCH, FAST_TOKENS), FAST_WORDS)
+    tokens[:, 0] = ACTION_WORDS["bos"]
+    return {
+        **{key: found[key] for key in ("images", "img_masks", "lang_masks")},
+        "lang_tokens": fill.integers("fast.lang_tokens", (BATCH, WORDS), FAST_WORDS),
+        "action_tokens": np.where(real, tokens, 0),
+        "action_token_masks": real,
+    }
+
+
+def fast_answers(ids):
+    """Answers as a model may give them, ``ids`` being a chunk's of the FAST tokenizer."""
+    last = FAST_WORDS - 1 - ACTION_WORDS["skipped"]
+    begin, stop = ACTION_WORDS["begin"], ACTION_WORDS["stop"]
+    chunk = [last - i for i in ids]
+    return {
+        "whole": [*begin, *chunk, stop, ACTION_WORDS["eos"]],
+        "without_stop": [*begin, *chunk],
+        "too_short": [*begin, *chunk[: len(chunk) // 2], stop],
+        "too_long": [*begin, *chunk, *chunk, stop],
+        "begun_twice": [*begin, *chunk[:4], *begin, *chunk[4:], stop],
+        "with_words": [*begin, *chunk[:3], 9, 12, *chunk[3:], stop],
+        "beyond_the_last": [*begin, *chunk[:3], FAST_WORDS - 1, *chunk[3:], stop],
+        "nothing": [stop, *chunk],
+    }

@@ -83,8 +83,8 @@ class UROperator(RosOperator):
         gripper_message: type of its state and command: std_msgs ``Float64`` or ``Float32``.
         trajectory_time_s: with a trajectory controller, how far ahead each target is set.
         camera_rate_hz: images a second that should come; None: as many as are sent.
-        domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s: see
-            ``fluxvla_core.ros2.RosOperator``.
+        **connection: as ``fluxvla_core.ros2.RosOperator`` takes it: ``domain_id``, how long to wait
+            for streams, how old they may be.
 
     Raises:
         ConfigError: an unknown model or controller, or a value out of its range.
@@ -117,16 +117,9 @@ class UROperator(RosOperator):
         gripper_message: str = FLOAT64,
         trajectory_time_s: float = 0.1,
         camera_rate_hz: float | None = None,
-        domain_id: int | None = None,
-        connect_timeout_s: float = 10.0,
-        max_age_s: float = 0.5,
-        max_skew_s: float = 0.1,
-        sync_on: str = "stamp",
-        rate_window_s: float = 1.0,
+        **connection: Any,
     ) -> None:
-        super().__init__(
-            domain_id, connect_timeout_s, max_age_s, max_skew_s, sync_on, rate_window_s
-        )
+        super().__init__(**connection)
         if controller not in CONTROLLERS:
             raise ConfigError(
                 f"unknown controller {controller!r}; known are {', '.join(CONTROLLERS)}"

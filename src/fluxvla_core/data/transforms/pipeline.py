@@ -124,12 +124,10 @@ def declared(thing: object, name: str, method: str) -> Any:
     return vars(owner).get(name)
 
 
-def redirected(
-    transforms: Sequence[Mapping[str, Any]], processors: Path
-) -> list[Mapping[str, Any]]:
-    """``transforms`` with the tokenizers that a checkpoint's ``processors`` folder has."""
+def redirected(tables: Sequence[Mapping[str, Any]], processors: Path) -> list[Mapping[str, Any]]:
+    """``tables`` with the tokenizers that a checkpoint's ``processors`` folder has."""
     saved = _saved(processors)
-    return [_redirect(table, saved) for table in transforms]
+    return [_redirect(table, saved) for table in tables]
 
 
 def _saved(folder: Path) -> dict[str, str]:

@@ -1,4 +1,5 @@
-"""Prompts of PaliGemma policies: the instruction as PI0 reads it, or with the state, as PI0.5 does.
+"""Prompts of PaliGemma policies: the instruction as PI0 reads it, or with the state, as PI0.5 and
+PI0-FAST do.
 
 The texts are those of openpi's ``PaligemmaTokenizer``; ``ProcessPrompts`` makes tokens of them.
 """
@@ -39,13 +40,14 @@ class PreparePrompt(Transform):
 
 
 class PreparePromptWithState(Transform):
-    """Add ``prompt``: ``Task: <instruction>, State: <numbers>;``, a newline and ``Action: ``.
+    """Add ``prompt``: ``Task: <instruction>, State: <numbers>;``, a newline and ``ending``.
 
     The numbers are the bins of the normalised ``states``: 256 equal ones from -1 to 1, and -1 below
     them. So it belongs after the normalisation.
 
     Args:
         state_dim: so many of the states, where they are padded; all if None.
+        ending: ``Action: `` for PI0.5; nothing for PI0-FAST, whose answer begins with it.
 
     Raises:
         ConfigError: there is no instruction, or there are fewer states.
@@ -53,12 +55,13 @@ class PreparePromptWithState(Transform):
 
     keeps_images = True
 
-    def __init__(self, state_dim: int | None = None) -> None:
+    def __init__(self, state_dim: int | None = None, ending: str = "Action: ") -> None:
         if state_dim is not None and state_dim < 1:
             raise ConfigError(
                 f"PreparePromptWithState: state_dim must be at least 1, got {state_dim}"
             )
         self.state_dim = state_dim
+        self.ending = ending
 
     def __call__(self, sample: Sample) -> Sample:
         text = cleaned(_instruction(sample, type(self).__name__))
@@ -69,7 +72,7 @@ class PreparePromptWithState(Transform):
                 f"{len(states)} states"
             )
         numbers = " ".join(map(str, state_bins(states[: self.state_dim])))
-        return {**sample, "prompt": f"Task: {text}, State: {numbers};\nAction: "}
+        return {**sample, "prompt": f"Task: {text}, State: {numbers};\n{self.ending}"}
 
 
 def cleaned(text: str) -> str:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import queue
-import signal
-import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -32,23 +29,22 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.process import launch
+from fluxvla_core.robot.process.control_process import (
+    END_S,
+    HUNG_S,
+    ControlProcess,
+    ControlProcessGone,
+    stop_through_new_connection,
+)
 from fluxvla_core.robot.process.event_messages import event_of
-from fluxvla_core.robot.process.launch import ControlProcessGone
-from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
-from fluxvla_core.robot.process.server import LinkServer
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
 from fluxvla_core.robot.tasks import Task
 
 _START_S = 30.0
 _WATCH_S = 0.02
-# For how long the control process may not run before it is given up.
-_HUNG_S = 1.0
-# For how long a connection that is only made to stop the robot, or an orderly end, may take.
-_END_S = 2 * STOP_S + 1.0
 
 
 class RemoteEngine(Engine):
@@ -81,14 +77,10 @@ class RemoteEngine(Engine):
         self._make_client = make_client
         self._latch, self._interrupts, self._reporter = latch, interrupts, reporter
         self._history = history
-        self._link: Link
-        self._process: subprocess.Popen[bytes] | None = None
-        self._server: LinkServer
+        self._started: ControlProcess | None = None
         self._observers: Sequence[EpisodeObserver] = ()
         self._ended_at: float | None = None
-        self._lost = 0
         self._steps = 0
-        self._holding = False
         self._facts: Mapping[str, Any] = {}
 
     # The contract.
@@ -112,7 +104,7 @@ class RemoteEngine(Engine):
         self._observers, self._steps, self._ended_at = observers, 0, None
         settings, now = self._settings, self._robot.clock.now
         self._latch.check()
-        if self._process is None:
+        if not self._runs:
             # It was lost, and a person says that the robot may move again.
             self._start()
         self._emit(EpisodePrepared(now(), task, seed, settings.rate_hz))
@@ -121,49 +113,49 @@ class RemoteEngine(Engine):
             self._emit(EpisodeStarted(now(), task))
             # Compared with commands in the control process.
             tracking = TrackingWatch(self._robot.embodiment, settings.safety)
-            self._server.begin(self._make_client(task, seed, tracking, self._emit))
+            self._process.server.begin(self._make_client(task, seed, tracking, self._emit))
             self._play(task, number, seed, folder)
         except ControlProcessGone as gone:
             self._note_gone(gone)
             raise
         finally:
-            self._server.end()
+            self._process.server.end()
             self._interrupts.deferred = False
         self._interrupts.resume()
 
     @property
     def holding(self) -> bool:
-        return self._holding
+        return self._started is not None and self._started.holding
 
     def hold(self) -> None:
         try:
             self._dispatch(_WATCH_S)
         except ControlProcessGone as gone:
-            failure = launch.stop_through_new_connection(self._setup, self._reporter, _END_S)
+            failure = stop_through_new_connection(self._setup, self._reporter, END_S)
             self._latch.trip(gone.rule, gone)
             now = self._robot.clock.now()
             self._emit(StoppedWhileHeld(now, self._latch.trips[-1], failure))
             raise
 
     def release(self) -> None:
-        self._holding = False
-        if self._process is not None:
+        self._let_go()
+        if self._runs:
             self._order(Kind.RELEASE, STOP_S)
 
     def rearm(self) -> None:
         self._latch.rearm()
-        if self._process is not None:
+        if self._runs:
             self._order(Kind.REARM, STOP_S)
 
     def episode_facts(self) -> Mapping[str, Any]:
         return self._facts
 
     def stop(self) -> str | None:
-        self._holding = False
-        return None if self._process is None else self._ordered_stop(Kind.STOP)
+        self._let_go()
+        return self._ordered_stop(Kind.STOP) if self._runs else None
 
     def close(self) -> str | None:
-        failure = self._end(_END_S) if self._process is not None else None
+        failure = self._process.end(END_S) if self._runs else None
         return self._robot.close() or failure
 
     # Parts.
@@ -175,29 +167,35 @@ class RemoteEngine(Engine):
             FluxError: its side of the robot cannot be built, or cannot be connected to; or this
                 machine has no room for it.
         """
-        try:
-            cameras, frames = self._setup.cameras or (), self._frames
-            memory = None if frames is None else frames.open(cameras)
-            self._process, self._link = launch.launch(self._setup, memory)
-        except OSError as error:
-            raise RunFailed(
-                f"the control process could not be started: {error}",
-                cause="this machine has no memory or no process to spare",
-            ) from error
-        self._lost = 0
-        self._server = LinkServer(self._link, self._robot, self._interrupts)
+        self._started = ControlProcess(self._setup, self._robot, self._interrupts, self._frames)
         try:
             self._await(Kind.READY, _START_S)
             self._order(Kind.CONNECT, None)
         except BaseException:
             # Nothing was commanded yet.
-            if self._process is not None:
-                self._end(_HUNG_S)
+            if self._runs:
+                self._process.end(HUNG_S)
             raise
+
+    @property
+    def _process(self) -> ControlProcess:
+        """The control process that was started last; it may be dead."""
+        assert self._started is not None, "the control process was started"
+        return self._started
+
+    @property
+    def _runs(self) -> bool:
+        """Whether there is a control process, as far as is known."""
+        return self._started is not None and not self._started.ended
+
+    def _let_go(self) -> None:
+        """The arm is not held any more."""
+        if self._started is not None:
+            self._started.holding = False
 
     def _play(self, task: Task, number: int, seed: int, folder: Path) -> None:
         problem: BaseException | None = None
-        self._link.send(
+        self._process.link.send(
             Kind.PLAY,
             task=task.name,
             instruction=task.instruction,
@@ -213,7 +211,7 @@ class RemoteEngine(Engine):
             except Interrupted as interrupted:
                 problem = problem or interrupted
                 self._interrupts.stopping = True
-                self._link.send(Kind.SIGNAL, number=interrupted.number)
+                self._process.link.send(Kind.SIGNAL, number=interrupted.number)
                 continue
             except ControlProcessGone:
                 raise
@@ -222,14 +220,14 @@ class RemoteEngine(Engine):
                 if problem is None:
                     problem = error
                     self._interrupts.stopping = True
-                    self._link.send(Kind.FAULT, **_fault(error))
+                    self._process.link.send(Kind.FAULT, **_fault(error))
                 continue
             if done is not None and done["order"] == Kind.PLAY:
                 break
-        self.stop_failure, self._holding = done["stop_failure"], done["holding"]
+        self.stop_failure, self._process.holding = done["stop_failure"], done["holding"]
         self._facts = done["facts"]
-        if self._link.lost > self._lost:
-            lost, self._lost = self._link.lost - self._lost, self._link.lost
+        lost = self._process.newly_lost()
+        if lost:
             self._reporter.warn(f"{lost} commands were not recorded: this process did not keep up")
         if problem is not None:
             raise problem
@@ -245,7 +243,7 @@ class RemoteEngine(Engine):
 
     def _original(self, error: FluxError) -> BaseException | None:
         """The exception that was raised in this process and came back as ``error``, if any."""
-        known = [(e, error_fields(e)["what"]) for e in self._server.raised]
+        known = [(e, error_fields(e)["what"]) for e in self._process.server.raised]
         return next((e for e, what in known if error.what.startswith(what)), None)
 
     def _dispatch(self, timeout_s: float) -> Message | None:
@@ -257,12 +255,8 @@ class RemoteEngine(Engine):
         """
         until = time.monotonic() + timeout_s
         while True:
-            self._check_alive()
-            try:
-                message = self._server.messages.get(timeout=max(until - time.monotonic(), 0.0))
-            except queue.Empty:
-                return None
-            if message.kind == Kind.DONE:
+            message = self._process.receive(max(until - time.monotonic(), 0.0))
+            if message is None or message.kind == Kind.DONE:
                 return message
             self._handle(message)
 
@@ -278,9 +272,9 @@ class RemoteEngine(Engine):
             case Kind.RESET:
                 self._reply(message.kind, lambda: self._episode_client.reset())
             case Kind.ACCEPTED:
-                self._episode_client.accepted(self._server.answers.pop(fields["number"]))
+                self._episode_client.accepted(self._process.server.answers.pop(fields["number"]))
             case Kind.REFUSED:
-                self._episode_client.refused(self._server.answers.pop(fields["number"]))
+                self._episode_client.refused(self._process.server.answers.pop(fields["number"]))
             case Kind.INFO:
                 self._reporter.info(fields["text"])
             case Kind.WARN:
@@ -290,7 +284,7 @@ class RemoteEngine(Engine):
             case Kind.LOG:
                 logging.getLogger(fields["logger"]).log(fields["level"], "%s", fields["text"])
             case Kind.RELEASED:
-                self._holding = False
+                self._let_go()
                 raise error_of(fields)
             case Kind.FAILED:
                 raise error_of(fields)
@@ -298,7 +292,7 @@ class RemoteEngine(Engine):
     def _happened(self, event: Event) -> None:
         match event:
             case CommandSent(sent=sent, phase=phase):
-                self._server.phase, self._history.commanded = phase, sent.command
+                self._process.server.phase, self._history.commanded = phase, sent.command
                 if phase is Phase.RUN:
                     self._steps += 1
                     most = self._settings.max_steps
@@ -319,7 +313,7 @@ class RemoteEngine(Engine):
 
     @property
     def _episode_client(self) -> PolicyClient:
-        client = self._server.client
+        client = self._process.server.client
         assert client is not None, "the control process asks in an episode only"
         return client
 
@@ -330,10 +324,10 @@ class RemoteEngine(Engine):
         except Interrupted:
             raise
         except Exception as error:  # noqa: BLE001 - raised in the control process
-            self._server.raised.append(error)
-            self._link.send(Kind.REPLY, to=to, **error_fields(error))
+            self._process.server.raised.append(error)
+            self._process.link.send(Kind.REPLY, to=to, **error_fields(error))
             return
-        self._link.send(Kind.REPLY, () if found is None else (found,), to=to)
+        self._process.link.send(Kind.REPLY, () if found is None else (found,), to=to)
 
     def _order(self, order: Kind, timeout_s: float | None) -> Message:
         """Have an order carried out.
@@ -341,7 +335,7 @@ class RemoteEngine(Engine):
         Raises:
             FluxError: what went wrong with it.
         """
-        self._link.send(order)
+        self._process.link.send(order)
         done = self._await(Kind.DONE, timeout_s)
         if "error" in done.fields:
             raise error_of(done.fields)
@@ -351,70 +345,21 @@ class RemoteEngine(Engine):
         until = None if timeout_s is None else time.monotonic() + timeout_s
         while until is None or time.monotonic() < until:
             self._interrupts.check()
-            self._check_alive()
-            try:
-                message = self._server.messages.get(timeout=_WATCH_S)
-            except queue.Empty:
+            message = self._process.receive(_WATCH_S)
+            if message is None:
                 continue
             if message.kind == kind:
                 return message
             self._handle(message)
         raise RunFailed(f"the control process sent no {kind.value!r} within {timeout_s:g} s")
 
-    # Its end.
-
-    def _check_alive(self) -> None:
-        """See that the control process runs.
-
-        Raises:
-            ControlProcessGone: it does not; it is dead by now.
-        """
-        process = self._process
-        assert process is not None, "the control process was started"
-        code = process.poll()
-        if code is not None and self._server.messages.empty():
-            ended = f"ended with exit code {code}"
-            raise self._gone(ended if code >= 0 else f"was killed by {signal.Signals(-code).name}")
-        if code is None and not self._server.alive:
-            self._link.send(Kind.CLOSE)
-            try:
-                process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-            raise self._gone("stopped responding to this process and was ended")
-        patience_s, silent_s = self._patience_s(), self._link.silent_s()
-        if code is None and patience_s is not None and silent_s > patience_s:
-            process.kill()
-            raise self._gone(f"did not run for {silent_s:.1f} s and was killed")
-
-    def _patience_s(self) -> float | None:
-        """How long the control process may not run; None while it waits for the operator."""
-        if self._server.client is None:
-            return _HUNG_S if self._holding else None
-        phase = self._server.phase
-        if phase.stoppable:
-            return _HUNG_S
-        if phase in (Phase.HOLD, Phase.STOP):
-            # It may be in the operator's own stop.
-            return _HUNG_S + STOP_S
-        # The robot is being prepared, perhaps by a simulation that puts its objects in place.
-        return _HUNG_S + STOP_S if self._interrupts.stopping else None
-
-    def _gone(self, how: str) -> ControlProcessGone:
-        self._clean_up()
-        return ControlProcessGone(
-            f"the control process {how}: nothing commands the robot any more",
-            cause="somebody, or the system, ended it, or the robot's driver crashed it",
-            next="look at the robot; docs/control.md says what each robot does by itself then",
-        )
-
     def _note_gone(self, gone: ControlProcessGone) -> None:
         """Try the operator's own stop, and complete the record."""
         began = self._robot.clock.now()
-        self._holding = False
+        self._let_go()
         self._interrupts.stopping = True
-        self.stop_failure = failure = launch.stop_through_new_connection(
-            self._setup, self._reporter, _END_S
+        self.stop_failure = failure = stop_through_new_connection(
+            self._setup, self._reporter, END_S
         )
         if failure is not None:
             self._reporter.warn(failure)
@@ -425,38 +370,12 @@ class RemoteEngine(Engine):
 
     def _ordered_stop(self, order: Kind) -> str | None:
         try:
-            self._link.send(order)
+            self._process.link.send(order)
             done = self._await(Kind.DONE, STOP_S + 1.0)
         except Exception as error:  # noqa: BLE001 - reported; the rest of the end follows
             return str(error)
         failure: str | None = done.fields.get("result")
         return failure
-
-    def _end(self, patience_s: float) -> str | None:
-        """Have the process stop the robot, disconnect and end; what went wrong."""
-        assert self._process is not None, "the control process was started"
-        self._link.send(Kind.CLOSE)
-        failures: list[str] = []
-        try:
-            self._process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            failures = ["the control process did not end: use the robot's emergency stop"]
-        self._clean_up()
-        while not self._server.messages.empty():
-            message = self._server.messages.get()
-            if message.kind == Kind.CLOSED:
-                failures += [failure for failure in message["failures"] if failure]
-        return "; ".join(failures) or None
-
-    def _clean_up(self) -> None:
-        """End the thread of the link, after what the process sent last."""
-        assert self._process is not None, "the control process was started"
-        self._process.wait()
-        self._process = None
-        self._server.close()
-        if self._frames is not None:
-            self._frames.close()
 
 
 def _fault(error: BaseException) -> dict[str, Any]:

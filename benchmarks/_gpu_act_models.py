@@ -83,7 +83,7 @@ class Case:
             backbone = model.vlm_backbone
             side, words = backbone.image_size, GR00T_PROMPT
             text = torch.randint(0, 90, (1, words), generator=drawn)
-            places = torch.full((1, self.cameras * backbone.places), backbone.picture_token)
+            places = torch.full((1, self.cameras * backbone.tokens_per_image), backbone.picture_token)
             tokens = torch.cat([text[:, :8], places, text[:, 8:]], dim=1)
             found["states"] = torch.randn(1, model.vla_head.state_dim, generator=drawn)
         seen = torch.ones(tokens.shape, dtype=torch.bool)

@@ -176,11 +176,11 @@ def skew(session: nox.Session) -> None:
 
 @nox.session
 def py313(session: nox.Session) -> None:
-    """What needs no torch, on Python 3.13: configs, contracts, robots, hooks and kits."""
+    """What needs no torch, on Python 3.13: commands, configs, data, robots, evaluation, kits."""
     with Steps(session) as step:
         pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
         env = pythons.filled(ROOT, nox.project.dependency_groups(pyproject, "dev"), session.log)
-        words = session.posargs or pythons.TESTED
+        words = session.posargs or ["-n", PROCESSES, *FILES, *pythons.TESTED]
         step("pytest", lambda: env.run("pytest", *words, cwd=ROOT, env=rendering.VARIABLES))
 
 

@@ -270,6 +270,22 @@ table["Gone"] = table
     assert "entry point Gone = 'acme_made:Gone' names an object that does not exist" in line
 
 
+def test_an_installation_older_than_its_entry_points_is_told(
+    fluxvla: Fluxvla, install: Install, tmp_path: Path
+) -> None:
+    info = install("acme-desk", entry_points=entry("Desk", "desk"), files={"desk.py": DESK})
+    about = {"url": tmp_path.as_uri(), "dir_info": {"editable": True}}
+    (info / "direct_url.json").write_text(json.dumps(about))
+    points = '[project.entry-points."fluxvla.operators"]\nDesk = "desk:Desk"\nLamp = "desk:Lamp"'
+    (tmp_path / "pyproject.toml").write_text(f'[project]\nname = "acme-desk"\n{points}\n')
+    ended = fluxvla("plugins", "doctor", "--no-import", "--json")
+    found = [f for f in json.loads(ended.out)["findings"] if f["distribution"] == "acme-desk"]
+    text = "acme-desk 1.0: pyproject.toml changed since it was installed (+Lamp); run: "
+    text += f"pip install -e {tmp_path}"
+    told = {"kind": "stale", "problem": True, "distribution": "acme-desk", "text": text}
+    assert (ended.code, found) == (1, [told])
+
+
 def test_a_dependency_that_is_missing_is_named_though_nothing_imported_it(
     fluxvla: Fluxvla, install: Install, alone: Callable[[], None]
 ) -> None:

@@ -36,7 +36,7 @@ class Specimen(VLA, nn.Module):
         if self.training:
             self.scale *= 0.99
         found = self.plan(states)
-        return {"loss": (found - actions - 0.1 * noise).square().mean()}
+        return {"loss": (found - actions - 0.1 * noise.mean(1)).square().mean()}
     def plan(self, states):
         hidden = self.block(torch.tanh(self.enter(states)))
         return torch.unflatten(self.scale * self.head(hidden), 1, (4, 3))
@@ -47,7 +47,7 @@ class TestSpecimen(ModelConformance):
     entry_point = "Specimen"
     state_dim = 5
 """
-LOSS = 'return {"loss": (found - actions - 0.1 * noise).square().mean()}'
+LOSS = 'return {"loss": (found - actions - 0.1 * noise.mean(1)).square().mean()}'
 PREDICT = "return self.plan(states) + 0.1 * noise"
 TRAINING = (
     "forward_gives_a_loss", "every_trainable_parameter_gets_a_gradient", "it_learns_one_batch",

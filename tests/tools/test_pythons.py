@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import tomli
 
 from tools import project, pythons
 from tools.shell import StepFailed
@@ -48,4 +49,18 @@ def test_what_is_tested_is_there() -> None:
     names = {dist.name for dist in project.distributions()}
     assert set(pythons.PLUGINS) <= names
     paths = [word for word in pythons.TESTED if word.startswith(("tests/", "plugins/"))]
-    assert [word for word in paths if not (project.ROOT / word).exists()] == []
+    assert [
+        word for word in (*paths, *pythons.NEED_MORE) if not (project.ROOT / word).exists()
+    ] == []
+
+
+def test_classifiers_name_the_pythons_of_every_night() -> None:
+    """Of the core all of them, and of a plugin none that is not tested."""
+    prefix = "Programming Language :: Python :: 3."
+    for dist in project.distributions():
+        table = tomli.loads((dist.path / "pyproject.toml").read_text(encoding="utf-8"))
+        stated = table["project"].get("classifiers", [])
+        named = {one.removeprefix(prefix) for one in stated if one.startswith(prefix)}
+        minor = {f"3.{number}" for number in named}
+        assert minor <= set(pythons.NIGHTLY), dist.name
+        assert dist.path != project.ROOT or minor == set(pythons.NIGHTLY)

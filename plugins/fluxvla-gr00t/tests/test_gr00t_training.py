@@ -17,6 +17,7 @@ from fluxvla_core.testing.training import (
     run_ranks,
     tiny_config,
 )
+from fluxvla_core.training.footprint import fake, kept, kept_by_fake
 from tests.oracles import fill
 
 from .gr00t_sizes import PLACE, TINY_N15, TINY_N17
@@ -154,3 +155,25 @@ def test_it_learns_a_batch_and_only_what_is_not_frozen_moves(version, frozen):
     assert min(losses[-20:]) < 0.7 * losses[0]
     still = {n for n, p in model.named_parameters() if torch.equal(p, before[n])}
     assert still == {n for n in before if frozen and n.startswith("vlm_backbone.")}
+
+
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize(
+    ("version", "frozen"),
+    # Of N1.7 as a whole transformers reads the values of tokens.
+    [("n1.5", True), ("n1.5", False), ("n1.7", True)],
+)
+def test_a_dry_run_counts_what_its_training_keeps(version, frozen, dtype):
+    def made():
+        tiny = MODELS[version]
+        return GR00T(tiny["vlm_backbone"], tiny["vla_head"], frozen).train()
+
+    with torch.device("meta"):
+        bare = made()
+    samples = [Samples(version).get_sample(i, 0) for i in range(3)]
+    batch = {k: torch.from_numpy(np.stack([sample[k] for sample in samples])) for k in KEYS}
+    told, found = kept_by_fake(fake(bare), batch, dtype), kept(made(), batch, dtype)
+    assert found.activations > 0
+    assert told.activations == pytest.approx(found.activations, rel=0.01)
+    assert told.recomputed == pytest.approx(found.recomputed, rel=0.01)
+    assert told.weight_copies == found.weight_copies

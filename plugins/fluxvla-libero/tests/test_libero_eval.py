@@ -20,6 +20,7 @@ from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch, UsageError
 from fluxvla_core.evaluation import RolloutSettings, run_episode
 from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.operators import Camera, RunContext
+from fluxvla_core.results import open_recording
 
 SALAD = "pick_up_the_salad_dressing_and_place_it_in_the_basket"
 KETCHUP = "pick_up_the_ketchup_and_place_it_in_the_basket"
@@ -264,9 +265,14 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     videos = sorted(path.name for path in folder.glob("*.mp4"))
     assert videos == ["agentview.mp4", "robot0_eye_in_hand.mp4"]
     lines = [json.loads(line) for line in (folder / "trace.jsonl").read_text().splitlines()]
-    assert len(lines) == summary["steps"]
-    assert len(lines[0]["command"]) == 7
-    assert {line["phase"] for line in lines} == {"run"}
+    commands = [line for line in lines if line["event"] == "command"]
+    assert len(commands) == summary["steps"]
+    assert len(commands[0]["command"]) == 7
+    assert {line["phase"] for line in commands} == {"run"}
+    assert (lines[0]["event"], lines[-1]["event"]) == ("start", "end")
+    recorded = open_recording(folder)
+    assert recorded.whole
+    assert recorded.embodiment.name == summary["embodiment"]
     assert f"success after {summary['steps']} steps" in listener.lines
     shown = images[0].read()
     assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")

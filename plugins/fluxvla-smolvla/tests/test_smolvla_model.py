@@ -111,6 +111,74 @@ def test_what_padding_the_old_chunk_has_does_not_matter():
     assert torch.equal(*found)
 
 
+def several_draws():
+    """A batch with two draws of noise and time a sample."""
+    batch, drawn = model_batch(), np.random.default_rng(1)
+    shape = (3, 2, HORIZON, WIDTH)
+    batch["noise"] = torch.from_numpy(drawn.normal(size=shape)).float()
+    batch["time"] = torch.from_numpy(drawn.uniform(size=(3, 2))).float()
+    return batch
+
+
+def test_a_prefix_of_no_actions_changes_nothing():
+    batch, none = several_draws(), torch.zeros(3, 2, dtype=torch.int64)
+    with torch.no_grad():
+        free = tiny_model()(**batch)["loss"]
+        found = tiny_model(prefix_conditioning=True)(**batch, prefix_len=none)["loss"]
+    torch.testing.assert_close(found, free)
+
+
+def test_actions_of_a_prefix_are_given_without_noise_and_not_counted():
+    model = tiny_model(prefix_conditioning=True, loss_mean="all")
+    batch, length = several_draws(), torch.tensor([[2, 0], [5, 1], [3, 4]])
+    batch["action_masks"] = torch.ones(3, HORIZON)
+    given = torch.arange(HORIZON) < length[..., None]
+    observed = [batch[key] for key in ("images", "img_masks", "lang_tokens", "lang_masks")]
+    total = 0.0
+    with torch.no_grad():
+        found = model(**batch, prefix_len=length)
+        other = {**batch, "noise": torch.where(given[..., None], 9.0, batch["noise"])}
+        torch.testing.assert_close(model(**other, prefix_len=length)["loss"], found["loss"])
+        # By hand: the velocity at what is half known, errors of the rest over all.
+        cache = model._encode_prefix(*observed, batch["states"])
+        for k in range(2):
+            t = torch.where(given[:, k], 0.0, 1 - batch["time"][:, k : k + 1])
+            x = torch.lerp(batch["actions"], batch["noise"][:, k], t[..., None])
+            velocity = model._velocity(x, t, cache)
+            errors = (batch["noise"][:, k] - batch["actions"] - velocity).square()
+            total += (errors * ~given[:, k, :, None])[..., :ACTION].sum().item()
+    assert found["loss"].item() == pytest.approx(total / (3 * 2 * HORIZON * ACTION), rel=1e-5)
+
+
+def test_a_chunk_continues_by_its_prefix():
+    model, (batch, noise) = tiny_model(prefix_conditioning=True), asked()
+    old = torch.from_numpy(np.random.default_rng(0).normal(size=(3, HORIZON, WIDTH))).float()
+    more = {
+        "prev_actions": old,
+        "prefix_weights": torch.ones(3, HORIZON),
+        "prefix_len": torch.tensor([2, 0, 3]),
+        "max_guidance_weight": torch.full((3,), 5.0),
+    }
+    with torch.no_grad():
+        found = model.predict_action(**batch, noise=noise, **more)
+        free = model.predict_action(**batch, noise=noise)
+        later = {**more, "prev_actions": old.clone()}
+        later["prev_actions"][0, 2:] = 9.0
+        assert torch.equal(model.predict_action(**batch, noise=noise, **later), found)
+    assert torch.equal(found[0, :2], old[0, :2])
+    assert torch.equal(found[2, :3], old[2, :3])
+    assert relative(found[1], free[1]) < 1e-5
+    assert not torch.allclose(found[0, 2:], free[0, 2:])
+
+
+def test_prefixes_and_the_model_belong_together():
+    length = torch.zeros(3, 1, dtype=torch.int64)
+    with pytest.raises(ConfigError, match="prefix_conditioning is True, and the batch has no"):
+        tiny_model(prefix_conditioning=True)(**model_batch())
+    with pytest.raises(ConfigError, match="prefix_conditioning is False, and the batch has a"):
+        tiny_model()(**model_batch(), prefix_len=length)
+
+
 def test_units_to_shard_are_disjoint():
     units = tiny_model().fsdp_units()
     seen = [id(p) for unit in units for p in unit.parameters()]

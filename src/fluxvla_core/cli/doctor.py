@@ -31,6 +31,7 @@ Kind = Literal[
     "unread group",
     "collision",
     "shadowed",
+    "stale",
     "cannot work",
     "requirement",
     "import",
@@ -124,7 +125,11 @@ def findings(no_import: bool, limit_s: float) -> Iterator[Finding]:
     Args:
         limit_s: seconds that one import may take.
     """
+    from fluxvla_core.plugins.editable import stale
+
     yield from collisions()
+    for one in stale(index()):
+        yield Finding("stale", True, one.dist, str(one))
     yield from _requirements()
     importable = []
     for plugin in _read_groups():

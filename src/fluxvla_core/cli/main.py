@@ -194,9 +194,9 @@ def dispatch(argv: list[str]) -> int:
     if argv[0] in plugins:
         return execute(argv[0], plugins.get(argv[0]), argv[1:])
     from fluxvla_core.plugins import first_party
-    from fluxvla_core.plugins.load import in_unread_group
+    from fluxvla_core.plugins.load import not_read
 
-    unread = in_unread_group(argv[0])
+    unread = not_read(argv[0])
     if unread:
         raise UsageError(f"no command {argv[0]!r}; {unread}", next="fluxvla --help")
     owner = first_party.owner("commands", argv[0])

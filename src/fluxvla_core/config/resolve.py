@@ -20,7 +20,7 @@ from fluxvla_core.errors import (
 )
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin
-from fluxvla_core.plugins.load import LIST, core_provides, find, in_unread_group, locate, unmet
+from fluxvla_core.plugins.load import LIST, core_provides, find, locate, not_read, unmet
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import PREFIX, check_api
 
@@ -164,7 +164,7 @@ def _only_registry(name: str) -> str:
             next="write '<distribution>:<name>', or put it under a key that says it",
         )
     short = name.rpartition(":")[2]
-    unread = in_unread_group(short)
+    unread = not_read(short)
     if unread:
         raise MissingPlugin(f"no plugin named {name!r} in any registry; {unread}", next=LIST)
     for registry in SEARCHED:

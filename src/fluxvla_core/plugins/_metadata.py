@@ -152,7 +152,7 @@ def index() -> Index:
             if key in names:  # shadowed by an earlier sys.path entry
                 continue
             names.add(key)
-            if not _wanted(key):
+            if not wanted(key):
                 continue
             version, requires = about.version, tuple(about.requires or ())
             if not version:
@@ -371,7 +371,7 @@ def _importlib_metadata() -> Any:
     return metadata
 
 
-def _wanted(dist: str) -> bool:
+def wanted(dist: str) -> bool:
     if dist == CORE:
         return True
     only, block = os.environ.get("FLUXVLA_PLUGINS"), os.environ.get("FLUXVLA_BLOCK", "")

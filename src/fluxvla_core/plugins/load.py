@@ -86,7 +86,7 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     installed = sorted({n for g, n in _metadata.index().plugins if g == group} | set(also))
     text = f"no {group} plugin named {name!r}"
     provider = first_party.owner(registry, short)
-    unread = in_unread_group(short)
+    unread = not_read(short)
     if unread:
         text += f"; {unread}"
     elif provider:
@@ -104,12 +104,18 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
     return (f"{text}\n  installed: {', '.join(installed) or '(none)'}",)
 
 
-def in_unread_group(name: str) -> str:
-    """What to say of a plugin called ``name`` that stands in a group that nothing reads, or ""."""
+def not_read(name: str) -> str:
+    """What to say of a plugin called ``name`` that is somewhere, and not to be found, or "".
+
+    It stands in a group that nothing reads, or in a ``pyproject.toml`` that changed since the
+    distribution was installed.
+    """
     for (group, found), providers in sorted(_metadata.index().plugins.items()):
         if found == name and group not in GROUPS:
             return unread_group(providers[0])
-    return ""
+    from fluxvla_core.plugins.editable import named_since
+
+    return named_since(name, _metadata.index())
 
 
 def unread_group(plugin: Plugin) -> str:

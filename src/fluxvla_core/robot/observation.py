@@ -18,7 +18,7 @@ from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import Event, Observed, Refused, RobotReading
-from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.robot import Robot, as_state, is_number
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 

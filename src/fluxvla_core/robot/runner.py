@@ -36,7 +36,6 @@ from fluxvla_core.robot.control.sender import Execute, check_pose
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.events import HookObserver
-from fluxvla_core.robot.make_engine import RunParts, make_engine
 from fluxvla_core.robot.observation import fit_cameras
 from fluxvla_core.robot.options import (
     InferenceOptions,
@@ -45,12 +44,14 @@ from fluxvla_core.robot.options import (
     check_state_dim,
     checked_rate,
 )
-from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.process_layout import (
     ControlTables,
     ProcessLayout,
     RunnerOverrides,
+    RunParts,
     choose_layout,
+    make_engine,
 )
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore

@@ -18,7 +18,7 @@ from fluxvla_core.robot.control.policy_client import PolicyFailed
 from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.events import EpisodeObserver
-from fluxvla_core.robot.policy_calls import PolicyThread
+from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
 _POLL_S = 0.02

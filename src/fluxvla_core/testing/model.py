@@ -29,6 +29,7 @@ from fluxvla_core.contracts.training import VLA
 from fluxvla_core.testing._conformance import Conformance, calling, capability, equal, numbers
 
 _CLOSE = 1e-4
+_REPEATS = 2
 # Keys of a batch that a robot's observations do not have.
 _LEARNT_FROM = ("actions", "action_masks", "time", "sample_ids")
 
@@ -102,6 +103,8 @@ class ModelConformance(Conformance):
     def batch(self, model: nn.Module, size: int = 2) -> dict[str, Tensor]:
         """``size`` samples with every key that datasets and transforms of the core give.
 
+        ``noise`` ``(B, K, T, D)`` and ``time`` ``(B, K)`` are as of ``SampleFlowNoise(repeats=2)``;
+        ``predict_action`` gets a ``noise`` ``(B, T, D)``.
         Override it for a model that takes other keys, or others of their shapes.
         """
         length, dim = self.shape_of(model)
@@ -116,8 +119,8 @@ class ModelConformance(Conformance):
             "embodiment_ids": torch.zeros(size, dtype=torch.int64),
             "actions": torch.randn(size, length, dim, generator=draw),
             "action_masks": torch.ones(size, length),
-            "noise": torch.randn(size, length, dim, generator=draw),
-            "time": torch.rand(size, generator=draw),
+            "noise": torch.randn(size, _REPEATS, length, dim, generator=draw),
+            "time": torch.rand(size, _REPEATS, generator=draw),
             "sample_ids": torch.arange(size),
         }
 
@@ -142,6 +145,8 @@ class ModelConformance(Conformance):
         parameters = inspect.signature(method).parameters.values()
         everything = any(p.kind is p.VAR_KEYWORD for p in parameters)
         batch = {k: v for k, v in self.batch(model, size).items() if k not in _LEARNT_FROM}
+        shape, draw = (size, *self.shape_of(model)), torch.Generator().manual_seed(2)
+        batch["noise"] = torch.randn(shape, generator=draw)
         named = {p.name for p in parameters}
         lacks = [
             p.name

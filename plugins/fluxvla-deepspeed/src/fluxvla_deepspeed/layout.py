@@ -48,7 +48,8 @@ def _flat(model: nn.Module, stage: int, processes: int) -> Layout:
 
 
 def _split(model: nn.Module, processes: int) -> Layout:
-    """Stage 3: a part of every weight, frozen ones too; small ones are whole besides."""
+    """Stage 3: a part of every weight, frozen ones too; small ones are whole besides. Of the parts
+    that are trained the optimizer has a copy."""
 
     def part(parameter: nn.Parameter) -> int:
         return math.ceil(parameter.numel() / processes)
@@ -60,7 +61,7 @@ def _split(model: nn.Module, processes: int) -> Layout:
     units = [sum(p.numel() for m in unit for p in m.parameters()) for unit in units_of(model)]
     largest = max([*units, *(p.numel() for p in parameters)])
     return Layout(
-        parameters=sum(part(p) for p in parameters) * FP32 + nbytes(model.buffers()),
+        parameters=(sum(map(part, parameters)) + sum(own)) * FP32 + nbytes(model.buffers()),
         gradients=sum(own) * FP32,
         optimized=[[bare((count,), torch.float32)] for count in own],
         gathered=(small + largest + PREFETCHED + BUCKET) * FP32,

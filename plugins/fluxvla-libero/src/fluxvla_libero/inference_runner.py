@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from fluxvla_core.operators import (
     task_source,
     tasks,
 )
+from fluxvla_core.results import episode_log
 from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
 from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import TRIALS
@@ -179,37 +180,24 @@ class LiberoInferenceRunner:
         reporter.info(f"{asked.instruction!r} in the scene of {where.name}")
         environment = self._environment(None if task is not None else asked.instruction)
         spec, body = environment.spec, environment.spec.embodiment
-        trace = EpisodeTrace(
-            next_folder(Path(self.context.work_dir) / FOLDER, asked.name), self.record_fps
+        folder = next_folder(Path(self.context.work_dir) / FOLDER, asked.name)
+        record = _Record(EpisodeTrace(folder, self.record_fps), self._videos, show)
+        record.write(
+            episode_log.START,
+            0.0,
+            format=episode_log.FORMAT,
+            task=asked.name,
+            instruction=asked.instruction,
+            seed=self._rollout.policy_seed,
+            robot="LIBERO",
+            embodiment=body.to_dict(),
+            rate_hz=CONTROL_HZ,
+            lockstep=True,
+            native=False,
+            began=time.time(),
         )
-        stride = round(CONTROL_HZ / self.record_fps)
-
-        def record_step(world: Any, steps: int) -> None:
-            if steps:
-                t = steps / CONTROL_HZ
-                event = {"event": "command", "t": t, "phase": "run", "command": world.action}
-                trace.write({**event, "clamps": [], "state": world.state})
-            if steps % stride == 0:
-                images = world.observe(self._videos)["images"]
-                trace.frames(images)
-                show(list(images.values()))
-
-        summary: dict[str, Any] = {
-            "format": "fluxvla-episode-1",
-            "task": asked.name,
-            "instruction": asked.instruction,
-            "scene": where.name,
-            "init_state": self.init_state,
-            "seed": self._rollout.policy_seed,
-            "robot": "LIBERO",
-            "embodiment": body.name,
-            "joints": list(body.joint_names),
-            "rate_hz": CONTROL_HZ,
-            "lockstep": True,
-            "render": self.render,
-            "outcome": "failed",
-            "success": None,
-        }
+        about = {"scene": where.name, "init_state": self.init_state, "render": self.render}
+        end: dict[str, Any] = {"outcome": "failed", "success": None, "problem": None}
         try:
             other = None if task in (None, where) else spec.task(task.name)
             found = run_episode(
@@ -219,25 +207,20 @@ class LiberoInferenceRunner:
                 self.init_state,
                 self._rollout,
                 other,
-                record_step,
+                record,
             )
             if found["problem"] is not None:
-                summary["problem"] = found["problem"]
-                raise RunFailed(found["problem"], where=str(trace.folder))
+                end["problem"] = found["problem"]
+                raise RunFailed(found["problem"], where=str(folder))
             success = None if task is None else found["behaviours"][task.name]
-            summary |= {
-                "outcome": "done" if success else "ended",
-                "success": success,
-                "steps": found["steps"],
-                "chunks": found["calls"],
-                "state_hash": found["state_hash"],
-            }
+            end |= {"outcome": "done" if success else "ended", "success": success}
+            about |= {"chunks": found["calls"], "state_hash": found["state_hash"]}
         finally:
-            trace.close(summary)
+            summary = record.close(end, about)
             environment.close()
         word = {True: "success", False: "no success", None: "success unknown"}[success]
         reporter.info(f"{word} after {found['steps']} steps")
-        reporter.artifact("episode", trace.folder)
+        reporter.artifact("episode", folder)
         return summary
 
     def _environment(self, instruction: str | None) -> LiberoEnvironment:
@@ -284,3 +267,39 @@ class LiberoInferenceRunner:
                 next="leave scene out, or choose another one",
             )
         return where, named[0] if named else None
+
+
+class _Record:
+    """Writes an episode in the format of a robot's: called at every step, then closed."""
+
+    def __init__(
+        self,
+        trace: EpisodeTrace,
+        cameras: Sequence[Camera],
+        show: Callable[[list[Any]], None],
+    ) -> None:
+        self._trace, self._cameras, self._show = trace, cameras, show
+        self._summary = episode_log.EpisodeSummary()
+        self._stride = round(CONTROL_HZ / (trace.video_fps or CONTROL_HZ))
+        self._t = 0.0
+
+    def write(self, kind: str, t: float, **fields: Any) -> None:
+        """One event at ``t`` seconds; arrays must not change afterwards."""
+        event = {"event": kind, "t": t, **fields}
+        self._trace.write(event)
+        self._summary.add(event)
+        self._t = t
+
+    def __call__(self, world: Any, steps: int) -> None:
+        if steps:
+            sent, t = {"command": world.action, "state": world.state}, steps / CONTROL_HZ
+            self.write(episode_log.COMMAND, t, phase="run", clamps=[], **sent)
+        if steps % self._stride == 0:
+            images = world.observe(self._cameras)["images"]
+            self._trace.frames(images)
+            self._show(list(images.values()))
+
+    def close(self, end: Mapping[str, Any], about: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the ``end`` event and ``episode.json``, which has ``about`` too; what it holds."""
+        self.write(episode_log.END, self._t, **end)
+        return self._trace.close({**self._summary.to_dict(), **about})

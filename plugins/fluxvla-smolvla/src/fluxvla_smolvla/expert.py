@@ -95,7 +95,8 @@ class Expert(nn.Module):
 
 
 class ActionTimeMLP(nn.Module):
-    """Noisy actions ``(B, T, D)`` and their time ``(B,)`` -> action tokens ``(B, T, width)``."""
+    """Noisy actions ``(B, T, D)`` and their time, ``(B,)`` or each its own ``(B, T)`` -> action
+    tokens ``(B, T, width)``."""
 
     def __init__(self, action_dim: int, width: int, shortest: float, longest: float) -> None:
         super().__init__()
@@ -110,7 +111,8 @@ class ActionTimeMLP(nn.Module):
         self.action_time_mlp_out = nn.Linear(width, width)
 
     def forward(self, noisy: Tensor, time: Tensor) -> Tensor:
-        return self.embed_at_time(noisy, self.time_features(time)[:, None])
+        features = self.time_features(time.flatten()).unflatten(0, time.shape)
+        return self.embed_at_time(noisy, features if time.ndim == 2 else features[:, None])
 
     def time_features(self, time: Tensor) -> Tensor:
         """Sinusoidal features ``(B, width)`` float64 of times ``(B,)``."""

@@ -92,6 +92,9 @@ class SmolVLA(VLA, nn.Module):
         loss_mean: ``valid``, as LeRobot: the mean over the steps that are inside their episodes;
             ``all``: steps beyond the end count as 0, which several processes, each with its own
             share of a batch, compute exactly as one process does.
+        prefix_conditioning: chunks that continue another are trained for and made by holding their
+            beginning (Black et al. 2025, arXiv 2512.05964); without, they are made by guidance.
+            Training takes ``prefix_len`` of ``SamplePrefixLength`` then.
         vlm_model_name: the backbone's name on the hub, which LeRobot looks up; for exports.
         pretrained_name_or_path: weights that a training starts from, as ``runner.init_from``.
 
@@ -117,6 +120,7 @@ class SmolVLA(VLA, nn.Module):
         train_expert_only: bool = True,
         train_state_proj: bool = True,
         loss_mean: str = "valid",
+        prefix_conditioning: bool = False,
         vlm_model_name: str = SMOLVLM2,
         pretrained_name_or_path: str | None = None,
     ) -> None:
@@ -141,6 +145,7 @@ class SmolVLA(VLA, nn.Module):
         self.n_action_steps, self.num_steps, self.loss_mean = n_action_steps, num_steps, loss_mean
         self.max_state_dim, self.max_action_dim = max_state_dim, max_action_dim
         self.ori_action_dim = max_action_dim if ori_action_dim is None else ori_action_dim
+        self.prefix_conditioning = prefix_conditioning
         self.image_size, self.width = vision_size.image_size, text_size.hidden_size
         self.pretrained_name_or_path = pretrained_name_or_path
         size = expert_size(text_size, experts, expert_width_multiplier)
@@ -168,6 +173,7 @@ class SmolVLA(VLA, nn.Module):
         action_masks: Tensor,
         noise: Tensor,
         time: Tensor,
+        prefix_len: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -179,21 +185,38 @@ class SmolVLA(VLA, nn.Module):
             states: ``(B, S)`` normalised; ``actions``: ``(B, T, D)`` normalised.
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)``; ``time``: ``(B, K)`` in 0..1, 1 being the data.
+            prefix_len: ``(B, K)`` int64: so many actions at the beginning are given, without noise,
+                and their errors count as 0, for ``prefix_conditioning``.
 
         Raises:
             DataError: an input of a width that the model does not have.
+            ConfigError: ``prefix_len`` without ``prefix_conditioning``, or the reverse.
         """
+        if self.prefix_conditioning != (prefix_len is not None):
+            raise ConfigError(
+                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
+                f"{'no' if prefix_len is None else 'a'} prefix_len",
+                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
+                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
+            )
         repeats, shape = noise.shape[1], self.action_shape
         _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
         _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
         cache = cache.repeat_interleave(repeats)
-        t = (1.0 - time)[..., None, None]
+        t, given = 1.0 - time, None
+        if prefix_len is not None:
+            given = self._first(prefix_len)
+            t = torch.where(given, 0.0, t[..., None])
+        share = t[..., None] if t.ndim == 3 else t[..., None, None]
         clean = actions[:, None]
-        noisy, target = t * noise + (1.0 - t) * clean, noise - clean
-        velocity = self._velocity(noisy.flatten(0, 1), t.flatten(), cache)
+        noisy, target = share * noise + (1.0 - share) * clean, noise - clean
+        velocity = self._velocity(noisy.flatten(0, 1), t.flatten(0, 1), cache)
         velocity = velocity.unflatten(0, (-1, repeats))
-        errors = (velocity.float() - target).square()[..., : self.ori_action_dim]
+        errors = (velocity.float() - target).square()
+        if given is not None:
+            errors = errors * ~given[..., None]
+        errors = errors[..., : self.ori_action_dim]
         loss, each = masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
@@ -215,23 +238,30 @@ class SmolVLA(VLA, nn.Module):
         Args:
             images, img_masks, lang_tokens, lang_masks, states: as of ``forward``.
             prev_actions: ``(B, T, D)`` normalised, to continue; the other three belong to it, see
-                ``fluxvla_models.guidance.Guide``.
+                ``fluxvla_models.guidance.Guide``. With ``prefix_conditioning`` ``prefix_len`` rows
+                are held, the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
 
         Raises:
             DataError: an input of a width that the model does not have.
         """
         _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
-        own = self.ori_action_dim
+        own = None if self.prefix_conditioning else self.ori_action_dim
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         if guide is None:
             seen = self.observe(images, img_masks, lang_tokens, lang_masks, states)
             return self.denoise(seen, noise, self.step_tables())
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
+        held = guide if self.prefix_conditioning else None
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
+            if held is not None:
+                x = held.freeze(x)
+                t = torch.where(self._first(held.frozen), 0.0, t[:, None])
             return self._velocity(x, t, cache).to(x.dtype)
 
+        if held is not None:
+            return held.freeze(sample(velocity, noise, self.num_steps))
         return sample(velocity, noise, self.num_steps, guide)
 
     def observe(
@@ -309,6 +339,10 @@ class SmolVLA(VLA, nn.Module):
         """``(B, 3, H, W)`` in -1..1 -> ``(B, tokens, width)``."""
         whole = resize_with_pad(images, self.image_size, self.image_size, BLACK)
         return self.connector(self.vision(whole))
+
+    def _first(self, length: Tensor) -> Tensor:
+        """``(..., T)``, True for the first ``length`` ``(...)`` actions of a chunk."""
+        return torch.arange(self.n_action_steps, device=length.device) < length[..., None]
 
     def _velocity(self, noisy: Tensor, t: Tensor, cache: KVCache) -> Tensor:
         return self._out(self.expert(self.embed_actions(noisy, t), cache))

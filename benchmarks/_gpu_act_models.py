@@ -83,8 +83,9 @@ class Case:
             backbone = model.vlm_backbone
             side, words = backbone.image_size, GR00T_PROMPT
             text = torch.randint(0, 90, (1, words), generator=drawn)
-            places = torch.full((1, self.cameras * backbone.places), backbone.picture_token)
-            tokens = torch.cat([text[:, :8], places, text[:, 8:]], dim=1)
+            count = self.cameras * backbone.tokens_per_image
+            image = torch.full((1, count), backbone.picture_token)
+            tokens = torch.cat([text[:, :8], image, text[:, 8:]], dim=1)
             found["states"] = torch.randn(1, model.vla_head.state_dim, generator=drawn)
         seen = torch.ones(tokens.shape, dtype=torch.bool)
         seen[:, -words // 4 :] = False

@@ -254,13 +254,13 @@ ROBOT = [
     Fault(
         "pictures of another size",
         change(CAM, height=24, width=32),
-        "sends 32x24 pictures",
+        "sends 32x24 images",
         rule="frame",
     ),
     Fault(
         "pictures without colours",
         change(CAM, encoding="16UC1"),
-        "sends 16UC1 pictures",
+        "sends 16UC1 images",
         rule="frame",
     ),
     Fault(

@@ -75,7 +75,7 @@ class TimedRunner(BaseTrainRunner):
         saver: Saver | None = self.saver
         began = time.perf_counter()
         if saver is not None:
-            saver.copied()
+            saver.wait_for_copies()
         if self.found:
             self.found[-1]["blocked_s"] += time.perf_counter() - began
         return super().optimizer_step()

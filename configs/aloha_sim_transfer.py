@@ -34,7 +34,7 @@ train_dataloader = dict(
         action_window_size=HORIZON,
         cache_frames=True,
         transforms=[
-            # Whatever a camera's size, the policy sees the table's part of a 144 x 192 picture.
+            # Whatever a camera's size, the policy sees the table's part of a 144 x 192 image.
             dict(type="ResizeImages", height=144, width=192),
             dict(type="CropImages", top=56, left=32, height=64, width=128),
             dict(type="NormalizeImages", means=[[127.5] * 3], stds=[[127.5] * 3]),

@@ -25,7 +25,7 @@ TASKS = {
 TRANSFORMS = [
     dict(
         type="ProcessPromptsWithImage",
-        max_len=900,  # 3 x 256 places for pictures, and the words
+        max_len=900,  # 3 x 256 places for images, and the words
         num_images=3,
         tokenizer=dict(type="PretrainedTokenizer", model_path=EAGLE),
     ),

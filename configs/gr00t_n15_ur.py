@@ -12,7 +12,7 @@ CAMERAS = ["cam_high", "cam_left_wrist"]
 TRANSFORMS = [
     dict(
         type="ProcessPromptsWithImage",
-        max_len=644,  # 2 x 256 places for pictures, and the words
+        max_len=644,  # 2 x 256 places for images, and the words
         num_images=2,
         tokenizer=dict(type="PretrainedTokenizer", model_path=EAGLE),
     ),

@@ -49,7 +49,7 @@ train_dataloader = dict(
             dict(type="ResizeCropImages", size=256, method="area"),
             dict(
                 type="ProcessQwenPrompts",
-                max_len=256,  # 2 x 64 places for pictures, and the words
+                max_len=256,  # 2 x 64 places for images, and the words
                 tokenizer=dict(type="PretrainedTokenizer", model_path=QWEN),
             ),
             dict(type="SimpleNormalizeImages"),

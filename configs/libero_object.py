@@ -35,7 +35,7 @@ train_dataloader = dict(
         action_window_size=HORIZON,
         cache_frames=True,
         transforms=[
-            # Whatever a camera's size, the policy sees the floor's part of a 128 x 128 picture.
+            # Whatever a camera's size, the policy sees the floor's part of a 128 x 128 image.
             dict(type="ResizeImages", height=128, width=128),
             dict(type="CropImages", top=32, left=0, height=64, width=128),
             dict(type="NormalizeImages", means=[[127.5] * 3], stds=[[127.5] * 3]),

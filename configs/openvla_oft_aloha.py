@@ -1,4 +1,4 @@
-"""OpenVLA-OFT+ on ALOHA: chunks of 25 joint targets, three pictures, FiLM.
+"""OpenVLA-OFT+ on ALOHA: chunks of 25 joint targets, three images, FiLM.
 
     fluxvla openvla-oft models/openvla-7b models/openvla-oft-aloha --robot aloha --action-dim 14 \
         --state-dim 14 --film

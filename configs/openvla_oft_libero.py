@@ -1,4 +1,4 @@
-"""OpenVLA-OFT on LIBERO: chunks of 8 actions by L1 regression, two pictures and the state.
+"""OpenVLA-OFT on LIBERO: chunks of 8 actions by L1 regression, two images and the state.
 
     fluxvla openvla-oft models/openvla-7b models/openvla-oft-libero --robot libero
     fluxvla run --config configs/openvla_oft_libero.py --section runner --nproc 8

@@ -1,4 +1,4 @@
-"""OpenVLA-OFT on a UR with one gripper: chunks of 10 joint targets, two pictures and the state.
+"""OpenVLA-OFT on a UR with one gripper: chunks of 10 joint targets, two images and the state.
 
     fluxvla openvla-oft models/openvla-7b models/openvla-oft-ur --robot aloha --horizon 10 \
         --cameras 2 --action-dim 7 --state-dim 7

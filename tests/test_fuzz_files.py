@@ -120,8 +120,8 @@ def dataset(root: Path) -> Path:
     with LeRobotWriter(root, 10, SPEC) as writer:
         for episode in range(2):
             for i in range(4):
-                picture = np.full((32, 32, 3), 20 * i, np.uint8)
-                writer.add_frame({"eye": picture}, [i, episode], [i, -i], f"do {episode}")
+                image = np.full((32, 32, 3), 20 * i, np.uint8)
+                writer.add_frame({"eye": image}, [i, episode], [i, -i], f"do {episode}")
             writer.save_episode()
     return root
 

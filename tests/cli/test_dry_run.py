@@ -112,7 +112,7 @@ def test_a_table_of_memory_that_fits_a_terminal(
     assert f"DryVLA: {WEIGHTS} parameters, {TRAINED} trained ({TRAINED / WEIGHTS:.1%})" in text
     assert "chunks of 4 actions, 3 wide" in text
     assert "images (5, 3, 16, 24) float32" in text
-    assert "pictures are assumed to be 480 x 640" in text
+    assert "images are assumed to be 480 x 640" in text
     assert "memory of each process in GB (1e9 bytes), computing in float32:" in text
     (head,) = (line.split() for line in lines if line.startswith("  processes"))
     assert head == ["processes", "1", "2", "4", "8"]

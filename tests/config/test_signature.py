@@ -226,7 +226,7 @@ class Base:
     """A base.
 
     Args:
-        height: of the picture
+        height: of the image
         width: of the base
     """
     height: int = 1
@@ -234,7 +234,7 @@ class Base:
 @dataclass
 class T(Base):
     width: int = 3
-    """Of the picture,
+    """Of the image,
     in pixels."""
     names: tuple[str, ...] = field(default=())
     rates: dict[str, float] = field(default_factory=dict)
@@ -242,7 +242,7 @@ class T(Base):
 ''',
     )
     assert signature is not None
-    assert signature.meanings == {"height": "of the picture", "width": "Of the picture, in pixels."}
+    assert signature.meanings == {"height": "of the image", "width": "Of the image, in pixels."}
     assert {p.name: p.text for p in signature.parameters} == {
         "height": ": int = 4",
         "width": ": int = 3",
@@ -574,7 +574,7 @@ def _line(text: str) -> int:
 DOCSTRING = """A class.
 
     Args:
-        height, width: of the pictures,
+        height, width: of the images,
             in pixels: both.
 
         rate (float): commands a second.
@@ -588,8 +588,8 @@ DOCSTRING = """A class.
 
 def test_the_arguments_of_a_docstring() -> None:
     assert argument_texts(DOCSTRING) == {
-        "height": "of the pictures, in pixels: both.",
-        "width": "of the pictures, in pixels: both.",
+        "height": "of the images, in pixels: both.",
+        "width": "of the images, in pixels: both.",
         "rate": "commands a second.",
         "options": "whatever the driver takes.",
     }

@@ -30,7 +30,7 @@ def make_spec(**changes: Any) -> EmbodimentSpec:
 
 @dataclass(frozen=True)
 class Take:
-    """What one episode was made of; pictures are smooth, so that lossy video stays near them."""
+    """What one episode was made of; images are smooth, so that lossy video stays near them."""
 
     key: int
     task: str

@@ -152,7 +152,7 @@ def test_pictures_that_are_not_in_the_tables(dataset):
         "names": None,
     }
     edit_info(dataset, features=info["features"])
-    words = r"observation\.images\.side holds null, not the bytes of pictures"
+    words = r"observation\.images\.side holds null, not the bytes of images"
     with pytest.raises(DataError, match=words):
         ParquetDataset(str(dataset), [], ["side"])
     info["features"]["observation.images.side"]["shape"] = [32, 48, 1]
@@ -390,7 +390,7 @@ def test_tables_of_more_rows_than_expected_are_not_unpacked(dataset):
         ({"features": {"a": {"dtype": 3, "shape": [1]}}}, "features.a.dtype"),
         ({"features": {"a": {"dtype": "float32", "shape": "3"}}}, "features.a.shape"),
         ({"features": {"a": {"dtype": "float32", "shape": [-1]}}}, "features.a.shape.0"),
-        ({"features": {"a": {"dtype": "video", "shape": [3]}}}, "features.a.shape: a picture is"),
+        ({"features": {"a": {"dtype": "video", "shape": [3]}}}, "features.a.shape: an image is"),
         ({"features": {"a": {"dtype": "image", "shape": [20000, 20000, 3]}}}, "each side from 1"),
         ({"features": {"a": {"dtype": "image", "shape": [16000, 16000, 3]}}}, "64 million pixels"),
         ({"total_frames": "28"}, "total_frames"),

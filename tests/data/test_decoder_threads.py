@@ -20,7 +20,7 @@ FPS = 30
 
 @pytest.fixture(scope="module")
 def movies(tmp_path_factory):
-    """Three files of 20 flat pictures; picture ``i`` of file ``k`` is as grey as ``60 k + 3 i``."""
+    """Three files of 20 flat images; image ``i`` of file ``k`` is as grey as ``60 k + 3 i``."""
     folder = tmp_path_factory.mktemp("movies")
     for k in range(3):
         encoder = EpisodeEncoder(folder / f"{k}.mp4", 16, 16, FPS, find_codec("h264"))

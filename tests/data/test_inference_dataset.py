@@ -112,9 +112,9 @@ def test_statistics_may_be_a_checkpoints_file(stats, tmp_path):
     [
         (
             {"images": {"top": observe()["images"]["top"]}},
-            "no picture of camera 'wrist'; it has top",
+            "no image of camera 'wrist'; it has top",
         ),
-        ({"images": {"top": None}}, "no picture of camera 'top'; it has none"),
+        ({"images": {"top": None}}, "no image of camera 'top'; it has none"),
         (
             {"images": {"top": np.zeros((32, 48, 3))}},
             r"camera 'top' gives float64 of shape \(32, 48, 3\); uint8 of shape",

@@ -1,6 +1,6 @@
 """LeRobot itself as the judge: it reads what we write, and we read what it writes.
 
-Both sides decode with FFmpeg and convert with its swscale, so pictures are equal to the last bit.
+Both sides decode with FFmpeg and convert with its swscale, so images are equal to the last bit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SIDE = Path(__file__).with_name("lerobot_side.py")
 CAMERAS = ("top", "wrist")
 OURS = {"h264": "h264", "av1": "libsvtav1"}
 # From our datasets, by LeRobot, from a version 2.1 by us, from the same by LeRobot; then with
-# pictures in the tables: by LeRobot, from a version 2.1 by us.
+# images in the tables: by LeRobot, from a version 2.1 by us.
 MADE = ("merged", "theirs", "converted", "theirs converted", "theirs stored", "stored")
 
 
@@ -95,7 +95,7 @@ def save_takes(path, takes):
 
 
 def enlarge(images):
-    # The AV1 encoder of LeRobot's PyAV crashes on pictures as small as ours.
+    # The AV1 encoder of LeRobot's PyAV crashes on images as small as ours.
     return images.repeat(4, axis=1).repeat(4, axis=2)
 
 
@@ -154,7 +154,7 @@ def test_lerobot_reads_what_we_recorded(name, seen, many):
 
 
 def test_lerobot_converts_version_2_to_the_same(seen):
-    """Rows and pictures are equal; statistics of rows agree but for LeRobot's float32."""
+    """Rows and images are equal; statistics of rows agree but for LeRobot's float32."""
     ours, theirs = seen["converted"], seen["theirs converted"]
     assert set(ours.arrays) == set(theirs.arrays)
     for key, array in ours.arrays.items():

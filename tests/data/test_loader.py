@@ -171,13 +171,13 @@ def test_an_error_of_the_collator_arrives_too(workers):
 
 
 class Large:
-    """Each sample makes pictures, and returns how many page faults that took."""
+    """Each sample makes images, and returns how many page faults that took."""
 
     def get_sample(self, index, epoch):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        pictures = [np.ones(900_000, np.uint8) for _ in range(24)]
+        images = [np.ones(900_000, np.uint8) for _ in range(24)]
         after = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        return {"x": np.int64(after - before), "noise": sum(int(p[0]) for p in pictures)}
+        return {"x": np.int64(after - before), "noise": sum(int(p[0]) for p in images)}
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is of glibc")

@@ -1,4 +1,4 @@
-"""Datasets with their pictures in the tables, as LeRobot stores the feature type ``image``."""
+"""Datasets with their images in the tables, as LeRobot stores the feature type ``image``."""
 
 from __future__ import annotations
 
@@ -106,20 +106,20 @@ def test_pictures_that_are_damaged_are_named(old):
     path = old / "data/chunk-000/episode_000001.parquet"
     kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     edit(path, lambda rows: pa.array([*rows[:6], {"bytes": b"?", "path": "x"}, *rows[7:]], kind))
-    where = rf"{path}: {WRIST}: the picture of row 6 cannot be decoded"
+    where = rf"{path}: {WRIST}: the image of row 6 cannot be decoded"
     with pytest.raises(DataError, match=where):
         load(old)[13]
     with pytest.raises(DataError, match=where):
         validate(old)
     nameless = {"bytes": None, "path": "images/6.png"}
     edit(path, lambda rows: pa.array([*rows[:6], nameless, *rows[7:]], kind))
-    with pytest.raises(DataError, match="row 6 holds no picture, at most the name of one"):
+    with pytest.raises(DataError, match="row 6 holds no image, at most the name of one"):
         load(old)[13]
 
 
 def test_a_column_of_something_else_is_refused_before_training(old):
     edit(old / "data/chunk-000/episode_000001.parquet", lambda rows: pa.array(range(len(rows))))
-    with pytest.raises(DataError, match="wrist holds int64, not the bytes of pictures"):
+    with pytest.raises(DataError, match="wrist holds int64, not the bytes of images"):
         load(old)
     assert len(load(old, ["top"])) == 28
 

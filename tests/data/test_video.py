@@ -15,7 +15,7 @@ FPS = 30
 
 
 def encode(path, count, first=0, codec="h264"):
-    """``count`` flat grey pictures, each 4 brighter than the one before."""
+    """``count`` flat grey images, each 4 brighter than the one before."""
     encoder = EpisodeEncoder(path, 16, 16, FPS, find_codec(codec))
     for i in range(first, first + count):
         encoder.add(np.full((16, 16, 3), 4 * i, np.uint8))

@@ -217,7 +217,7 @@ def test_odd_sizes_cannot_be_video(tmp_path, spec):
     writer = LeRobotWriter(tmp_path / "d", 10, spec())
     with pytest.raises(DataError) as caught:
         writer.add_frame(**frame(images={"top": np.zeros((33, 48, 3), np.uint8)}))
-    assert "pictures of 33 x 48 cannot be stored as video" in str(caught.value)
+    assert "images of 33 x 48 cannot be stored as video" in str(caught.value)
     assert "height and width must be even" in str(caught.value)
 
 

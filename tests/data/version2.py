@@ -26,7 +26,7 @@ def write_v2(
 ) -> Path:
     """Episodes one file each, ``chunk`` of them in a folder; the jsonl lines in no order.
 
-    ``codec`` may be ``png`` or ``jpg`` too: pictures then stand in the tables.
+    ``codec`` may be ``png`` or ``jpg`` too: images then stand in the tables.
     """
     tasks = list(dict.fromkeys(take.task for take in takes))
     rows = {"episodes": [], "tasks": [], "episodes_stats": []}

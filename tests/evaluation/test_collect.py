@@ -145,7 +145,7 @@ def test_a_simulation_that_diverges_demonstrates_nothing(walking):
     [
         ({"episodes": 0}, "nothing to collect: 0 episodes"),
         ({"seed": -1}, "seed must be from 0 to 499999998"),
-        ({"height": 8}, "height: pictures of 8 pixels are too small"),
+        ({"height": 8}, "height: images of 8 pixels are too small"),
         ({"tasks": ("up",)}, "there is no task 'up'; there are right, left"),
         ({"cameras": ("ear",)}, "a line has no camera 'ear'; it has eye"),
         ({"policy": "checkpoint"}, "policy 'checkpoint' demonstrates nothing"),
@@ -275,8 +275,8 @@ class Actor:
             raise RuntimeError(f"episode {number} slipped")
         frames = number + 2
         values = np.full((frames, 1), float(number)) + np.arange(frames)[:, None] / 100
-        pictures = np.full((frames, 32, 32, 3), 20 * number, np.uint8)
-        return Demonstration({"eye": pictures}, values, values, f"do {number % 2}", number % 2)
+        images = np.full((frames, 32, 32, 3), 20 * number, np.uint8)
+        return Demonstration({"eye": images}, values, values, f"do {number % 2}", number % 2)
 
 
 def write(out, episodes=4, workers=1, resume=False, settings=None, bad=()):

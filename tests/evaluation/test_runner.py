@@ -331,8 +331,8 @@ def test_results_say_whether_training_saw_their_seeds(tmp_path, checkpoint, firs
 
 def test_how_pictures_were_drawn_is_in_the_results(tmp_path, walking):
     evaluate(tmp_path, policy={"type": "Thinker"}, tasks=["right"], episodes=1, workers=1)
-    pictures = results(tmp_path)["provenance"]["pictures"]
-    assert pictures == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"
+    images = results(tmp_path)["provenance"]["pictures"]
+    assert images == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"
 
 
 def test_chance_does_what_chance_does(tmp_path, walking):

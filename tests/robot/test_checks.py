@@ -44,7 +44,7 @@ def test_a_frame_that_is_not_as_described_is_refused(bad, message):
 
 
 def test_only_the_cameras_that_are_needed_must_be_there():
-    with pytest.raises(SafetyStop, match="camera wrist gave no picture"):
+    with pytest.raises(SafetyStop, match="camera wrist gave no image"):
         check_frame(frame(), ARM, ["front", "wrist"])
 
 

@@ -44,8 +44,8 @@ def test_every_number_and_pixel_is_the_same(recorded: Recorded) -> None:
     chunks = recorded.chunks()
     assert [len(chunks), digest(np.concatenate(chunks))] == EXPECTED["chunks"]
     front = recorded.pictures["front"]
-    pictures = np.stack([front.read(index) for index in range(len(front))])
-    assert [len(front), digest(pictures)] == EXPECTED["pictures"]
+    images = np.stack([front.read(index) for index in range(len(front))])
+    assert [len(front), digest(images)] == EXPECTED["pictures"]
 
 
 def test_its_summary_is_counted_anew(recorded: Recorded) -> None:

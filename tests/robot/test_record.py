@@ -217,13 +217,13 @@ def test_what_is_not_written_in_time_is_dropped_and_said(bench, monkeypatch):
     bench.run(record=str(bench.work_dir / "rec"), max_publish_step=10)
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert "pictures were not recorded: the disk or the processor did not keep up" in line
+    assert "images were not recorded: the disk or the processor did not keep up" in line
     summary = json.loads((bench.work_dir / "rec/001-1/episode.json").read_text())
     assert summary["dropped"]["pictures"] > 0
 
 
 class Tapped:
-    """``pictures_after`` of a robot whose camera sends 30 pictures a second and keeps 2."""
+    """``pictures_after`` of a robot whose camera sends 30 images a second and keeps 2."""
 
     def __init__(self, arm, hz=30.0):
         self.arm, self.hz, self.began = arm, hz, time.monotonic()

@@ -89,11 +89,11 @@ def test_pictures_belong_to_their_rows(recordings, tmp_path):
     found = ParquetDataset(str(out), [], ["front"])
     first = open_recording(recordings / "001-1")
     for row in (0, 7, 30):
-        picture = first.pictures["front"].read(
+        image = first.pictures["front"].read(
             first.pictures["front"].newest(row_times(first, 50)[row])
         )
         seen = np.asarray(found[row]["images"][0], dtype=np.float64)
-        assert abs(seen.mean() - picture.mean()) < 3  # h264 is not exact
+        assert abs(seen.mean() - image.mean()) < 3  # h264 is not exact
     assert found.embodiment.joint_names == ("shoulder", "elbow", "jaw")
     assert found[0]["task_description"] == "wave at the camera"
 
@@ -115,7 +115,7 @@ def test_rows_that_show_a_picture_again_are_said(make_bench, tmp_path):
     recordings_to_dataset([tmp_path / "rec"], tmp_path / "data", reporter=said)
 
     (line,) = said.lines
-    assert "50 rows show 10 pictures of front; --fps 10 would show each once" in line
+    assert "50 rows show 10 images of front; --fps 10 would show each once" in line
 
 
 def test_those_that_failed_can_be_left_out(recordings, tmp_path):
@@ -135,7 +135,7 @@ def test_what_cannot_be_done_is_refused(recordings, make_bench, make_arm, tmp_pa
         recordings_to_dataset([tmp_path], tmp_path / "data")
     bench = make_bench(tmp_path / "b")
     bench.run(max_publish_step=5)
-    with pytest.raises(DataError, match="this episode has no pictures") as caught:
+    with pytest.raises(DataError, match="this episode has no images") as caught:
         recordings_to_dataset([tmp_path / "b" / "inference"], tmp_path / "data")
     assert "--record DIR" in str(caught.value)
     spec = bench.arm.embodiment.to_dict()

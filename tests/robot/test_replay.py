@@ -90,7 +90,7 @@ def test_the_recorded_robot_gives_a_policy_what_it_saw(bench, make_arm):
 
 
 class Streams:
-    """A robot whose state and camera come at rates of their own, the pictures late.
+    """A robot whose state and camera come at rates of their own, the images late.
 
     Args:
         arm: what moves.
@@ -185,10 +185,10 @@ def test_streams_of_their_own_rates_are_replayed_with_every_joiner(bench, stream
 
 def test_a_picture_that_was_not_recorded_in_time_does_not_end_a_replay(streams):
     operator = ReplayOperator(streams)
-    pictures = operator.recorded.pictures["front"]
-    first = pictures.read(1)
+    images = operator.recorded.pictures["front"]
+    first = images.read(1)
     # As where the disk was too slow for the very first one.
-    del pictures.times[0], pictures._places[0]
+    del images.times[0], images._places[0]
     operator.connect()
     np.testing.assert_array_equal(operator.get_frame().images["front"], first)
 
@@ -317,7 +317,7 @@ def test_lines_of_json_are_enough_for_a_policy(bench, make_arm):
     bench.run(max_publish_step=20, policy=ReplayPolicy(path))
 
     np.testing.assert_array_equal(bench.arm.sent, sent)
-    with pytest.raises(DataError, match="has no pictures: its robot cannot be replayed") as caught:
+    with pytest.raises(DataError, match="has no images: its robot cannot be replayed") as caught:
         bench.run(operator=ReplayOperator(path))
     assert "record again with --record DIR" in str(caught.value)
 
@@ -406,5 +406,5 @@ def test_an_episode_in_which_nothing_was_done_is_no_policy(bench):
 
     with pytest.raises(DataError, match="holds no chunks: nothing was done in it"):
         ReplayPolicy(str(bench.work_dir / "rec")).horizon  # noqa: B018
-    with pytest.raises(DataError, match="no pictures"):
+    with pytest.raises(DataError, match="no images"):
         ReplayOperator(str(bench.work_dir / "rec")).embodiment  # noqa: B018

@@ -104,7 +104,7 @@ def test_a_camera_with_another_view_than_in_training(bench):
     refused(
         bench,
         SpecMismatch,
-        "camera front gives 24 x 32 pictures; the policy was trained on 32 x 32: another view",
+        "camera front gives 24 x 32 images; the policy was trained on 32 x 32: another view",
     )
 
 
@@ -115,7 +115,7 @@ def test_a_camera_with_more_pixels_than_in_training_is_said(bench):
     bench.run(max_publish_step=5)
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert line.endswith("24 x 32 pictures; the policy was trained on 12 x 16; they are scaled")
+    assert line.endswith("24 x 32 images; the policy was trained on 12 x 16; they are scaled")
 
 
 @pytest.mark.parametrize(

@@ -187,7 +187,7 @@ def test_a_stream_that_has_not_come_yet_is_waited_for(bare):
 def test_a_stream_that_never_comes_is_named(bare):
     bare.arm.image_after = 10**9
 
-    with pytest.raises(NotReady, match="there is no picture of front yet"):
+    with pytest.raises(NotReady, match="there is no image of front yet"):
         run(bare, ready_timeout=0.1)
     assert bare.arm.sent == []
 

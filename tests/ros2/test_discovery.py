@@ -64,7 +64,7 @@ def test_another_type_is_named():
     assert error.what == (
         "cam (/c) is published as sensor_msgs/msg/CompressedImage, sensor_msgs/msg/Image is needed"
     )
-    assert error.next == "a compressed picture topic ends in /compressed; /c does not"
+    assert error.next == "a compressed image topic ends in /compressed; /c does not"
 
 
 def test_another_type_without_a_compressed_one():

@@ -1,4 +1,4 @@
-"""Pictures: encodings, row steps, byte order, sizes, compressed ones, and the way back."""
+"""Images: encodings, row steps, byte order, sizes, compressed ones, and the way back."""
 
 from __future__ import annotations
 
@@ -102,13 +102,13 @@ def test_a_view_copies_nothing_and_a_picture_is_copied_once():
 @pytest.mark.parametrize(
     ("call", "sent", "what"),
     [
-        ("to_rgb", message(colours(8, 6), "rgb8"), "sends 6x8 pictures, the embodiment says 6x4"),
+        ("to_rgb", message(colours(8, 6), "rgb8"), "sends 6x8 images, the embodiment says 6x4"),
         ("to_rgb", message(colours(), "yuv422"), "encoding 'yuv422'; understood are rgb8"),
-        ("to_rgb", message(np.zeros((4, 6), np.uint16), "16UC1"), "16UC1 pictures, which have no"),
-        ("to_rgb", message(np.zeros((4, 6), np.uint8), "mono8"), "mono8 pictures, which have no c"),
-        ("to_rgb", message(np.zeros((4, 6), np.uint8), "8UC1"), "8UC1 pictures, which have no col"),
-        ("to_depth", message(colours(), "rgb8"), "rgb8 pictures, which hold no distances"),
-        ("to_depth", message(np.zeros((8, 6), np.uint16), "16UC1"), "sends 6x8 pictures"),
+        ("to_rgb", message(np.zeros((4, 6), np.uint16), "16UC1"), "16UC1 images, which have no"),
+        ("to_rgb", message(np.zeros((4, 6), np.uint8), "mono8"), "mono8 images, which have no c"),
+        ("to_rgb", message(np.zeros((4, 6), np.uint8), "8UC1"), "8UC1 images, which have no col"),
+        ("to_depth", message(colours(), "rgb8"), "rgb8 images, which hold no distances"),
+        ("to_depth", message(np.zeros((8, 6), np.uint16), "16UC1"), "sends 6x8 images"),
     ],
 )
 def test_what_does_not_fit_is_named(call, sent, what):
@@ -123,7 +123,7 @@ def test_damaged_pictures_are_refused(change):
     sent = message(colours(), "rgb8")
     vars(sent).update(change)
 
-    with pytest.raises(BadMessage, match=r"damaged pictures: 6x\d rgb8 with rows of"):
+    with pytest.raises(BadMessage, match=r"damaged images: 6x\d rgb8 with rows of"):
         images.to_rgb(sent, 4, 6)
 
 
@@ -180,7 +180,7 @@ class TestCompressed:
     def test_a_compressed_picture_without_colours_is_refused(self, form):
         grey = self.packed(np.full((48, 64), 90, np.uint8), ".jpg", form)
 
-        with pytest.raises(BadMessage, match="sends mono8 pictures, which have no colours"):
+        with pytest.raises(BadMessage, match="sends mono8 images, which have no colours"):
             images.to_rgb(grey, 48, 64)
         assert (images.to_rgb(grey, 48, 64, grey=True) == 90).all()
 
@@ -227,10 +227,10 @@ class TestCompressed:
             images.fill_compressed(SimpleNamespace(), pixels, encoding, form)
 
     def test_a_compressed_picture_has_a_size_too(self):
-        with pytest.raises(BadMessage, match="sends 6x4 pictures, the embodiment says 6x8"):
+        with pytest.raises(BadMessage, match="sends 6x4 images, the embodiment says 6x8"):
             images.to_rgb(self.packed(colours(), ".png", "png"), 8, 6)
 
-    @pytest.mark.parametrize("data", [b"", b"no picture"])
+    @pytest.mark.parametrize("data", [b"", b"no image"])
     def test_what_cannot_be_decoded_is_named(self, data):
         pytest.importorskip("cv2", reason="pip install opencv-python-headless")
         sent = SimpleNamespace(format="jpeg", data=array.array("B", data))
@@ -255,5 +255,5 @@ class TestCompressed:
             images.to_rgb(sent, 4, 6)
 
         assert caught.value.next.startswith("pip install opencv-python-headless")
-        with pytest.raises(LoadFailed, match="compressed pictures are to be sent, and OpenCV"):
+        with pytest.raises(LoadFailed, match="compressed images are to be sent, and OpenCV"):
             images.fill_compressed(SimpleNamespace(), colours(), "rgb8")

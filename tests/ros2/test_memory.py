@@ -1,4 +1,4 @@
-"""Pictures are given memory that others had, not fresh pages each time."""
+"""Images are given memory that others had, not fresh pages each time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from fluxvla_core.ros2.connection import keep_large_blocks
 if sys.argv[1] == "kept":
     assert keep_large_blocks()
 
-def pictures():
+def images():
     for _ in range(100):
         kept = [np.ones((480, 640, 3), np.uint8) for _ in range(3)]
 
-pictures()
+images()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-pictures()
+images()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 

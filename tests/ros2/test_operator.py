@@ -85,10 +85,10 @@ def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
 
 
 def test_pictures_that_nobody_looked_at_can_be_had(arm):
-    pictures, received = arm.pictures_after("cam", 0.0)
-    assert received >= len(pictures) > 0
-    assert all(picture.shape == (48, 64, 3) for _, picture in pictures)
-    newest = max(stamp for stamp, _ in pictures)
+    images, received = arm.pictures_after("cam", 0.0)
+    assert received >= len(images) > 0
+    assert all(image.shape == (48, 64, 3) for _, image in images)
+    newest = max(stamp for stamp, _ in images)
 
     wait_for(lambda: arm.pictures_after("cam", newest)[0])
 
@@ -297,15 +297,15 @@ class TestFaults:
         [
             (
                 {"/cam/image": {"height": 24, "width": 32}},
-                "cam (/cam/image) sends 32x24 pictures, the embodiment says 64x48",
+                "cam (/cam/image) sends 32x24 images, the embodiment says 64x48",
             ),
             (
                 {"/cam/image": {"encoding": "16UC1"}},
-                "cam (/cam/image) sends 16UC1 pictures, which have no colours",
+                "cam (/cam/image) sends 16UC1 images, which have no colours",
             ),
             (
                 {"/cam/image": {"encoding": "mono8"}},
-                "cam (/cam/image) sends mono8 pictures, which have no colours",
+                "cam (/cam/image) sends mono8 images, which have no colours",
             ),
             (
                 {"/arm/state": {"names": ["elbow", "wrist"], "positions": [0.1, 0.2]}},
@@ -349,7 +349,7 @@ class TestFaults:
         assert all(ring.duplicates + ring.overtaken > 0 for ring in rings)
 
     def test_a_late_camera_is_named(self, arm, robot):
-        """Not only its pictures are old then, but the state that belongs to them."""
+        """Not only its images are old then, but the state that belongs to them."""
         robot.tell(fault="/cam/image=delay:0.7")
         time.sleep(0.8)
         error = frame_error(arm, "cam is late: what belongs to its newest message arrived 0.")

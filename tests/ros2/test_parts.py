@@ -116,7 +116,7 @@ def test_what_one_part_commands_the_other_sees_and_neither_is_another_commander(
     control, cameras = both
     control.send_action(TARGET)
     wait_for(lambda: np.array_equal(cameras.get_state(), TARGET))
-    # A frame's state is that of its pictures, which come less often.
+    # A frame's state is that of its images, which come less often.
     wait_for(lambda: np.array_equal(cameras.get_frame().state, TARGET))
 
     time.sleep(3 * WATCH_S)

@@ -60,7 +60,7 @@ def test_a_sender_of_another_dds_is_not_told_of_fast_dds_file():
     error = caught.value
     assert "do not share Fast DDS's memory" in error.cause
     assert "net.core.rmem_max" in error.next
-    # Fast DDS may freeze with reliable pictures of another.
+    # Fast DDS may freeze with reliable images of another.
     assert "RELIABLE" not in error.next
     assert "FASTDDS" not in error.next
 

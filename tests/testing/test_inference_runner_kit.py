@@ -69,10 +69,10 @@ FAULTS = {
         "zip(self._cameras, [image[:, ::-1].copy() // 2 for image in images])",
         "expected what the robot's front sees",
     ),
-    "no picture": Fault(
+    "no image": Fault(
         "the_policy_is_asked_with_what_the_robot_sees", GAIN,
         GAIN + "    def run_setup(self):\n        super().run_setup()\n"
-        "        self._cameras = self._cameras[:1]\n", "has no picture of wrist",
+        "        self._cameras = self._cameras[:1]\n", "has no image of wrist",
     ),
     "half way": Fault(
         "commands_are_the_policys", MOVE,

@@ -71,7 +71,7 @@ SHAPED = (
 """
 )
 
-# One that has more streams than the embodiment: a depth picture comes with its own stamp.
+# One that has more streams than the embodiment: a depth image comes with its own stamp.
 DEEP = GOOD.replace('"front": now}', '"front": now, "front depth": now}').replace(
     "SmallOperator", "DeepOperator"
 )

@@ -1,4 +1,4 @@
-"""A run whose pictures are normalised where it computes is the run whose workers do it."""
+"""A run whose images are normalised where it computes is the run whose workers do it."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class Said(SilentReporter):
 
 @pytest.fixture
 def leave(monkeypatch):
-    """Once called, runs leave pictures to the device; gives the dtypes that arrive there."""
+    """Once called, runs leave images to the device; gives the dtypes that arrive there."""
     arrived = []
 
     def spy(batch, known=batches.normalized):
@@ -207,7 +207,7 @@ def test_a_mixture_leaves_all_or_nothing(roots):
 
 
 class Cropping(DictCollator):
-    """Somebody's, that looks at pictures."""
+    """Somebody's, that looks at images."""
 
     def __call__(self, samples):
         return super().__call__([{**s, "images": s["images"][..., 1:]} for s in samples])

@@ -69,7 +69,7 @@ def targets(text: str) -> Iterator[str]:
 
 
 def linked_files(root: Path) -> dict[str, str]:
-    """Other files that pages link to -> the pages that show them; of pictures the picture."""
+    """Other files that pages link to -> the pages that show them; of images the image."""
     known = pages(root)
     found: dict[str, str] = {}
     for path in [p for p in known if p.endswith(".md")]:

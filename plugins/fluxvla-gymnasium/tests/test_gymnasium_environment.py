@@ -115,7 +115,7 @@ def test_it_is_evaluated_by_the_cores_runner(tmp_path):
     found = runner.run()
     counted = found["groups"]["policy"]["tasks"]["Reacher-v5"]
     assert (counted["episodes"], counted["errors"]) == (3, 0)
-    assert found["settings"]["render"] == "cheap", "the results say how pictures are drawn"
+    assert found["settings"]["render"] == "cheap", "the results say how images are drawn"
     assert len(found["videos"]) == 1
     lines = (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()[1:]
     records = [json.loads(line) for line in lines]
@@ -147,8 +147,8 @@ def test_gym_aloha_from_a_config():
     assert made.spec.tasks[0].name == "gym_aloha-AlohaTransferCube-v0", "a file name"
     made.reset(5, made.spec.tasks[0].name)
     home = made.state
-    picture = made.observe(made.spec.embodiment.cameras)["images"]["top"]
-    assert (home.shape, picture.shape) == ((14,), (480, 640, 3))
+    image = made.observe(made.spec.embodiment.cameras)["images"]["top"]
+    assert (home.shape, image.shape) == ((14,), (480, 640, 3))
     physics = made._env.unwrapped._env.physics
     assert physics.model.ptr.vis.quality.shadowsize == 0, "behind dm_control, too"
     found = made.step(home)
@@ -237,7 +237,7 @@ def test_impossible_values_are_refused(arguments, message):
 def test_a_picture_that_is_not_there_is_named():
     made = GymnasiumEnvironment("CartPole-v1", body(1, 4, [("top", 8, 8)]), success="terminated")
     made.reset(0, "CartPole-v1")
-    with pytest.raises(SpecMismatch, match="has no picture 'top'; it has none") as caught:
+    with pytest.raises(SpecMismatch, match="has no image 'top'; it has none") as caught:
         made.observe(made.spec.embodiment.cameras)
     assert "--set '<GymnasiumEnvironment>.cameras={top = \"NAME\"}'" in str(caught.value)
     made.close()

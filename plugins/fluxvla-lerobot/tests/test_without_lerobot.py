@@ -196,9 +196,9 @@ def test_cameras_by_name(folder: Path) -> None:
     seen = {"images": {"top": large}, "qpos": np.zeros(3, np.float32), "task_description": ""}
     (found,) = pictures(seen, {feature: "top"}, trained).values()
     assert np.array_equal(found, large[:48, :64])
-    with pytest.raises(DataError, match=r"the picture of top is \(96, 128, 3\) float64"):
+    with pytest.raises(DataError, match=r"the image of top is \(96, 128, 3\) float64"):
         pictures({**seen, "images": {"top": large / 2}}, {feature: "top"}, trained)
-    with pytest.raises(SpecMismatch, match=r"top gives 96 x 128 pictures; .* trained on 48 x 64"):
+    with pytest.raises(SpecMismatch, match=r"top gives 96 x 128 images; .* trained on 48 x 64"):
         check_sizes(described, {feature: "top"}, {"top": (96, 128)})
 
 

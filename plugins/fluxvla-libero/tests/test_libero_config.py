@@ -208,7 +208,7 @@ def test_the_experts_way_leads_from_above_the_object_into_the_container():
     [
         ({"suite": "libero"}, "there is no suite 'libero'"),
         ({"cameras": ("top",)}, "no camera 'top'; they have agentview, agentview_image, image"),
-        ({"height": 8}, "pictures of 8x224 are too small"),
+        ({"height": 8}, "images of 8x224 are too small"),
         ({"render": "nice"}, "render 'nice' is unknown; choose one of cheap, coarse, reference"),
         ({"begin": "anywhere"}, "begin 'anywhere' is unknown; choose one of fixed, random"),
         ({"num_steps_wait": -1}, "num_steps_wait must be at least 0, got -1"),

@@ -246,12 +246,12 @@ def infer(work_dir, listener, task, **arguments):
 
 
 def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener, monkeypatch):
-    pictures = []
+    images = []
 
     def look(view_info):
         if view_info.startswith("live at "):
             stream = urllib.request.urlopen(view_info.removeprefix("live at "), timeout=60)
-            pictures.append(stream)
+            images.append(stream)
         listener.lines.append(view_info)
 
     monkeypatch.setattr(listener, "info", look)
@@ -274,7 +274,7 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     assert recorded.whole
     assert recorded.embodiment.name == summary["embodiment"]
     assert f"success after {summary['steps']} steps" in listener.lines
-    shown = pictures[0].read()
+    shown = images[0].read()
     assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
     assert shown.count(b"\xff\xd8\xff") >= 1, "JPEG"
 

@@ -1,4 +1,4 @@
-"""The live view: a stream of pictures for browsers on this machine."""
+"""The live view: a stream of images for browsers on this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fluxvla_core.errors import RunFailed
 
 
 def part(stream):
-    """The next picture of the stream."""
+    """The next image of the stream."""
     assert stream.readline() == b"--picture\r\n"
     assert stream.readline() == b"Content-Type: image/jpeg\r\n"
     length = int(stream.readline().split(b":")[1])

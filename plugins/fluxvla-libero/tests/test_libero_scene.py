@@ -1,4 +1,4 @@
-"""A scene against LIBERO's own environment: resets, states and pictures are the same."""
+"""A scene against LIBERO's own environment: resets, states and images are the same."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
     scene.model.vis.quality.shadowsize = env.sim.model.vis.quality.shadowsize
     scene.model.vis.quality.offsamples = env.sim.model.vis.quality.offsamples
     for camera in ("agentview", "robot0_eye_in_hand"):
-        picture = drawing.picture(scene._shown, camera, 64, 64)[:, ::-1]
+        image = drawing.picture(scene._shown, camera, 64, 64)[:, ::-1]
         turned = seen[f"{camera}_image"][::-1, ::-1]
-        assert picture.std() > 10, "something is seen"
-        np.testing.assert_array_equal(picture, turned)
+        assert image.std() > 10, "something is seen"
+        np.testing.assert_array_equal(image, turned)
     drawing.close()
     env.close()
 
@@ -183,19 +183,19 @@ def test_waiting_steps_do_not_count(scene):
 
 def test_cheap_pictures_show_the_same_without_shadows(scene):
     scene.reset(init_states("libero_object", 2)[0])
-    picture = scene.render("agentview", 48, 80)
-    assert picture.shape == (48, 80, 3)
-    assert picture.dtype == np.uint8
-    assert picture.std() > 10
-    np.testing.assert_array_equal(picture, scene.render("agentview", 48, 80))
+    image = scene.render("agentview", 48, 80)
+    assert image.shape == (48, 80, 3)
+    assert image.dtype == np.uint8
+    assert image.std() > 10
+    np.testing.assert_array_equal(image, scene.render("agentview", 48, 80))
     assert scene.model.vis.quality.shadowsize == 0
 
 
 def test_the_basket_is_on_the_left_as_in_the_public_datasets(scene):
     """It stands at positive y; upright and not mirrored it would be on the right."""
     scene.reset(init_states("libero_object", 2)[0])
-    picture = scene.render("agentview", 64, 64).astype(int)
-    column = picture[30:42].std(axis=(0, 2))
+    image = scene.render("agentview", 64, 64).astype(int)
+    column = image[30:42].std(axis=(0, 2))
     assert column[5:20].mean() > 1.5 * column[48:62].mean(), "the basket's wicker"
 
 

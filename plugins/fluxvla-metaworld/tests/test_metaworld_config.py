@@ -26,7 +26,7 @@ def test_the_spec_is_known_before_a_scene_is_built():
     assert EmbodimentSpec.from_dict(body.to_dict()) == body
     assert len(spec.tasks) == 50
     assert {task.max_steps for task in spec.tasks} == {500}
-    assert spec.details["render"] == "reference", "a report states how pictures are drawn"
+    assert spec.details["render"] == "reference", "a report states how images are drawn"
     assert spec.keep_together
 
 
@@ -52,7 +52,7 @@ def test_sets_of_tasks_have_names():
         ({"tasks": []}, "tasks must name each task once"),
         ({"tasks": ["push-v3", "push-v3"]}, "tasks must name each task once"),
         ({"cameras": ("front",)}, "no camera 'front'; they have corner, corner2"),
-        ({"height": 8}, "pictures of 8x224 are too small"),
+        ({"height": 8}, "images of 8x224 are too small"),
         ({"render": "nice"}, "render 'nice' is unknown; choose one of cheap, coarse, reference"),
         ({"max_steps": 501}, "max_steps must be 1 to 500, got 501"),
     ],

@@ -1,4 +1,4 @@
-"""Episodes and pictures against Meta-World's own; outcomes that follow from task and seed."""
+"""Episodes and images against Meta-World's own; outcomes that follow from task and seed."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ def test_reference_pictures_are_meta_worlds_own(metaworld, camera):
     expected = own.render()
     if camera == "corner2":
         expected = expected[::-1, ::-1]
-    picture = made.observe([Camera(camera, 80, 96)])["images"][camera]
-    assert picture.std() > 10
-    np.testing.assert_array_equal(picture, expected)
+    image = made.observe([Camera(camera, 80, 96)])["images"][camera]
+    assert image.std() > 10
+    np.testing.assert_array_equal(image, expected)
     own.close()
     made.close()
 
@@ -96,7 +96,7 @@ def test_every_camera_shows_something_at_no_cost_to_the_physics(environment):
     seen = environment.observe([Camera(name, 32, 40) for name in CAMERAS])
     assert seen["task_description"] == "push the puck to the goal"
     assert all(p.shape == (32, 40, 3) and p.dtype == np.uint8 for p in seen["images"].values())
-    assert all(picture.std() > 5 for picture in seen["images"].values())
+    assert all(image.std() > 5 for image in seen["images"].values())
     assert environment.state_hash() == before
     with pytest.raises(ConfigError, match="no camera 'front'"):
         environment.observe([Camera("front", 32, 32)])
@@ -107,8 +107,8 @@ def test_the_first_picture_shows_this_episodes_goal_and_not_the_last_ones(enviro
     camera = [Camera("topview", 96, 96)]
 
     def goal():
-        picture = environment.observe(camera)["images"]["topview"].astype(int)
-        green = (picture[..., 1] > 120) & (picture[..., 0] < 80) & (picture[..., 2] < 80)
+        image = environment.observe(camera)["images"]["topview"].astype(int)
+        green = (image[..., 1] > 120) & (image[..., 0] < 80) & (image[..., 2] < 80)
         assert green.sum() > 2, "the marker is seen"
         return np.argwhere(green).mean(0)
 

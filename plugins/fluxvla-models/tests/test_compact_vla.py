@@ -181,9 +181,9 @@ def test_spatial_softmax_finds_a_peak():
     module = SpatialSoftmax(1, 1)
     torch.nn.init.constant_(module.to_maps.weight, 50.0)
     torch.nn.init.zeros_(module.to_maps.bias)
-    picture = torch.zeros(1, 1, 5, 9)
-    picture[0, 0, 1, 6] = 1.0
-    torch.testing.assert_close(module(picture)[0], torch.tensor([0.5, -0.5]), atol=1e-4, rtol=0)
+    image = torch.zeros(1, 1, 5, 9)
+    image[0, 0, 1, 6] = 1.0
+    torch.testing.assert_close(module(image)[0], torch.tensor([0.5, -0.5]), atol=1e-4, rtol=0)
 
 
 def test_one_encoder_serves_several_cameras():
@@ -205,7 +205,7 @@ def test_an_image_size_that_does_not_divide_is_refused():
 
 
 def test_the_model_learns_one_batch_and_tells_instructions_apart(model):
-    """Same pictures and states, two instructions, two behaviours: after training both are right."""
+    """Same images and states, two instructions, two behaviours: after training both are right."""
     torch.manual_seed(2)
     batch = make_batch(size=2, draws=4)
     for key in ("images", "states"):

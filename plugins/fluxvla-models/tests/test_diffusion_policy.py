@@ -153,7 +153,7 @@ def test_crops_are_drawn_in_training_and_the_middle_else() -> None:
     assert not torch.equal(drawn, still)
     model.eval()
     assert torch.equal(model(**batch, crops=torch.zeros(4, 2))["loss"], still)
-    with pytest.raises(ConfigError, match=r"pictures of 72 x 64 pixels are smaller than crop_sha"):
+    with pytest.raises(ConfigError, match=r"images of 72 x 64 pixels are smaller than crop_sha"):
         make(crop_shape=(64, 65))(**batch)
 
 
@@ -161,9 +161,9 @@ def test_keypoints_find_a_peak() -> None:
     module = Keypoints(1, 1)
     torch.nn.init.constant_(module.nets.weight, 50.0)
     torch.nn.init.zeros_(module.nets.bias)
-    picture = torch.zeros(1, 1, 5, 9)
-    picture[0, 0, 1, 6] = 1.0
-    torch.testing.assert_close(module(picture)[0], torch.tensor([0.5, -0.5]), atol=1e-4, rtol=0)
+    image = torch.zeros(1, 1, 5, 9)
+    image[0, 0, 1, 6] = 1.0
+    torch.testing.assert_close(module(image)[0], torch.tensor([0.5, -0.5]), atol=1e-4, rtol=0)
     assert position_grid(1, 3).tolist() == [[-1.0, -1.0], [0.0, -1.0], [1.0, -1.0]]
 
 

@@ -159,7 +159,7 @@ def test_normalising_by_each_mode(folder: Path, mode: str) -> None:
         ({"vision_backbone": "resnet50"}, "'resnet50' of a residual network is not one of resnet1"),
         ({"latent_dim": 7}, "of another size"),
         ({"output_features": {}}, "output_features has no action; it has nothing"),
-        ({"input_features": {}}, "cameras with pictures of one size .* has none"),
+        ({"input_features": {}}, "cameras with images of one size .* has none"),
     ],
 )
 def test_what_is_not_built_here_is_refused_in_words(

@@ -164,8 +164,8 @@ def test_every_normalisation_becomes_lerobots(tmp_path: Path, table: dict) -> No
     )
     for key in ("states", "actions"):
         np.testing.assert_allclose(ours[key], theirs[key], rtol=1e-5, atol=1e-6)
-    pictures = {"images": np.full((6, 72, 96), 200, np.uint8)}
-    one, other = (Pipeline([read.transforms[1]])(pictures) for read in (checkpoint, found))
+    images = {"images": np.full((6, 72, 96), 200, np.uint8)}
+    one, other = (Pipeline([read.transforms[1]])(images) for read in (checkpoint, found))
     np.testing.assert_allclose(one["images"], other["images"], rtol=1e-5)
     assert found.img_keys == ("observation.images.front", "observation.images.wrist")
 

@@ -279,7 +279,7 @@ def test_batches_that_do_not_fit(folders) -> None:
     model, batch = halves(folders), batch_of()
     with pytest.raises(ConfigError, match=r"num_cameras is 2, .* 3 image channels \(1 cameras\)"):
         model(**{**batch, "images": batch["images"][:, :3]})
-    with pytest.raises(ConfigError, match="pictures are 32 x 16, the encoder sees 32 x 32"):
+    with pytest.raises(ConfigError, match="images are 32 x 16, the encoder sees 32 x 32"):
         model(**{**batch, "images": batch["images"][..., :16]})
     with pytest.raises(ConfigError, match=r"actions are \(3, 3\), the head's are \(4, 3\)"):
         model(**{**batch, "actions": batch["actions"][:, :3]})

@@ -37,13 +37,13 @@ def draw(made, render, size=(48, 64)):
     data = mujoco.MjData(made)
     mujoco.mj_forward(made, data)
     drawn = Drawing(made, render)
-    picture = drawn.picture(data, "side", *size)
+    image = drawn.picture(data, "side", *size)
     again = drawn.picture(data, "side", *size)
-    np.testing.assert_array_equal(picture, again)
-    assert picture.base is None, "a picture of its own"
+    np.testing.assert_array_equal(image, again)
+    assert image.base is None, "an image of its own"
     drawn.close()
     drawn.close()
-    return picture
+    return image
 
 
 @pytest.fixture(autouse=True)
@@ -53,12 +53,12 @@ def _egl(monkeypatch):
 
 
 def test_pictures_are_upright_and_of_the_size_that_is_asked_for():
-    picture = draw(model(), "cheap")
-    assert (picture.shape, picture.dtype) == ((48, 64, 3), np.uint8)
-    red = (picture[..., 0] > 60) & (picture[..., 2] < 30)
+    image = draw(model(), "cheap")
+    assert (image.shape, image.dtype) == ((48, 64, 3), np.uint8)
+    red = (image[..., 0] > 60) & (image[..., 2] < 30)
     assert red[:24].sum() > red[24:].sum() > -1
     assert red[10:24, 20:44].any(), "the ball is in the upper half, the floor in the lower"
-    assert picture[40, 32, 2] > picture[40, 32, 0]
+    assert image[40, 32, 2] > image[40, 32, 0]
 
 
 def test_coarse_pictures_show_the_same_with_fewer_faces_and_leave_the_physics_alone():

@@ -221,7 +221,7 @@ def test_it_learns_one_batch(kind, settings, rate):
         (OpenVLA, {"dino": {"widht": 3}}, "OpenVLA: dino has no 'widht'; it has width"),
         (OpenVLA, {"dino": {"width": "a"}}, "dino.width must be of type int, got 'a'"),
         (OpenVLA, {"language": 3}, "language must be a table, got 3"),
-        (OpenVLA, {"image_size": 30}, "pictures of 30 pixels, patches of 14"),
+        (OpenVLA, {"image_size": 30}, "images of 30 pixels, patches of 14"),
         (OpenVLA, {"siglip": {"num_heads": 5}}, "width 1152, num_heads 5"),
         (OpenVLA, {"language": {"text_vocab_size": 40000}}, "text_vocab_size 40000 must be above"),
         (OpenVLAOFT, {"head": "l2"}, "head 'l2' is not one of l1, diffusion"),

@@ -57,7 +57,7 @@ def planes(array):
 
 
 def levels(found, expected):
-    """By how many of 255 levels two pictures differ: on average, and at most."""
+    """By how many of 255 levels two images differ: on average, and at most."""
     gap = np.abs(found.astype(int) - expected)
     return gap.mean(), gap.max()
 

@@ -109,9 +109,9 @@ def test_a_run_on_a_robot_is_written_and_read_back(tmp_path: Path) -> None:
         "/policy/latency_s",
         "/events",
     }
-    (picture,) = found["/cameras/front"]
-    assert picture[ROBOT] == 1_500_000_000
-    pixels = np.frombuffer(bytes(picture["Image:buffer"][0]), np.uint8)
+    (image,) = found["/cameras/front"]
+    assert image[ROBOT] == 1_500_000_000
+    pixels = np.frombuffer(bytes(image["Image:buffer"][0]), np.uint8)
     np.testing.assert_array_equal(pixels.reshape(PICTURE.shape), PICTURE)
     assert numbers(found["/joints/elbow/command"]) == [(2.0, 0.0), (3.0, 1.0), (4.0, 2.0)]
     assert numbers(found["/joints/elbow/target"]) == [(2.0, 1.0), (3.0, 2.0), (4.0, 3.0)]

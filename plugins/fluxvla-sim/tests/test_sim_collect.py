@@ -85,8 +85,8 @@ def test_the_command_collects_and_says_so(tmp_path, capsys, robot, tasks, camera
     info = json.loads((out / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["total_tasks"]) == ("v3.0", 10, tasks)
     assert info["features"]["action"]["shape"] == [dim]
-    pictures = [name for name in info["features"] if name.startswith("observation.images.")]
-    assert [name.rpartition(".")[2] for name in pictures] == cameras
+    images = [name for name in info["features"] if name.startswith("observation.images.")]
+    assert [name.rpartition(".")[2] for name in images] == cameras
     assert main(words) == 2
     assert "a dataset is never written over" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""The demo's own training, killed in the middle: its model, pictures, noise and command line."""
+"""The demo's own training, killed in the middle: its model, images, noise and command line."""
 
 from __future__ import annotations
 

@@ -93,9 +93,9 @@ def test_a_checkpoint_and_its_untrained_twin_are_evaluated(tmp_path, trembling):
         assert set(results["groups"]) == {"policy", "untrained"}
         assert results["timing"]["policy_ms"] > 0
         assert results["videos"][0]["success"] is False
-        pictures = results["provenance"]["pictures"]
-        assert pictures["sizes"] == {"top": [48, 64]}
-        (by,) = pictures["by"]
+        images = results["provenance"]["pictures"]
+        assert images["sizes"] == {"top": [48, 64]}
+        (by,) = images["by"]
         assert by.partition(":")[0] in {"egl", "osmesa", "glfw", "the platform's own OpenGL"}
         assert by.partition(": ")[2], "the renderer has a name"
     one, two = hashes(tmp_path / "1"), hashes(tmp_path / "2")

@@ -141,7 +141,7 @@ class TestAloha:
         operator = connect(AlohaOperator, **ALOHA)
         frame = operator.get_frame()
         np.testing.assert_allclose(frame.state, HOME, atol=0.02)
-        assert frame.images["top"].std() > 10, "the picture shows nothing"
+        assert frame.images["top"].std() > 10, "the image shows nothing"
         assert topics.facts()["steps"] == 0
 
         target = HOME.copy()

@@ -310,8 +310,8 @@ class TestCommandLine:
         [
             (["aloha"], "a simulated robot is reached over ROS 2 here"),
             (["aloha", "--ros2", "--fault", "x=drop"], "the robot has no stream 'x'; it has left"),
-            (["aloha", "--ros2", "--fault", "top=nan"], "top is a camera: a picture's numbers"),
-            (["aloha", "--ros2", "--fault", "top_depth=nan"], "top_depth is a camera: a picture's"),
+            (["aloha", "--ros2", "--fault", "top=nan"], "top is a camera: an image's numbers"),
+            (["aloha", "--ros2", "--fault", "top_depth=nan"], "top_depth is a camera: an image's"),
             (["aloha", "--ros2", "--fault", "base=nan"], "base is odometry: only joints and bare"),
             (["aloha", "--ros2", "--latency", "x=1"], "the robot has no stream 'x'; it has left"),
             (["aloha", "--ros2", "--state-hz", "501"], "states need a rate from 0 to 500 Hz"),

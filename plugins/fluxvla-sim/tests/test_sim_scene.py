@@ -28,15 +28,15 @@ def scene():
 
 @pytest.fixture
 def stock(monkeypatch):
-    """gym-aloha's own environment, without the pictures that it draws after every step."""
+    """gym-aloha's own environment, without the images that it draws after every step."""
     import_mujoco()
     gymnasium = pytest.importorskip("gymnasium")
     import gym_aloha  # noqa: F401 - registers the environment
     from gym_aloha.tasks import sim
 
     def blind(self, physics):
-        picture = np.zeros((1, 1, 3), np.uint8)
-        return {"qpos": self.get_qpos(physics), "images": {"top": picture}}
+        image = np.zeros((1, 1, 3), np.uint8)
+        return {"qpos": self.get_qpos(physics), "images": {"top": image}}
 
     monkeypatch.setattr(sim.BimanualViperXTask, "get_observation", blind)
 
@@ -112,8 +112,8 @@ def test_depth_is_how_far_a_ray_goes(world, camera):
     scene, height, width = world.open_scene("cheap"), 96, 128
     scene.reset(3)
     renderer = Renderer(scene.model)
-    picture, metres = renderer.render_with_depth(scene.data, camera, height, width)
-    np.testing.assert_array_equal(picture, renderer.render(scene.data, camera, height, width))
+    image, metres = renderer.render_with_depth(scene.data, camera, height, width)
+    np.testing.assert_array_equal(image, renderer.render(scene.data, camera, height, width))
     renderer.close()
     assert metres.dtype == np.float32
     points = [(row, column) for row in range(4, height, 13) for column in range(5, width, 17)]
@@ -121,7 +121,7 @@ def test_depth_is_how_far_a_ray_goes(world, camera):
         metres[point] - along_the_axis(scene, camera, (height, width), point) for point in points
     ]
     assert np.isnan(metres).any(), "something is out of reach"
-    # A ray at an object's edge may pass by where the picture's pixel does not.
+    # A ray at an object's edge may pass by where the image's pixel does not.
     assert np.mean(np.abs(off) < 1e-3) + np.mean(np.isnan(off)) > 0.95
     assert np.mean(np.abs(off) < 1e-3) > 0.3
 
@@ -178,10 +178,10 @@ def test_state_has_the_embodiments_order(scene):
 def test_pictures_have_any_size(scene):
     scene.reset(0)
     for size in ((33, 47), (480, 640), (600, 900), (48, 64)):
-        picture = scene.render("top", *size)
-        assert picture.shape == (*size, 3)
-        assert picture.dtype == np.uint8
-        red = (picture[..., 0] > 150) & (picture[..., 1] < 100)
+        image = scene.render("top", *size)
+        assert image.shape == (*size, 3)
+        assert image.dtype == np.uint8
+        red = (image[..., 0] > 150) & (image[..., 1] < 100)
         assert red.any(), "the red cube is in sight"
 
 
@@ -201,14 +201,14 @@ def test_cheap_pictures_leave_out_shadows_and_multisampling():
 
 
 def test_cheap_pictures_show_the_same_scene():
-    pictures = []
+    images = []
     for quality in ("cheap", "reference"):
         drawn = AlohaScene(quality)
         drawn.reset(4)
-        pictures.append(drawn.render("top", 96, 128).astype(int))
+        images.append(drawn.render("top", 96, 128).astype(int))
         drawn.close()
-    assert np.abs(pictures[0] - pictures[1]).mean() < 12
-    assert (pictures[0] != pictures[1]).any()
+    assert np.abs(images[0] - images[1]).mean() < 12
+    assert (images[0] != images[1]).any()
 
 
 def test_a_missing_gym_aloha_is_named_with_its_install_command(monkeypatch):

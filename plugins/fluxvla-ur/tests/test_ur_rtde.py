@@ -475,9 +475,9 @@ class TestCameras:
 
     def test_pictures_are_rgb_and_a_camera_that_ends_is_silent(self, robot, connect, film):
         operator = connect(robot, cameras={"top": film}, height=48, width=64)
-        picture = operator.get_frame().images["top"]
-        assert picture.shape == (48, 64, 3)
-        assert abs(picture.mean(axis=(0, 1)) - [200, 20, 30]).max() < 8
+        image = operator.get_frame().images["top"]
+        assert image.shape == (48, 64, 3)
+        assert abs(image.mean(axis=(0, 1)) - [200, 20, 30]).max() < 8
 
         wait_for(lambda: time.monotonic() - operator._cameras[0].newest()[0] > 2.0)
         with pytest.raises(Stale, match=r"top is silent for \d"):
@@ -487,7 +487,7 @@ class TestCameras:
         camera = VideoCamera(Camera("top", 96, 128), film)
         camera.connect()
         wait_for(lambda: camera._newest)
-        with pytest.raises(BadMessage, match=r"camera top gives \(48, 64, 3\) pictures, the emb"):
+        with pytest.raises(BadMessage, match=r"camera top gives \(48, 64, 3\) images, the emb"):
             camera.newest()
         camera.close()
 

@@ -14,7 +14,7 @@ _ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: \([^)]*\))?:\s*(.*)$")
 def argument_texts(docstring: str | None) -> dict[str, str]:
     """Parameter -> its description, on one line; empty where there is no such section.
 
-    ``height, width: of the pictures`` is said of both.
+    ``height, width: of the images`` is said of both.
     """
     text = inspect.cleandoc(docstring or "")
     section = _SECTION.search(text)

@@ -20,7 +20,7 @@ class ForeignCheckpoint:
         model: the config's ``model`` table that builds the architecture.
         tensors: weights and buffers under the names of that model's ``state_dict``: torch tensors,
             or what ``safetensors_in`` and ``renamed`` give, which is read when it is used.
-        img_keys: cameras, in the order in which the model takes their pictures.
+        img_keys: cameras, in the order in which the model takes their images.
         transforms: tables of the transforms from a robot's observation to a batch; one of them
             normalises states and actions, and is able to undo it.
         statistics: ``{"private": {"proprio": {...}, "action": {...}}}``, what they normalise by.

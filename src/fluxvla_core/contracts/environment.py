@@ -53,7 +53,7 @@ class EnvironmentSpec:
             a chunk is one step.
         keep_together: going from one task to another takes seconds, so that episodes of one task
             are best run one after the other.
-        details: what else a report should state: how pictures are drawn, versions.
+        details: what else a report should state: how images are drawn, versions.
     """
 
     name: str
@@ -132,7 +132,7 @@ class Environment(Contract):
 
     @abstractmethod
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """The current observation, with a picture of each camera, in its size if possible.
+        """The current observation, with an image of each camera, in its size if possible.
 
         ``task_description`` is the language instruction: the task's, or one of the environment's
         own for this episode.
@@ -156,7 +156,7 @@ class Environment(Contract):
         return None
 
     def drawn_by(self) -> str:
-        """OpenGL backend and renderer of its pictures, for results; "" if unknown."""
+        """OpenGL backend and renderer of its images, for results; "" if unknown."""
         return ""
 
     @attribute

@@ -1,4 +1,4 @@
-"""One reading of a robot: its state, its pictures, and when each arrived."""
+"""One reading of a robot: its state, its images, and when each arrived."""
 
 from __future__ import annotations
 

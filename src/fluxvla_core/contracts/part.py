@@ -19,7 +19,7 @@ class Part(Enum):
 
     @property
     def cameras(self) -> bool:
-        """Whether it reads pictures."""
+        """Whether it reads images."""
         return self is not Part.WITHOUT_CAMERAS
 
     @property

@@ -152,11 +152,11 @@ class Operator(Contract):
     def pictures_after(
         self, camera: str, after: float
     ) -> tuple[Sequence[tuple[float, npt.NDArray[np.uint8]]], int]:
-        """Pictures that are kept for recordings, which then have all that arrive.
+        """Images that are kept for recordings, which then have all that arrive.
 
-        Stamps and ``(H, W, 3)`` uint8 RGB pictures, oldest first, and how many ever arrived.
+        Stamps and ``(H, W, 3)`` uint8 RGB images, oldest first, and how many ever arrived.
         Called often, from a thread of its own; ``after`` is the stamp of the last one it has.
-        Without this method recordings have the pictures of the frames.
+        Without this method recordings have the images of the frames.
         """
         return (), 0
 

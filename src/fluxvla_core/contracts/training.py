@@ -276,7 +276,7 @@ class _AnyTransform(Contract):
 
     def defer(self, sample: Sample) -> Sample:
         """As ``__call__``, but images are left for normalisation on the device."""
-        raise NotImplementedError(f"{type(self).__name__} normalises no pictures")
+        raise NotImplementedError(f"{type(self).__name__} normalises no images")
 
 
 class Transform(_AnyTransform):

@@ -50,7 +50,7 @@ class ParquetDataset(Dataset):
         data_root_path: one dataset's folder, or several, one after the other.
         transforms: tables of ``fluxvla.transforms``, or callables.
         img_keys: cameras, by feature (``observation.images.top``) or short name (``top``);
-            with none, samples have no pictures.
+            with none, samples have no images.
         action_window_size: T.
         action_key, state_key: features; ``action_key`` may be the state, see
             ``window_start_idx``.
@@ -210,7 +210,7 @@ class ParquetDataset(Dataset):
         return self.get_samples([SampleKey(epoch, index)])[0]
 
     def get_samples(self, keys: Sequence[SampleKey]) -> list[Sample]:
-        """Several samples at once; their pictures are read in the order of the files."""
+        """Several samples at once; their images are read in the order of the files."""
         self.prepare()
         places = [self._place(key.index) for key in keys]
         pictures = self._frames.read(places)

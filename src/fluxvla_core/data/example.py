@@ -88,7 +88,7 @@ def assumed_example(
     of_robot = "the robot's" if robot is not None else "the model's"
     assumed = [*notes, f"widths of states and actions are assumed to be {of_robot}"]
     if any(found is None for found in sizes.values()):
-        assumed.append(f"pictures are assumed to be {HEIGHT} x {WIDTH}")
+        assumed.append(f"images are assumed to be {HEIGHT} x {WIDTH}")
     sample: Sample = {
         "states": np.zeros(states, np.float32),
         "actions": np.zeros((size, actions), np.float32),

@@ -60,7 +60,7 @@ class Frames:
         if free is not None and needed > 0.8 * free:
             raise DataError(
                 f"cache_frames=True needs {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free",
-                next="--set train_dataloader.dataset.cache_frames=false, or resize the pictures "
+                next="--set train_dataloader.dataset.cache_frames=false, or resize the images "
                 "when recording",
             )
         total = sum(len(r) * len(t) for t, r in zip(self._tracks, self._rows, strict=True))

@@ -30,7 +30,7 @@ class PrivateInferenceDataset(InferenceDataset):
 
     Args:
         img_keys: cameras, as in training; ``observation.images.top`` and ``top`` mean the same.
-            With none the batch has no pictures.
+            With none the batch has no images.
         transforms: tables of ``fluxvla.transforms``, or callables.
         norm_stats: the statistics, or the path of ``dataset_statistics.json``.
         embodiment_id: the robot's number in a model of several.
@@ -65,11 +65,11 @@ class PrivateInferenceDataset(InferenceDataset):
         """Prepare one observation.
 
         Args:
-            observation: ``qpos`` ``(D,)``, ``task_description``, and pictures ``(H, W, 3)`` uint8
+            observation: ``qpos`` ``(D,)``, ``task_description``, and images ``(H, W, 3)`` uint8
                 RGB, either under ``images`` or flat, by camera.
 
         Raises:
-            DataError: a picture or the state is missing or of another type.
+            DataError: an image or the state is missing or of another type.
             ConfigError: there is no instruction, or a transform does not fit.
         """
         import torch
@@ -99,7 +99,7 @@ class PrivateInferenceDataset(InferenceDataset):
                 return _chw(name, image)
         have = sorted(k for k, v in images.items() if np.ndim(v) == 3)
         raise DataError(
-            f"the observation has no picture of camera {camera_name(key)!r}; "
+            f"the observation has no image of camera {camera_name(key)!r}; "
             f"it has {', '.join(have) or 'none'}"
         )
 

@@ -288,7 +288,7 @@ def _decode(track: Track, number: int, reporter: Reporter, done: int, total: int
 
 
 def _wrong_times(meta: Metadata, timestamp: npt.NDArray[Any]) -> list[str]:
-    """Episodes whose frames are not one period apart from 0 s on: other pictures would be shown."""
+    """Episodes whose frames are not one period apart from 0 s on: other images would be shown."""
     starts = meta.episodes.first_row
     frame = np.arange(len(timestamp)) - np.repeat(starts, meta.episodes.lengths)
     off = np.abs(timestamp.astype(np.float64) - frame / meta.fps) * meta.fps >= 0.5

@@ -218,7 +218,7 @@ def _check_picture(key: str, feature: Feature, where: str) -> None:
     sides = shape[1:] if fits and shape[0] == 3 != shape[2] else shape[:2]
     if not fits or sides[0] * sides[1] > MOST_PIXELS:
         raise DataError(
-            f"features.{key}.shape: a picture is height x width x channels, each side from 1 to "
+            f"features.{key}.shape: an image is height x width x channels, each side from 1 to "
             f"{LARGEST_SIDE}, at most {MOST_PIXELS // 1_000_000} million pixels; got "
             f"{list(shape)[:8]}",
             where=where,

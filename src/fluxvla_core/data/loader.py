@@ -39,7 +39,7 @@ class DictCollator(Collator):
         keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.
         meta_keys: kept as plain lists, one entry a sample.
 
-    What is left of normalising pictures (``image_scale``) is stacked without being listed.
+    What is left of normalising images (``image_scale``) is stacked without being listed.
 
     Keys that are configured but that no sample has are left out: one list serves datasets with
     and without ``embodiment_ids``.

@@ -129,7 +129,7 @@ class Metadata:
         """The feature of the camera ``name``, which is a feature or a camera's short name.
 
         Raises:
-            DataError: there is none, or its pictures are not in colour.
+            DataError: there is none, or its images are not in colour.
         """
         for key in (name, lerobot.image_feature(name)):
             if key in self.features:

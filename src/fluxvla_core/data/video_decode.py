@@ -195,7 +195,7 @@ class ImageColumnReader:
         kind = schema.field(column.key).type if column.key in schema.names else pa.null()
         if not pa.types.is_struct(kind) or kind.get_field_index("bytes") < 0:
             self.close()
-            raise DataError(f"{column} holds {kind}, not the bytes of pictures")
+            raise DataError(f"{column} holds {kind}, not the bytes of images")
         about = self._file.metadata
         sizes = [about.row_group(i).num_rows for i in range(about.num_row_groups)]
         self._ends = np.cumsum(sizes)
@@ -212,19 +212,19 @@ class ImageColumnReader:
         data = self._bytes(row)
         if data is None:
             raise DataError(
-                f"{self.path}: row {row} holds no picture, at most the name of one",
-                cause="the pictures were left in files of their own when this was written",
+                f"{self.path}: row {row} holds no image, at most the name of one",
+                cause="the images were left in files of their own when this was written",
             )
         stated = picture_size(data)
         if stated is not None and stated != self.path.size:
             raise DataError(
-                f"{self.path}: the picture of row {row} is {stated[0]} x {stated[1]}, "
+                f"{self.path}: the image of row {row} is {stated[0]} x {stated[1]}, "
                 f"info.json says {self.path.size[0]} x {self.path.size[1]}"
             )
         cv2 = opencv()
         image = stated and cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
-            raise DataError(f"{self.path}: the picture of row {row} cannot be decoded")
+            raise DataError(f"{self.path}: the image of row {row} cannot be decoded")
         out: Image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return out
 

@@ -84,7 +84,7 @@ class EpisodeEncoder:
     """Encode one episode of one camera to ``path``.
 
     Args:
-        height, width: of every picture, even numbers (the colour planes have half the size).
+        height, width: of every image, even numbers (the colour planes have half the size).
         fps: frames per second.
 
     Raises:
@@ -96,7 +96,7 @@ class EpisodeEncoder:
 
         if height % 2 or width % 2:
             raise DataError(
-                f"{path.stem}: pictures of {height} x {width} cannot be stored as video",
+                f"{path.stem}: images of {height} x {width} cannot be stored as video",
                 cause="height and width must be even",
                 next="collect them in another size (data collect: --cameras NAME --height H "
                 "--width W), or crop a pixel where they are made and say so in the embodiment",
@@ -116,7 +116,7 @@ class EpisodeEncoder:
             self._stream.codec_context.open()
 
     def add(self, image: npt.NDArray[np.uint8]) -> None:
-        """Encode the next picture, ``(height, width, 3)`` uint8 RGB."""
+        """Encode the next image, ``(height, width, 3)`` uint8 RGB."""
         av = libav()
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
@@ -138,7 +138,7 @@ class EpisodeEncoder:
 
 @dataclass(frozen=True)
 class Clip:
-    """``frames`` pictures of ``path`` from ``start`` seconds on, and how many bytes they take.
+    """``frames`` images of ``path`` from ``start`` seconds on, and how many bytes they take.
 
     ``delay`` is how many frames later than they are decoded some of them are shown; above 0 only
     for whole files.

@@ -244,7 +244,7 @@ class LeRobotWriter:
         return EpisodeBuffer(self._staging / "part", spec, fps, self._codec, self._sizes)
 
     def _sized(self) -> DatasetSettings:
-        """The recording with the pictures' true sizes in its embodiment."""
+        """The recording with the images' true sizes in its embodiment."""
         spec = self._recording.embodiment
         cameras = tuple(
             replace(c, height=self._sizes[c.name][0], width=self._sizes[c.name][1])

@@ -52,7 +52,7 @@ class Collection:
         tasks: names; all of the environment's by default.
         seed: seed of the first episode.
         cameras: names; all of the environment's by default.
-        height, width: size of all pictures; each camera's own by default.
+        height, width: size of all images; each camera's own by default.
         failures: also keep episodes in which the task was not done.
 
     Raises:
@@ -76,7 +76,7 @@ class Collection:
             raise ConfigError(f"seed must be from 0 to {SPARE_STRIDE - self.episodes}")
         for name, value in (("height", self.height), ("width", self.width)):
             if value is not None and value < 16:
-                raise ConfigError(f"{name}: pictures of {value} pixels are too small")
+                raise ConfigError(f"{name}: images of {value} pixels are too small")
 
 
 def collect(

@@ -134,7 +134,7 @@ class EnvironmentOperator(Operator):
             self.ticks = self.late = 0
 
     def get_frame(self) -> Frame:
-        """State and pictures of this moment."""
+        """State and images of this moment."""
         with self._lock:
             self._catch_up()
             now = self.clock.now()

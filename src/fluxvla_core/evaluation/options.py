@@ -34,9 +34,9 @@ class EvalOptions:
     norm_stats_key: str | None = None
     """which of the checkpoint's statistics."""
     height: int | None = None
-    """height of the policy's pictures; as in its training data by default."""
+    """height of the policy's images; as in its training data by default."""
     width: int | None = None
-    """width of the policy's pictures; as in its training data by default."""
+    """width of the policy's images; as in its training data by default."""
     device: str = "cpu"
     """torch device of the policy."""
     mixed_precision_dtype: str = "float32"
@@ -91,9 +91,9 @@ class EvalOptions:
     video_cameras: Sequence[str] | None = None
     """side by side; the environment's first by default."""
     video_height: int | None = None
-    """of each camera's picture; the environment's own by default."""
+    """of each camera's image; the environment's own by default."""
     video_width: int | None = None
-    """of each camera's picture; the environment's own by default."""
+    """of each camera's image; the environment's own by default."""
     video_fps: float = 10.0
     """frames a second."""
 
@@ -140,7 +140,7 @@ class EvalOptions:
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Height and width of the policy's pictures; None as in its training data."""
+        """Height and width of the policy's images; None as in its training data."""
         return None if self.height is None or self.width is None else (self.height, self.width)
 
     @property

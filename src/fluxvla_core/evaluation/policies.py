@@ -153,7 +153,7 @@ def match_policy(
 
     Args:
         policy: if it has no ``embodiment`` it is taken to be made for this environment.
-        size: height and width of all pictures; as in the policy's training data by default.
+        size: height and width of all images; as in the policy's training data by default.
 
     Raises:
         SpecMismatch: its numbers mean something else here: joints, units, frames, rotations,

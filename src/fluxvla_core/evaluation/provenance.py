@@ -157,12 +157,12 @@ def _collection(root: Path) -> dict[str, Any] | None:
 
 
 def rendering(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Rendering of the pictures of ``records``: ``sizes`` (camera -> height, width), and ``by``
+    """Rendering of the images of ``records``: ``sizes`` (camera -> height, width), and ``by``
     (GL backend and renderer), which has several entries where machines differ."""
-    pictures = [record["pictures"] for record in records if record.get("pictures")]
+    images = [record["pictures"] for record in records if record.get("pictures")]
     return {
-        "sizes": {name: size for each in pictures for name, size in each["sizes"].items()},
-        "by": sorted({each["by"] for each in pictures if each["by"]}),
+        "sizes": {name: size for each in images for name, size in each["sizes"].items()},
+        "by": sorted({each["by"] for each in images if each["by"]}),
     }
 
 

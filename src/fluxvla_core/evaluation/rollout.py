@@ -36,7 +36,7 @@ class RolloutSettings:
     """Settings of an episode, besides its environment, policy, task and seed.
 
     Args:
-        cameras: the pictures that the policy gets.
+        cameras: the images that the policy gets.
         replan_every: how many actions of a chunk are executed before the policy is queried again;
             all of them by default.
         max_steps: instead of the task's.
@@ -152,7 +152,7 @@ def run_episode(
         observed_at = time.perf_counter()
         chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
         answered = time.perf_counter()
-        del observation  # so that the next pictures can have its memory: fresh pages cost more
+        del observation  # so that the next images can have its memory: fresh pages cost more
         spent["observe"] += observed_at - at
         spent["policy"] += answered - observed_at
         calls += 1

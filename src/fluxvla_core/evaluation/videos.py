@@ -82,8 +82,8 @@ class VideoRecorder:
             return
         images = environment.observe(self._video.cameras)["images"]
         pictures = [images[camera.name] for camera in self._video.cameras]
-        lowest = min(picture.shape[0] for picture in pictures)
-        frame = np.hstack([picture[:lowest] for picture in pictures])
+        lowest = min(image.shape[0] for image in pictures)
+        frame = np.hstack([image[:lowest] for image in pictures])
         if self._writer is None:
             self._writer = VideoWriter(self._path, rate / stride, *frame.shape[:2])
         self._writer.add(frame)

@@ -50,7 +50,7 @@ class Settings:
             possible.
         sources: where the policy of ``policy`` and that of ``untrained`` come from.
         rollout: how episodes are run; its cameras are filled in for each policy.
-        size: height and width of the policy's pictures; as it was trained by default.
+        size: height and width of the policy's images; as it was trained by default.
         served: attributes of the policies that the parent serves, by group.
         live: on the wall clock instead of stepped.
     """

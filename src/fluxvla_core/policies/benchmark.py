@@ -1,7 +1,7 @@
 """How long a policy takes to answer: ``fluxvla bench-policy``.
 
 One observation after another is asked for a chunk, as a robot does. What is measured follows from
-the command line alone (pictures, states and weights are drawn from ``seed``), so that anybody can
+the command line alone (images, states and weights are drawn from ``seed``), so that anybody can
 repeat a published figure.
 """
 
@@ -103,7 +103,7 @@ def answers(policy: LocalPolicy, observations: Sequence[Observation]) -> npt.NDA
 def random_observations(
     policy: LocalPolicy, task: str, seed: int, count: int = 4
 ) -> list[Observation]:
-    """Pictures of noise of the robot's sizes, and states within its limits."""
+    """Images of noise of the robot's sizes, and states within its limits."""
     rng = np.random.default_rng(seed)
     robot = policy.embodiment
     joints = robot.state_joints or robot.joints
@@ -211,7 +211,7 @@ def inference_work(policy: LocalPolicy, observation: Observation) -> dict[str, W
 
 
 def fixture(observations: Sequence[Observation]) -> dict[str, npt.NDArray[Any]]:
-    """Pictures and states of all ``observations``, stacked: what was asked, to be kept."""
+    """Images and states of all ``observations``, stacked: what was asked, to be kept."""
     cameras = observations[0]["images"]
     found = {
         f"images.{name}": np.stack([o["images"][name] for o in observations]) for name in cameras

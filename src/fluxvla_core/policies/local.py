@@ -51,7 +51,7 @@ class LocalPolicy(Policy):
         prepare: observation -> batch of one.
         denormalize: ``{"action": (1, T, D), "states": (S,)}`` -> ``(T, dim)`` physical units.
         embodiment: the robot that it was trained for.
-        cameras: names of the pictures that ``prepare`` looks at.
+        cameras: names of the images that ``prepare`` looks at.
         action_rate_hz, horizon: rate and length of a chunk.
         device: the torch device of the model.
         precision: ``float32`` or ``bf16`` (autocast).
@@ -271,7 +271,7 @@ class LocalPolicy(Policy):
         }
 
     def _sized(self, observation: Observation) -> dict[str, Any]:
-        """The observation with pictures of the size that the policy was trained on.
+        """The observation with images of the size that the policy was trained on.
 
         The transforms may cut pixels by number. A camera with more pixels of the same view is
         scaled down; ``run_setup`` has refused another view.

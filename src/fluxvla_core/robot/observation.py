@@ -207,7 +207,7 @@ def _check_complete(window: dict[str, Any], cameras: Sequence[str]) -> None:
         raise NotReady("there are no joint states yet")
     missing = [name for name in cameras if window["images"].get(name) is None]
     if missing:
-        raise NotReady(f"there is no picture of {', '.join(missing)} yet")
+        raise NotReady(f"there is no image of {', '.join(missing)} yet")
 
 
 def _is_nothing(state: Any) -> bool:
@@ -287,7 +287,7 @@ def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]
         cameras: names of the cameras that are needed.
 
     Raises:
-        BadFrame: state of another shape or not finite; a camera missing; a picture that is not
+        BadFrame: state of another shape or not finite; a camera missing; an image that is not
             ``(height, width, 3)`` uint8 of the camera's size.
     """
     as_state(frame.state, embodiment, "the robot's state")
@@ -296,7 +296,7 @@ def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]
         image = frame.images.get(name)
         if image is None:
             raise BadFrame(
-                f"camera {name} gave no picture", cause="it is not connected, or has another name"
+                f"camera {name} gave no image", cause="it is not connected, or has another name"
             )
         if not isinstance(image, np.ndarray):
             raise BadFrame(f"camera {name} gives a {type(image).__name__}, not an array")
@@ -322,7 +322,7 @@ def fit_cameras(
         embodiment: the robot's.
         chosen: the config's ``camera_names``; None for those that the policy looks at.
         error: makes an error about a key of the config.
-        reporter: warns of pictures that are scaled.
+        reporter: warns of images that are scaled.
 
     Raises:
         SpecMismatch: the policy is for another robot, or for other views.
@@ -352,10 +352,10 @@ def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[
         names: the cameras that the policy looks at.
 
     Returns:
-        What is to be said of pictures that are scaled.
+        What is to be said of images that are scaled.
 
     Raises:
-        SpecMismatch: a camera's pictures have another aspect.
+        SpecMismatch: a camera's images have another aspect.
     """
     cameras = {camera.name: camera for camera in here.cameras}
     said = []
@@ -366,7 +366,7 @@ def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[
         if (now.height, now.width) == (then.height, then.width):
             continue
         sizes = (
-            f"camera {then.name} gives {now.height} x {now.width} pictures; the policy was "
+            f"camera {then.name} gives {now.height} x {now.width} images; the policy was "
             f"trained on {then.height} x {then.width}"
         )
         difference = abs(now.width * then.height - then.width * now.height)

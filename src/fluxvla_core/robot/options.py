@@ -32,7 +32,7 @@ class InferenceOptions:
     """let a process of its own command the robot, so that nothing that the policy or a hook does
     keeps the arm from being held. By default wherever that is possible (docs/control.md). An
     operator that cannot be divided (``Operator.without_cameras``) runs there as a whole, its
-    pictures included."""
+    images included."""
     ready_timeout: float = 10.0
     """seconds that the robot may take to give its first reading."""
 
@@ -101,7 +101,7 @@ class InferenceOptions:
     """folder for complete recordings, which ``ReplayOperator`` and ``ReplayPolicy`` play and
     Foxglove and ROS 2 open; by default an episode leaves its events and videos in the work dir."""
     record_fps: float | None = 10.0
-    """frames a second of the recorded videos, and of a simulation's recorded pictures; None records
+    """frames a second of the recorded videos, and of a simulation's recorded images; None records
     none."""
 
     def check(self, wrong: WrongKey) -> None:

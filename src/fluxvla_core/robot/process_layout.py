@@ -78,7 +78,7 @@ class ProcessLayout:
     def notice(self) -> str | None:
         """What to tell the user about it; None for nothing."""
         if self.frames is not None:
-            return f"{self.robot.name} is not divided: the control process reads its pictures too"
+            return f"{self.robot.name} is not divided: the control process reads its images too"
         if self.why_single_process is None or self.robot.lockstep:
             return None
         return f"no control process: {self.why_single_process}"

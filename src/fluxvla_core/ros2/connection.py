@@ -1,7 +1,7 @@
 """Connection to ROS 2: a node in a context, spun by one thread, shut down in the order that works.
 
 A ``MultiThreadedExecutor`` loses messages and burns a core in the rclpy releases that are in use;
-one thread that only stores messages keeps up with 240 VGA pictures a second. The context is our
+one thread that only stores messages keeps up with 240 VGA images a second. The context is our
 own, so several connections, on several domains, live in one process, and nobody else's
 ``rclpy.shutdown`` ends this one. rclpy's signal handlers stay out: they invalidate the context
 first, and then a last "hold" could not be published any more.
@@ -98,7 +98,7 @@ def _udp_alone() -> Iterator[None]:
     """Let the participant that is created meanwhile have UDP alone of Fast DDS's transports.
 
     https://fast-dds.docs.eprosima.com, ``FASTDDS_BUILTIN_TRANSPORTS``. What a user says in this
-    variable, or of transports in a profiles file, counts; ours for large frames is for pictures.
+    variable, or of transports in a profiles file, counts; ours for large frames is for images.
     """
     before = {name: os.environ.get(name) for name in (_TRANSPORTS, _PROFILES, _RANGE)}
     os.environ.setdefault(_TRANSPORTS, "UDPv4")
@@ -284,10 +284,10 @@ def _check_domain(domain_id: int | None) -> None:
 
 @functools.cache
 def keep_large_blocks() -> bool:
-    """Let the memory of one picture serve the next, in this process; whether the C library can.
+    """Let the memory of one image serve the next, in this process; whether the C library can.
 
-    A picture is larger than what malloc keeps: each message, and each copy of one, would be asked
-    of the kernel and given back to it, page by page, which takes longer than copying the picture
+    An image is larger than what malloc keeps: each message, and each copy of one, would be asked
+    of the kernel and given back to it, page by page, which takes longer than copying the image
     and stops the process's other threads meanwhile. glibc keeps larger blocks if configured to
     (mallopt(3)); other C libraries are left as they are. Memory stays bounded by what was in use at
     one time.

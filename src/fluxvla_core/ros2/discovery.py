@@ -59,7 +59,7 @@ def wrong_type(label: str, topic: str, wanted: str, present: Sequence[str]) -> N
     """The error for a topic that is published with another message type."""
     step = None
     if any(name.endswith("/CompressedImage") for name in present):
-        step = f"a compressed picture topic ends in /compressed; {topic} does not"
+        step = f"a compressed image topic ends in /compressed; {topic} does not"
     return NotReady(
         f"{label} is published as {', '.join(present)}, {wanted} is needed",
         cause="the topic belongs to another kind of driver",

@@ -15,14 +15,14 @@ from fluxvla_core.ros2.streams import CAMERA, DEPTH, Received, StreamSpec
 def pictures(
     specs: Sequence[StreamSpec], chosen: Mapping[str, Received]
 ) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, npt.NDArray[np.float32]]]:
-    """The colour and depth pictures of a frame, by camera name, in fresh arrays.
+    """The colour and depth images of a frame, by camera name, in fresh arrays.
 
     Args:
         specs: of any kind; cameras and depths are taken.
         chosen: stream name -> the message to convert.
 
     Raises:
-        BadMessage: a picture has another size or encoding than its camera; names stream and topic.
+        BadMessage: an image has another size or encoding than its camera; names stream and topic.
     """
     colours: dict[str, npt.NDArray[np.uint8]] = {}
     depths: dict[str, npt.NDArray[np.float32]] = {}
@@ -43,7 +43,7 @@ def pictures(
 def pictures_after(
     connection: Connection, specs: Sequence[StreamSpec], camera: str, after: float
 ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
-    """The colour pictures of a camera that are kept and newer than ``after``: see ``RosOperator``.
+    """The colour images of a camera that are kept and newer than ``after``: see ``RosOperator``.
 
     None for a camera that has no stream.
     """

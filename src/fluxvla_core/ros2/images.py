@@ -1,7 +1,7 @@
-"""``sensor_msgs/Image`` and ``CompressedImage`` to numpy and back; a picture is copied once.
+"""``sensor_msgs/Image`` and ``CompressedImage`` to numpy and back; an image is copied once.
 
 A message's ``data`` is an ``array.array``; numpy can look at it without copying (0.6 us for a VGA
-picture, against 18 ms through a list). Going back, only an ``array.array`` is taken as it is; bytes
+image, against 18 ms through a list). Going back, only an ``array.array`` is taken as it is; bytes
 and ndarrays are converted byte by byte, or refused when field checks are on.
 Encodings are those of sensor_msgs' ``image_encodings.hpp``; depth follows REP 118.
 """
@@ -29,7 +29,7 @@ _COLOUR: Mapping[str, tuple[int, tuple[int, int, int]]] = {
     "8UC1": (1, (0, 0, 0)),
 }
 GREY = ("mono8", "8UC1")
-"""Encodings of pictures without colours: taken only where the camera is said to have none."""
+"""Encodings of images without colours: taken only where the camera is said to have none."""
 _DEPTH: Mapping[str, type[np.generic]] = {
     "16UC1": np.uint16,
     "mono16": np.uint16,
@@ -58,7 +58,7 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
     else:
         known = ", ".join([*_COLOUR, *_DEPTH])
         raise BadMessage(
-            f"{source} sends pictures with encoding {encoding!r}; understood are {known}",
+            f"{source} sends images with encoding {encoding!r}; understood are {known}",
             next="set the camera driver to one of them (rgb8 costs the least)",
         )
     dtype: np.dtype[Any] = np.dtype(_DEPTH.get(encoding, np.uint8))
@@ -66,7 +66,7 @@ def view(message: Any, source: str = "image") -> npt.NDArray[Any]:
     size = message.step * (message.height - 1) + row if message.height else 0
     if message.step < row or len(message.data) < size:
         raise BadMessage(
-            f"{source} sends damaged pictures: {message.width}x{message.height} {encoding} with "
+            f"{source} sends damaged images: {message.width}x{message.height} {encoding} with "
             f"rows of {message.step} bytes needs {max(size, row)} bytes, got {len(message.data)}"
         )
     pixels: npt.NDArray[Any] = np.ndarray(
@@ -86,24 +86,24 @@ def to_rgb(
     """A fresh ``(height, width, 3)`` uint8 RGB array from an ``Image`` or ``CompressedImage``.
 
     Args:
-        grey: whether the camera has no colours: its pictures are alike in all three channels.
+        grey: whether the camera has no colours: its images are alike in all three channels.
 
     Raises:
-        BadMessage: another size, no colour picture, or damaged; names ``source``.
-        LoadFailed: a compressed picture, and no decoder is installed.
+        BadMessage: another size, no colour image, or damaged; names ``source``.
+        LoadFailed: a compressed image, and no decoder is installed.
     """
     if is_compressed(message):
-        picture = _decode(message, source, colour=True)
-        if picture.ndim == 2:
-            picture = picture[..., None].repeat(3, 2)
+        image = _decode(message, source, colour=True)
+        if image.ndim == 2:
+            image = image[..., None].repeat(3, 2)
             _check_colours(GREY[0], grey, source)
         _check_colours(message.format.partition(";")[0].strip(), grey, source)
-        _check_size(picture, height, width, source)
-        return picture
+        _check_size(image, height, width, source)
+        return image
     pixels = view(message, source)
     if message.encoding not in _COLOUR:
         raise BadMessage(
-            f"{source} sends {message.encoding} pictures, which have no colours",
+            f"{source} sends {message.encoding} images, which have no colours",
             cause="a depth topic is given where a colour topic belongs",
         )
     _check_colours(message.encoding, grey, source)
@@ -127,8 +127,8 @@ def to_depth(
     ``16UC1`` holds millimetres with 0 for nothing, ``32FC1`` metres with NaN (REP 118).
 
     Raises:
-        BadMessage: another size, no depth picture, or damaged; names ``source``.
-        LoadFailed: a compressed picture, and no decoder is installed.
+        BadMessage: another size, no depth image, or damaged; names ``source``.
+        LoadFailed: a compressed image, and no decoder is installed.
     """
     if is_compressed(message):
         pixels = _decode(message, source, colour=False)
@@ -137,7 +137,7 @@ def to_depth(
     else:
         view(message, source)
         raise BadMessage(
-            f"{source} sends {message.encoding} pictures, which hold no distances",
+            f"{source} sends {message.encoding} images, which hold no distances",
             cause="a colour topic is given where a depth topic belongs",
         )
     _check_size(pixels, height, width, source)
@@ -200,7 +200,7 @@ def fill_compressed(
         message.format = "16UC1; png compressed"
     else:
         raise ValueError(f"{form} cannot hold {encoding}; png can hold 16UC1")
-    cv2 = _opencv("compressed pictures are to be sent", "send them uncompressed")
+    cv2 = _opencv("compressed images are to be sent", "send them uncompressed")
     done, packed = cv2.imencode(f".{form}", np.ascontiguousarray(pixels))
     if not done:
         raise ValueError(f"OpenCV makes no {form} of {encoding} {pixels.shape}")
@@ -230,7 +230,7 @@ def _check_array(pixels: npt.NDArray[Any], encoding: str) -> int:
 def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) -> None:
     if pixels.shape[:2] != (height, width):
         raise BadMessage(
-            f"{source} sends {pixels.shape[1]}x{pixels.shape[0]} pictures, "
+            f"{source} sends {pixels.shape[1]}x{pixels.shape[0]} images, "
             f"the embodiment says {width}x{height}",
             next="set the camera driver's resolution, or the operator's height and width",
         )
@@ -239,7 +239,7 @@ def _check_size(pixels: npt.NDArray[Any], height: int, width: int, source: str) 
 def _check_colours(encoding: str, grey: bool, source: str) -> None:
     if encoding in GREY and not grey:
         raise BadMessage(
-            f"{source} sends {encoding} pictures, which have no colours",
+            f"{source} sends {encoding} images, which have no colours",
             cause="the camera's mode was changed, or the topic is an infrared or a grey camera's",
             next="set the driver to rgb8 or name the colour topic; a camera that has no colours is "
             "declared with encoding='mono8'",
@@ -247,26 +247,26 @@ def _check_colours(encoding: str, grey: bool, source: str) -> None:
 
 
 def _decode(message: Any, source: str, colour: bool) -> npt.NDArray[Any]:
-    cv2 = _opencv(f"{source} sends compressed pictures", "name the uncompressed topic")
+    cv2 = _opencv(f"{source} sends compressed images", "name the uncompressed topic")
     data = np.frombuffer(message.data, np.uint8)
     if colour:
-        picture = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if data.size else None
-        if picture is not None and picture.ndim == 2:
-            return np.asarray(picture)
-        if picture is not None:
-            return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if data.size else None
+        if image is not None and image.ndim == 2:
+            return np.asarray(image)
+        if image is not None:
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     elif message.format.startswith("16UC1"):
         data = data[_DEPTH_HEADER:] if "compressedDepth" in message.format else data
-        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if picture is not None and picture.dtype == np.uint16 and picture.ndim == 2:
-            return np.asarray(picture)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        if image is not None and image.dtype == np.uint16 and image.ndim == 2:
+            return np.asarray(image)
     else:
         raise BadMessage(
             f"{source} sends compressed depth as {message.format!r}; only 16UC1 is understood",
             next="name the uncompressed depth topic",
         )
     raise BadMessage(
-        f"{source} sends a compressed picture ({message.format!r}, {data.size} bytes) "
+        f"{source} sends a compressed image ({message.format!r}, {data.size} bytes) "
         "that cannot be decoded"
     )
 

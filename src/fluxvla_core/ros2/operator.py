@@ -2,7 +2,7 @@
 
 A subclass has ``embodiment``, lists its ``streams()`` and ``commands()``, makes a state vector of
 messages in ``read_state`` and messages of an action in ``publish_action``. Everything else is here:
-connecting and its checks, matching pictures and state in time, refusing bad actions before any I/O,
+connecting and its checks, matching images and state in time, refusing bad actions before any I/O,
 holding on ``stop``, and noticing a driver that falls silent or another node that commands the arm;
 and dividing the robot between two processes, with a node in each.
 """
@@ -157,7 +157,7 @@ class RosOperator(Operator):
             warnings.warn(message, DeprecationWarning, stacklevel=2)
             cls.check_command = vars(cls)["admit"]  # type: ignore[method-assign]
 
-    # The contract.
+    # Methods of the Operator contract.
 
     def without_cameras(self) -> RosOperator | None:
         """This operator, to be connected without a subscription to any camera.
@@ -208,7 +208,7 @@ class RosOperator(Operator):
                 raise
 
     def get_frame(self) -> RobotFrame:
-        """State and pictures that belong together, in fresh arrays, with their receipt stamps.
+        """State and images that belong together, in fresh arrays, with their receipt stamps.
 
         Waits up to ``max_age_s`` for messages that belong together; as a rule they are there.
 
@@ -231,7 +231,7 @@ class RosOperator(Operator):
         )
 
     def get_state(self) -> Array:
-        """The newest ``(state_dim,)`` state, without waiting, and without converting pictures.
+        """The newest ``(state_dim,)`` state, without waiting, and without converting images.
 
         Called after every command, it is also what notices a silent camera between two frames.
 
@@ -260,14 +260,14 @@ class RosOperator(Operator):
         """Images that a camera sent after a time, for recordings; any thread may call it.
 
         Args:
-            after: receipt time; earlier pictures are left out, and all but the newest few.
+            after: receipt time; earlier images are left out, and all but the newest few.
 
         Returns:
-            Receipt times and ``(H, W, 3)`` uint8 RGB pictures, oldest first; and how many arrived
+            Receipt times and ``(H, W, 3)`` uint8 RGB images, oldest first; and how many arrived
             since connecting.
 
         Raises:
-            BadMessage: a picture has another size or encoding than its camera.
+            BadMessage: an image has another size or encoding than its camera.
         """
         connection = self._connection
         if connection is None:

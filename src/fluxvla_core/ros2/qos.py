@@ -16,7 +16,7 @@ def reliability(offers: Iterable[Any]) -> str:
     """The QoS to subscribe with: ``reliable`` if every publisher offers it, else ``best_effort``.
 
     A reliable subscription is never matched with a best-effort publisher, while a best-effort one
-    is matched with any; and best effort loses pictures that a reliable one would have repaired.
+    is matched with any; and best effort loses images that a reliable one would have repaired.
 
     Args:
         offers: what ``Node.get_publishers_info_by_topic`` gives.

@@ -1,10 +1,10 @@
 """Startup checks of ``connect``: waits for streams, and names in the error what is missing.
 
-Message losses are counted because a robot that sees one picture in thirty looks like a robot with
+Message losses are counted because a robot that sees one image in thirty looks like a robot with
 a bad policy. Fast DDS hands messages to processes of the same machine through shared memory, in a
-segment of 512 KB that belongs to the publisher. A VGA picture has 900 KB: it is cut into pieces
+segment of 512 KB that belongs to the publisher. A VGA image has 900 KB: it is cut into pieces
 that overwrite one another before they are read. A reliable subscription gets the pieces again;
-with best effort (what camera drivers offer by default) 93 to 99 of 100 pictures are lost. Only the
+with best effort (what camera drivers offer by default) 93 to 99 of 100 images are lost. Only the
 publishing process can be given a larger segment. (On Jazzy a profile's transports are overridden
 while ``ROS_AUTOMATIC_DISCOVERY_RANGE`` is ``LOCALHOST``; there the publisher has to offer
 RELIABLE.)
@@ -132,9 +132,9 @@ class StartupChecks:
             raise self._losses_error(lost)
 
     def _warn_of_vendors(self) -> None:
-        """Log once which pictures may freeze this process (docs/ros2.md has the measurements)."""
-        pictures = [spec for spec in self._specs if spec.kind in (CAMERA, DEPTH)]
-        streams = [s for s in map(self._stream, pictures) if s.name not in self._warned]
+        """Log once which images may freeze this process (docs/ros2.md has the measurements)."""
+        images = [spec for spec in self._specs if spec.kind in (CAMERA, DEPTH)]
+        streams = [s for s in map(self._stream, images) if s.name not in self._warned]
         found = [s for s in streams if s.other_vendors and s.reliability == RELIABLE]
         if found:
             self._warned.update(stream.name for stream in found)
@@ -268,7 +268,7 @@ def losses_error(bad: list[ReceptionStats]) -> NotReady:
     if any(is_trap(r) and r.from_fast_dds for r in bad):
         return NotReady(
             what,
-            cause="the publisher offers best effort, and its pictures are larger than the 512 KB "
+            cause="the publisher offers best effort, and its images are larger than the 512 KB "
             "of Fast DDS's shared memory, so their pieces overwrite one another",
             next="start the publisher (not this program) with "
             f"FASTDDS_DEFAULT_PROFILES_FILE={large_frames_profile()}, or let it offer RELIABLE",
@@ -281,7 +281,7 @@ def losses_error(bad: list[ReceptionStats]) -> NotReady:
             "or its buffers drop the pieces",
             # Not RELIABLE: see vendor_warning.
             next="make the receive buffers of this machine larger (net.core.rmem_max; 'Robots on "
-            "another DDS' in docs/ros2.md says how), or the pictures smaller or compressed",
+            "another DDS' in docs/ros2.md says how), or the images smaller or compressed",
         )
     return NotReady(
         what,
@@ -292,9 +292,9 @@ def losses_error(bad: list[ReceptionStats]) -> NotReady:
 
 
 def vendor_warning(origins: Sequence[str]) -> str:
-    """The warning for reliable pictures from another DDS; ``origins`` says who publishes them."""
+    """The warning for reliable images from another DDS; ``origins`` says who publishes them."""
     return (
-        f"reliable pictures come from another DDS: {'; '.join(origins)}. When pieces of a large "
+        f"reliable images come from another DDS: {'; '.join(origins)}. When pieces of a large "
         "one are lost, Fast DDS can freeze this whole process (measured with Cyclone DDS). "
         "Let the publisher offer best effort, and start this program with "
         f"FASTDDS_DEFAULT_PROFILES_FILE={large_frames_profile()}, whose larger receive buffer "

@@ -17,9 +17,9 @@ STATE, CAMERA, DEPTH, AUXILIARY = "state", "camera", "depth", "auxiliary"
 """Kinds of streams. Auxiliary ones (a robot's mode, its base) must be fresh, but their messages are
 not matched in time with the others."""
 
-# Long enough to find the state that belongs to a picture that took 0.2 s, at 500 Hz.
+# Long enough to find the state that belongs to an image that took 0.2 s, at 500 Hz.
 _STATE_DEPTH = 128
-# Pictures are large; the newest few are enough to match cameras with one another.
+# Images are large; the newest few are enough to match cameras with one another.
 _PICTURE_DEPTH = 4
 # Messages that wait in the middleware while the ROS thread is busy elsewhere.
 _QUEUE = 10
@@ -33,13 +33,13 @@ class StreamSpec:
     """One subscription.
 
     Args:
-        name: the stream's name in frames and messages; a camera's name for pictures.
+        name: the stream's name in frames and messages; a camera's name for images.
         topic: the topic.
         message: its type, as ``sensor_msgs.msg:JointState``.
         kind: ``STATE``, ``CAMERA``, ``DEPTH`` or ``AUXILIARY``.
         depth: how many messages are kept.
         expected_hz: messages a second that should come; None: as many as are sent.
-        camera: size of the pictures, for ``camera`` and ``depth``.
+        camera: size of the images, for ``camera`` and ``depth``.
         required: whether ``connect`` waits for it; only auxiliary streams need not be. Otherwise it
             warns if nobody publishes it. Once a message arrived, more must come in either case.
         latched: a topic with ``transient_local`` durability (``latched`` in ROS 1), whose last
@@ -66,14 +66,14 @@ class StreamSpec:
 
 
 def depth_stream(camera: str) -> str:
-    """The name of the stream of a camera's depth pictures."""
+    """The name of the stream of a camera's depth images."""
     return f"{camera}_depth"
 
 
 def camera_stream(
     camera: Camera, topic: str, expected_hz: float | None = None, depth: bool = False
 ) -> StreamSpec:
-    """The stream of a camera's pictures; of its depth (named ``<camera>_depth``) if ``depth``.
+    """The stream of a camera's images; of its depth (named ``<camera>_depth``) if ``depth``.
 
     A topic that ends in ``/compressed`` or ``/compressedDepth`` carries ``CompressedImage``, as
     image_transport names them.
@@ -122,7 +122,7 @@ class Ring:
     """At most ``depth`` messages, oldest dropped first, in the order of the sender's stamps.
 
     A message that another overtook, or that comes twice, says nothing new; it is counted and
-    dropped, so that a driver repeating its last picture counts as silent. When the sender's clock
+    dropped, so that a driver repeating its last image counts as silent. When the sender's clock
     steps (a restart, NTP, a simulation that begins again), what came before the step is dropped,
     because it cannot be compared with what comes after. Any thread may call anything.
     """

@@ -100,7 +100,7 @@ def check_together(streams: Streams, max_skew: float, wall_offset: float | None 
     """Refuse parts of one state whose stamps say that they are of different times.
 
     What arrives at the same time and is stamped apart is a difference of clocks, or one sender is
-    that much later than the other: either way the newest messages do not belong together. Pictures
+    that much later than the other: either way the newest messages do not belong together. Images
     take longer than joint states, and are matched by their stamps instead.
 
     Args:

@@ -38,7 +38,7 @@ NO_SPEEDS = (
     "repeated rolls on"
 )
 LARGEST_SIDE = 16384
-"""Pixels of a picture's side: four times what robots' cameras have."""
+"""Pixels of an image's side: four times what robots' cameras have."""
 ROTATIONS = ("none", "axis_angle", "quaternion_wxyz", "quaternion_xyzw", "euler_xyz", "rotation_6d")
 
 
@@ -177,7 +177,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class EmbodimentSpec:
-    """A robot as a policy sees it: ``dim`` numbers in, ``dim`` numbers out, some pictures.
+    """A robot as a policy sees it: ``dim`` numbers in, ``dim`` numbers out, some images.
 
     Args:
         name: for people, for example ``aloha``.
@@ -287,7 +287,7 @@ def _is_speed(name: str) -> bool:
 def differences(a: EmbodimentSpec, b: EmbodimentSpec) -> list[str]:
     """Every difference that changes what a number means; limits and camera sizes may differ.
 
-    Limits belong to the robot that moves, and pictures are resized by the policy's own
+    Limits belong to the robot that moves, and images are resized by the policy's own
     transforms, so neither is compared.
     """
     found: list[str] = []

@@ -62,8 +62,8 @@ class _SameActions(RandomPolicy):
         self.seen: list[Any] = []
 
     def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
-        pictures = {name: image.tobytes() for name, image in observation["images"].items()}
-        self.seen.append((observation["qpos"].tolist(), pictures))
+        images = {name: image.tobytes() for name, image in observation["images"].items()}
+        self.seen.append((observation["qpos"].tolist(), images))
         return super().predict_action(observation)
 
 
@@ -79,7 +79,7 @@ class EnvironmentConformance:
     steps: ClassVar[int] = 12
     """Control steps of each episode here."""
     picture: ClassVar[tuple[int, int] | None] = (48, 64)
-    """Height and width of the pictures here; None for environments that draw in one size only."""
+    """Height and width of the images here; None for environments that draw in one size only."""
     seeds_differ: ClassVar[bool] = True
     """Whether another seed makes another episode."""
 
@@ -186,10 +186,10 @@ class EnvironmentConformance:
                     f"{sorted(seen['images'])}, expected that one: the policy looks at it"
                 )
                 assert image.dtype == np.uint8, (
-                    f"the picture of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
+                    f"the image of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
                 )
                 assert image.shape == (camera.height, camera.width, 3), (
-                    f"the picture of {camera.name} has the shape {image.shape}, expected "
+                    f"the image of {camera.name} has the shape {image.shape}, expected "
                     f"{(camera.height, camera.width, 3)}, as asked for"
                 )
             unasked = environment.observe(())["images"]
@@ -264,7 +264,7 @@ class EnvironmentConformance:
         task = self.tried(environment)[0]
         courses = {self.course(environment, task, seed) for seed in (1, 2, 3)}
         assert len(courses) > 1, (
-            "reset() with the seeds 1, 2 and 3 and the same actions gave the same states, pictures "
+            "reset() with the seeds 1, 2 and 3 and the same actions gave the same states, images "
             "and rewards, expected others: the seed is "
             "ignored, and fifty episodes would be one (set seeds_differ = False if that is meant)"
         )
@@ -293,7 +293,7 @@ class EnvironmentConformance:
         seen = self.episode(environment, task, cameras=self.cameras(environment))
         differ = unequal_keys(unseen, seen)
         assert not differ, (
-            f"an episode with pictures has another {', '.join(differ)} than one without, expected "
+            f"an episode with images has another {', '.join(differ)} than one without, expected "
             "the same: observe() moves the world, or draws from its generator"
         )
 

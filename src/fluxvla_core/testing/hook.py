@@ -44,7 +44,7 @@ class HookConformance(Conformance):
     joints: ClassVar[int] = 2
     """Of the robot that it watches: numbers of a state and of an action."""
     cameras: ClassVar[Mapping[str, tuple[int, int]]] = {"front": (4, 6)}
-    """Of the robot: name -> height and width of its pictures."""
+    """Of the robot: name -> height and width of its images."""
 
     @pytest.fixture
     def watched(self, tmp_path: Path) -> Watched:

@@ -119,7 +119,7 @@ class InferenceRunnerConformance(Conformance):
 
     def test_the_policy_is_asked_with_what_the_robot_sees(self, tmp_path: Path) -> None:
         robot, policy = self.robot(), self.policy()
-        pictures = {camera.name: robot.picture(camera) for camera in self.spec.cameras}
+        images = {camera.name: robot.picture(camera) for camera in self.spec.cameras}
         state = robot.state.copy()
         self.drive(tmp_path, robot, policy)
         assert policy.asked, "run() ended and the policy was never asked, expected a first question"
@@ -134,17 +134,17 @@ class InferenceRunnerConformance(Conformance):
             f"{state.tolist()}, the state of the robot in the order of its joints: the policy "
             "would take the arm to be elsewhere"
         )
-        missing = sorted(set(pictures) - set(first["images"]))
+        missing = sorted(set(images) - set(first["images"]))
         assert not missing, (
-            f"the first observation has no picture of {', '.join(missing)}, at which the policy "
+            f"the first observation has no image of {', '.join(missing)}, at which the policy "
             "looks (its cameras)"
         )
-        for name, picture in pictures.items():
+        for name, image in images.items():
             found = first["images"][name]
-            shown = [other for other, p in pictures.items() if equal(found, p)]
+            shown = [other for other, p in images.items() if equal(found, p)]
             assert name in shown, (
-                f"the first observation's picture of {name} is {_shown(found, shown)}, expected "
-                f"what the robot's {name} sees, {picture.shape} uint8 RGB"
+                f"the first observation's image of {name} is {_shown(found, shown)}, expected "
+                f"what the robot's {name} sees, {image.shape} uint8 RGB"
             )
 
     def test_commands_are_the_policys(self, tmp_path: Path) -> None:

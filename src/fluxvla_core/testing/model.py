@@ -54,10 +54,10 @@ class ModelConformance(Conformance):
     state_dim: ClassVar[int | None] = None
     """Numbers of a state; None: the constructor's ``state_dim`` or ``max_state_dim``, else 7."""
     cameras: ClassVar[int | None] = None
-    """Pictures of an observation, whose channels stand one behind the other; None: the
+    """Images of an observation, whose channels stand one behind the other; None: the
     constructor's ``num_cameras``, else 2."""
     picture: ClassVar[tuple[int, int] | None] = None
-    """Height and width of a picture; None: the constructor's ``image_size``, else 32 and 32."""
+    """Height and width of an image; None: the constructor's ``image_size``, else 32 and 32."""
     words: ClassVar[int] = 8
     """Tokens of a prompt."""
     vocabulary: ClassVar[int | None] = None
@@ -196,7 +196,7 @@ class ModelConformance(Conformance):
         stated = numbers(self.stated())
         takes = f"; {self.entry_point} was made with {stated}" if stated else ""
         hint = (
-            "set state_dim, cameras, picture, words, vocabulary and action_shape of this kit's "
+            "set state_dim, cameras, image, words, vocabulary and action_shape of this kit's "
             "subclass to what it takes, or override batch(model, size) (fluxvla plugins check: "
             f"--kit FILE with such a subclass){takes}"
         )

@@ -182,11 +182,11 @@ class OperatorConformance(DividedOperatorChecks):
         for camera in spec.cameras:
             image, shape = frame.images[camera.name], (camera.height, camera.width, 3)
             assert image.shape == shape, (
-                f"the picture of {camera.name} has the shape {image.shape}, expected {shape}: "
+                f"the image of {camera.name} has the shape {image.shape}, expected {shape}: "
                 "height, width and three colours, as the embodiment says"
             )
             assert image.dtype == np.dtype(np.uint8), (
-                f"the picture of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
+                f"the image of {camera.name} is {image.dtype}, expected uint8 from 0 to 255"
             )
         # What came with them, depth for one, has a stamp too.
         lacks = {STATE, *spec.camera_names} - set(frame.stamps)

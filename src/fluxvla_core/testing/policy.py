@@ -74,7 +74,7 @@ class PolicyConformance(Conformance):
         return spec
 
     def observation(self, policy: Actor, number: int = 0) -> Observation:
-        """Observation ``number``: a state near the middle of the limits, and pictures of noise."""
+        """Observation ``number``: a state near the middle of the limits, and images of noise."""
         spec = self.embodiment(policy)
         rng = np.random.default_rng(number)
         joints = {joint.name: joint for joint in spec.joints}

@@ -3,7 +3,7 @@
     python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
 
 ``Driver`` starts that process from a test, gives it orders and keeps what it received. It is a
-process of its own because drivers are: lost pictures, killed publishers and other settings after a
+process of its own because drivers are: lost images, killed publishers and other settings after a
 restart happen between processes only.
 Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
 """

@@ -45,9 +45,9 @@ class TransformConformance(Conformance):
     horizon: ClassVar[int] = 4
     """Actions of a chunk."""
     cameras: ClassVar[int] = 2
-    """Pictures of a sample."""
+    """Images of a sample."""
     picture: ClassVar[tuple[int, int]] = (24, 32)
-    """Height and width of a picture."""
+    """Height and width of an image."""
     draws: ClassVar[bool] = True
     """Whether one with ``needs_rng`` gives another result with another generator."""
 
@@ -90,7 +90,7 @@ class TransformConformance(Conformance):
     def apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:
         """Call it as the pipeline does."""
         hint = (
-            "set state_dim, horizon, cameras and picture of this kit's subclass to what it takes, "
+            "set state_dim, horizon, cameras and image of this kit's subclass to what it takes, "
             "or override sample(number) for one that comes after other transforms (fluxvla "
             "plugins check: --kit FILE with such a subclass)"
         )

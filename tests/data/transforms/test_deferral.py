@@ -1,4 +1,4 @@
-"""Pictures that travel as uint8 become, bit for bit, what their transform makes of them."""
+"""Images that travel as uint8 become, bit for bit, what their transform makes of them."""
 
 from __future__ import annotations
 

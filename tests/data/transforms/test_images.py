@@ -67,7 +67,7 @@ def test_resize_to_the_same_size_changes_nothing():
     ],
 )
 def test_joining_planes_is_concatenation_whatever_the_memory_is_like(change):
-    """Decoded pictures are views of (H, W, 3) memory, sometimes read-only or cut."""
+    """Decoded images are views of (H, W, 3) memory, sometimes read-only or cut."""
     views = [np.ascontiguousarray(picture(i).transpose(1, 2, 0)).transpose(2, 0, 1) for i in (0, 1)]
     images = frozen(*(change(view) for view in views))
     joined = join_planes(images)
@@ -148,7 +148,7 @@ def test_groups_that_fit_no_number_of_cameras():
 
 
 def test_a_crop_beyond_the_picture_is_refused():
-    with pytest.raises(DataError, match=r"rows 8:14, columns 0:4 are not in a picture of 12 x 16"):
+    with pytest.raises(DataError, match=r"rows 8:14, columns 0:4 are not in an image of 12 x 16"):
         CropImages(8, 0, 6, 4)({"images": [picture()]})
 
 
@@ -157,7 +157,7 @@ def test_wrong_shapes_say_what_is_likely():
         split_images([picture().transpose(1, 2, 0)])
     with pytest.raises(DataError, match=r"images of shape \(4, 5, 5\) are not \(3N, height, width"):
         split_images(np.zeros((4, 5, 5), np.uint8))
-    with pytest.raises(DataError, match="the sample has no pictures"):
+    with pytest.raises(DataError, match="the sample has no images"):
         split_images([])
 
 

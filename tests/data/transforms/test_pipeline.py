@@ -157,7 +157,7 @@ MARKS = ("<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>")
 
 
 class Marked(Letters):
-    """One id a letter, and one for each mark of a chat with pictures."""
+    """One id a letter, and one for each mark of a chat with images."""
 
     def encode(self, text):
         for i, mark in enumerate(MARKS):
@@ -209,11 +209,11 @@ def test_places_of_pictures_are_never_cut():
     [
         (
             {"task_description": "lift it", "img_masks": np.ones(3)},
-            "num_images is 2, the sample has 3 pictures",
+            "num_images is 2, the sample has 3 images",
         ),
         (
             {"task_description": "lift <IMG_CONTEXT>"},
-            "has 7 places for pictures, 6 expected",
+            "has 7 places for images, 6 expected",
         ),
         ({}, "ProcessPromptsWithImage: there is no instruction"),
     ],

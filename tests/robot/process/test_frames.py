@@ -234,10 +234,10 @@ def answering(operator, looks):
 
 def test_what_the_operator_raised_is_raised_here():
     operator = RemoteOperator("Arm", SPEC)
-    error = {"error": ["NotReady"], "rule": NotReady.rule, "what": "no picture yet"}
+    error = {"error": ["NotReady"], "rule": NotReady.rule, "what": "no image yet"}
     answering(operator, [FrameMessage({"error": error}), message_of_frame(frame(), NAMES, "a")])
 
-    with pytest.raises(NotReady, match="no picture yet"):
+    with pytest.raises(NotReady, match="no image yet"):
         operator.get_frame()
     assert_same(operator.get_frame(), frame())
     operator.close()

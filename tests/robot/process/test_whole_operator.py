@@ -39,7 +39,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 
 class OldArm(Operator):
-    """State and pictures in one; counts its frames in the first pixel. Its folder has the log."""
+    """State and images in one; counts its frames in the first pixel. Its folder has the log."""
 
     api = "1.0"
 
@@ -277,11 +277,11 @@ def test_an_episode_with_pictures_of_the_process_that_commands(tmp_path, module)
 
     assert run.runner.divided
     assert (result["outcome"], result["success"]) == ("max_steps", True)
-    assert "OldArm is not divided: the control process reads its pictures too" in run.notes.lines
+    assert "OldArm is not divided: the control process reads its images too" in run.notes.lines
     (connected,) = run.log("connected")
     assert connected[0] != os.getpid()
     run.assert_within_limits()
-    # Each picture is of a look of its own, and only the camera that the policy looks at is there.
+    # Each image is of a look of its own, and only the camera that the policy looks at is there.
     counts = []
     for images in run.policy.seen:
         assert set(images) == {"front"}

@@ -139,8 +139,8 @@ def test_jpegs_need_opencv_to_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_the_newest_picture_by_a_time(folder: Path) -> None:
-    pictures = open_recording(folder).pictures[CAMERA]
-    assert [pictures.newest(t) for t in (4.9, 5.0, 5.05, 5.1, 99.0)] == [None, 0, 0, 1, 19]
+    images = open_recording(folder).pictures[CAMERA]
+    assert [images.newest(t) for t in (4.9, 5.0, 5.05, 5.1, 99.0)] == [None, 0, 0, 1, 19]
 
 
 def test_what_is_cut_anywhere_is_read_up_to_there_and_can_be_finished(folder: Path) -> None:
@@ -237,7 +237,7 @@ def test_a_folder_that_is_there_is_not_written_over(folder: Path) -> None:
 
 def test_what_the_robot_cannot_give_hurts_nothing_else(tmp_path: Path) -> None:
     def broken(camera: str, after: float) -> Any:
-        raise DataError("the picture has another size")
+        raise DataError("the image has another size")
 
     trace = EpisodeTrace(tmp_path / "e", 10.0, Recording(NAMES, (CAMERA,), broken))
     trace.write({**START, "embodiment": SPEC.to_dict()})

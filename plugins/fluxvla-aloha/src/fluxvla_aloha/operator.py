@@ -46,9 +46,9 @@ class AlohaOperator(RosOperator):
 
     Args:
         preset: ``cobot_magic`` (AgileX) or ``interbotix``.
-        img_front_topic, img_left_topic, img_right_topic: colour pictures; a topic that ends in
+        img_front_topic, img_left_topic, img_right_topic: colour images; a topic that ends in
             ``/compressed`` carries ``CompressedImage``.
-        img_front_depth_topic, img_left_depth_topic, img_right_depth_topic: depth pictures.
+        img_front_depth_topic, img_left_depth_topic, img_right_depth_topic: depth images.
         puppet_arm_left_topic, puppet_arm_right_topic: joint states of the arms.
         puppet_arm_left_cmd_topic, puppet_arm_right_cmd_topic: their commands.
         puppet_gripper_left_cmd_topic, puppet_gripper_right_cmd_topic: commands of the grippers,
@@ -62,7 +62,7 @@ class AlohaOperator(RosOperator):
         publish_rate: commands a second.
         camera_names: what front, left and right camera are called, in this order; with fewer names
             the last cameras are not used.
-        height, width: of every picture, in pixels.
+        height, width: of every image, in pixels.
         joint_names: names of an arm's six joints and gripper in its messages.
         gripper_closed, gripper_open: a gripper's raw values at its ends.
         arm_message, gripper_message: types of the commands: ``sensor_msgs.msg:JointState``, one
@@ -70,7 +70,7 @@ class AlohaOperator(RosOperator):
         base_max_linear, base_max_angular: largest speeds of the base, in m/s and rad/s.
         base_max_linear_acceleration, base_max_angular_acceleration: how fast a policy may change
             them, in m/s^2 and rad/s^2.
-        camera_rate_hz: pictures a second that should come; None: as many as are sent.
+        camera_rate_hz: images a second that should come; None: as many as are sent.
         arms: ``viperx300``, ``arx_x5`` or ``piper``: whose limits are kept. The preset
             ``interbotix`` has the first; with ``cobot_magic`` nobody but you can tell, and without
             them :meth:`connect` refuses.

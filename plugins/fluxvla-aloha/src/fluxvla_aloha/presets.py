@@ -19,7 +19,7 @@ class Preset:
     """One kind of ALOHA. Pairs are left, right; triples are front, left, right.
 
     Args:
-        images, depths: picture topics.
+        images, depths: image topics.
         states, commands: of the arms.
         gripper_commands: of the grippers, where the arms' commands do not hold them.
         odometry, velocity: of the mobile base.

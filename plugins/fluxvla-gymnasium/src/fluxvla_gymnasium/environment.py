@@ -99,14 +99,14 @@ class GymnasiumEnvironment(MujocoEnvironment):
         instruction_from: instead: a text of the observation, which may be another in each episode.
         max_steps: steps after which an episode ends at the latest.
         state: parts of the observation that are the state, in this order, keys of nested parts
-            joined by dots; by default every part that is neither a picture nor text, by name.
+            joined by dots; by default every part that is neither an image nor text, by name.
         cameras: camera of the embodiment -> part of the observation, or ``render`` for what
             Gymnasium's ``render()`` gives; by default the part of that name.
         success: ``info`` (its ``is_success`` or ``success``), ``terminated``, or ``truncated``:
             it lasted until the time was up, as a pole that did not fall.
         success_reward: instead: a step's reward from which on the task is done.
         success_return: instead: a return, the sum of an episode's rewards, from which on it is.
-        render: ``cheap`` pictures (no shadows, no multisampling) where the simulator is MuJoCo, or
+        render: ``cheap`` images (no shadows, no multisampling) where the simulator is MuJoCo, or
             the environment's own: ``reference``.
 
     Raises:
@@ -238,10 +238,10 @@ class GymnasiumEnvironment(MujocoEnvironment):
         return Step(reward, self._done, terminated or bool(truncated) or self._done)
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """State and pictures; these are of the environment's sizes.
+        """State and images; these are of the environment's sizes.
 
         Raises:
-            SpecMismatch: there is no such picture.
+            SpecMismatch: there is no such image.
         """
         return {
             "qpos": self.state.astype(np.float32),
@@ -270,7 +270,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         ends = [name for name in found if name == key or name.endswith(f".{key}")]
         if len(ends) != 1:
             raise SpecMismatch(
-                f"{self.spec.name} has no picture {key!r}; it has {', '.join(found) or 'none'}",
+                f"{self.spec.name} has no image {key!r}; it has {', '.join(found) or 'none'}",
                 next=f"--set '<GymnasiumEnvironment>.cameras={{{camera} = \"NAME\"}}', "
                 "one of these or render",
             )

@@ -1,4 +1,4 @@
-"""A Gymnasium observation taken apart: arrays by name, pictures and texts among them."""
+"""A Gymnasium observation taken apart: arrays by name, images and texts among them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Parts = Mapping[str, npt.NDArray[Any]]
 def parts(observation: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
     """Arrays by name, sorted; the names of nested ones are joined by dots. Texts are arrays, too.
 
-    An observation that is one array has the name ``""``, or ``image`` if it is a picture.
+    An observation that is one array has the name ``""``, or ``image`` if it is an image.
 
     Raises:
         SpecMismatch: a part is neither an array of numbers nor text.
@@ -70,7 +70,7 @@ def pictures(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
 
 
 def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float64]:
-    """The parts ``keys``, or all that are neither pictures nor texts, as one row.
+    """The parts ``keys``, or all that are neither images nor texts, as one row.
 
     Raises:
         SpecMismatch: there is no such part, or it is a text.

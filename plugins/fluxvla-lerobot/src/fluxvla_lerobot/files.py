@@ -84,27 +84,26 @@ def describe(folder: Path, trust_remote_code: bool = False) -> Described:
     _refuse_remote_code(kind, {*before, *after}, trust_remote_code, where)
     seen = _renamed(before, folder)
     inputs = {name: entry for name, entry in inputs.items() if not name.startswith(EMPTY)}
-    pictures = {name: shape for name, (sort, shape) in inputs.items() if sort == "VISUAL"}
-    other = [name for name in inputs if name not in pictures and name != STATE]
+    images = {name: shape for name, (sort, shape) in inputs.items() if sort == "VISUAL"}
+    other = [name for name in inputs if name not in images and name != STATE]
     if other:
         raise CheckpointError(
             f"the policy takes {', '.join(other)}, which no observation has here",
             where=where,
-            cause="an observation has pictures, joint states (observation.state) and an "
-            "instruction",
+            cause="an observation has images, joint states (observation.state) and an instruction",
         )
     if ACTION not in outputs:
         raise CheckpointError(
             f"output_features has no {ACTION!r}; it has {', '.join(outputs) or 'nothing'}",
             where=where,
         )
-    for name, shape in pictures.items():
+    for name, shape in images.items():
         if len(shape) != 3:
             raise CheckpointError(f"{name} is {shape}, not channels, height, width", where=where)
     return Described(
         kind=kind,
-        cameras={name: camera_of(seen.get(name, name)) for name in pictures},
-        sizes={name: (shape[1], shape[2]) for name, shape in pictures.items()},
+        cameras={name: camera_of(seen.get(name, name)) for name in images},
+        sizes={name: (shape[1], shape[2]) for name, shape in images.items()},
         state_dim=_width(inputs[STATE][1], STATE, where) if STATE in inputs else None,
         action_dim=_width(outputs[ACTION][1], ACTION, where),
         before=tuple(before),

@@ -26,7 +26,7 @@ class LeRobot:
         config_class: ``PreTrainedConfig``, whose subclasses are the known policies.
         policy_class: the class of a policy's ``type``; imports its module.
         processors: makes a policy's pre- and postprocessor.
-        raw_batch: pictures, states and an instruction as LeRobot's robots give them.
+        raw_batch: images, states and an instruction as LeRobot's robots give them.
         normalizers: the classes of steps that normalise or undo it.
     """
 

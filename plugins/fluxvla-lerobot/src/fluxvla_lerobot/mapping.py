@@ -153,7 +153,7 @@ def pictures(
 
     Args:
         cameras: feature -> the robot's camera.
-        trained: cameras of the embodiment that the policy was trained for; larger pictures of the
+        trained: cameras of the embodiment that the policy was trained for; larger images of the
             same view are scaled down to theirs.
 
     Raises:
@@ -163,13 +163,13 @@ def pictures(
     for feature, name in cameras.items():
         if name not in observation["images"]:
             raise DataError(
-                f"the observation has no picture of {name!r}; it has "
+                f"the observation has no image of {name!r}; it has "
                 f"{', '.join(observation['images']) or 'none'}"
             )
         image = np.asarray(observation["images"][name])
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise DataError(
-                f"the picture of {name} is {image.shape} {image.dtype}; (H, W, 3) uint8 is expected"
+                f"the image of {name} is {image.shape} {image.dtype}; (H, W, 3) uint8 is expected"
             )
         camera = trained.get(name)
         if camera is not None and image.shape[:2] != (camera.height, camera.width):
@@ -181,7 +181,7 @@ def pictures(
 def check_sizes(
     described: Described, cameras: Mapping[str, str], sizes: Mapping[str, tuple[int, int]]
 ) -> None:
-    """Refuse pictures of another size than a policy was trained on that takes them as they are.
+    """Refuse images of another size than a policy was trained on that takes them as they are.
 
     Args:
         cameras: feature -> the robot's camera.
@@ -196,7 +196,7 @@ def check_sizes(
         expected, found = described.sizes[feature], sizes.get(name)
         if found is not None and found != expected:
             raise SpecMismatch(
-                f"camera {name} gives {found[0]} x {found[1]} pictures; the policy was trained on "
+                f"camera {name} gives {found[0]} x {found[1]} images; the policy was trained on "
                 f"{expected[0]} x {expected[1]}, and takes them as they are",
                 next=f"height = {expected[0]} and width = {expected[1]} in the evaluation; or an "
                 "embodiment whose cameras have the size of the training data",
@@ -204,8 +204,8 @@ def check_sizes(
 
 
 AS_THEY_ARE = frozenset({"act", "diffusion", "multi_task_dit", "tdmpc", "vqbet"})
-"""Types of LeRobot whose files state the size of the pictures that they were trained on. The others
-bring pictures to a size of their own, and keep the sizes of the model that they began from."""
+"""Types of LeRobot whose files state the size of the images that they were trained on. The others
+bring images to a size of their own, and keep the sizes of the model that they began from."""
 
 
 def _scaled(image: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
@@ -214,7 +214,7 @@ def _scaled(image: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint
     height, width = image.shape[:2]
     if abs(width * camera.height - camera.width * height) > 0.01 * height * camera.width:
         raise DataError(
-            f"camera {camera.name} gives {height} x {width} pictures; the policy was trained on "
+            f"camera {camera.name} gives {height} x {width} images; the policy was trained on "
             f"{camera.height} x {camera.width}: another view"
         )
     size = (camera.width, camera.height)

@@ -179,7 +179,7 @@ class LeRobotPolicy(Actor):
         """``(T, D)`` in the units and the order of the policy's data.
 
         Args:
-            seen: LeRobot's features: ``(H, W, 3)`` uint8 pictures, ``(S,)`` float32 states.
+            seen: LeRobot's features: ``(H, W, 3)`` uint8 images, ``(S,)`` float32 states.
         """
         import torch
 

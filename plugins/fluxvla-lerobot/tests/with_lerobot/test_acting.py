@@ -194,10 +194,10 @@ def test_another_robot_is_refused(folders):
         LeRobotPolicy(path, embodiment=seven.to_dict(), state=JOINTS)
     wide = EmbodimentSpec.from_dict({**ROBOT.to_dict()})
     wide = replace(wide, cameras=tuple(replace(c, width=128) for c in wide.cameras))
-    with pytest.raises(SpecMismatch, match=r"front gives 72 x 128 pictures; .* trained on 72 x 96"):
+    with pytest.raises(SpecMismatch, match=r"front gives 72 x 128 images; .* trained on 72 x 96"):
         LeRobotPolicy(path, embodiment=wide.to_dict())
     policy = LeRobotPolicy(path)
-    with pytest.raises(DataError, match="no picture of 'wrist'; it has front"):
+    with pytest.raises(DataError, match="no image of 'wrist'; it has front"):
         policy.predict_action(observation(0, CAMERAS[:1]))
     with pytest.raises(DataError, match=r"qpos has shape \(5,\); \(6,\) is expected"):
         policy.predict_action({**observation(0), "qpos": np.zeros(5, np.float32)})

@@ -1,6 +1,6 @@
 """A policy that LeRobot saved acts here and imported into this project's own families alike.
 
-Both begin with the same pictures, joint states and words, and end with joint commands. Noise is
+Both begin with the same images, joint states and words, and end with joint commands. Noise is
 drawn differently: LeRobot's policy is given what the imported one draws.
 """
 

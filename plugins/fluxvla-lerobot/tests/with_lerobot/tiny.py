@@ -163,5 +163,5 @@ def observation(
 
 def features(seen: dict) -> dict[str, np.ndarray]:
     """The same as LeRobot's robots have it."""
-    pictures = {feature_of(name): image.copy() for name, image in seen["images"].items()}
-    return {**pictures, "observation.state": seen["qpos"].copy()}
+    images = {feature_of(name): image.copy() for name, image in seen["images"].items()}
+    return {**images, "observation.state": seen["qpos"].copy()}

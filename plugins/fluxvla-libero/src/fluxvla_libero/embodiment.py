@@ -33,7 +33,7 @@ CAMERAS = {
 
 SCENE_CAMERAS = ("agentview", "robot0_eye_in_hand")
 PICTURE = 224
-"""Side of the pictures of the standard protocol, in pixels."""
+"""Side of the images of the standard protocol, in pixels."""
 
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
 

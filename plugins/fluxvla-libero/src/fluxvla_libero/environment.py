@@ -52,8 +52,8 @@ class LiberoEnvironment(MujocoEnvironment):
         mixed: each of these tasks in the scenes of all of them where it can be done: then the
             scene does not say what to do. Tasks are called ``<task>-in-scene-<index>``.
         cameras: of the scene, also by the names that public datasets give them.
-        height, width: of their pictures, if no other size is requested.
-        render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
+        height, width: of their images, if no other size is requested.
+        render: how images are drawn, see ``fluxvla_mujoco.drawing``.
         begin: ``fixed`` or ``random``.
         num_steps_wait: they do not count.
         protocol: ``fluxvla`` or ``openvla``; results of one do not compare with the other's.
@@ -88,7 +88,7 @@ class LiberoEnvironment(MujocoEnvironment):
                 f"LIBERO's scenes have no camera {unknown[0]!r}; they have {', '.join(CAMERAS)}"
             )
         if min(height, width) < 16:
-            raise ConfigError(f"pictures of {height}x{width} are too small")
+            raise ConfigError(f"images of {height}x{width} are too small")
         if begin not in (FIXED, RANDOM):
             raise ConfigError(f"begin {begin!r} is unknown; choose one of {FIXED}, {RANDOM}")
         if protocol not in (FLUXVLA, OPENVLA):
@@ -237,7 +237,7 @@ class LiberoEnvironment(MujocoEnvironment):
         return Step(float(success), success, success or instructed, dict(self._did))
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """State, instruction, and pictures in the sizes that are asked for.
+        """State, instruction, and images in the sizes that are asked for.
 
         Raises:
             SpecMismatch: there is no such camera.

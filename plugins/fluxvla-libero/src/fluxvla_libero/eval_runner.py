@@ -36,7 +36,7 @@ class LiberoEvalRunner(EvalRunner):
         task_suite_name: libero_spatial, _object, _goal, _10, _90, or one of LIBERO-PRO's.
         tasks: which of the suite's, by index or name; all by default.
         eval_chunk_size: how many actions of a chunk are executed before the next query.
-        resize_size: side of the policy's pictures, which are drawn in that size; as it was
+        resize_size: side of the policy's images, which are drawn in that size; as it was
             trained by default.
         num_trials_per_task: episodes for each task, from the first initial state on; at most 50.
         num_steps_wait: steps that the arm holds still before; they do not count.
@@ -47,7 +47,7 @@ class LiberoEvalRunner(EvalRunner):
         mixed_precision_dtype, enable_mixed_precision_training: ``bf16`` inference, if enabled.
         instruction_swap: repeat every episode with the instruction of another task that could be
             done in the same scene, and test whether the right one does better.
-        render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones (nor details),
+        render: ``cheap`` images (no shadows, no multisampling), ``coarse`` ones (nor details),
             or LIBERO's own: ``reference``.
         video_fps: at most 20.
         **options: as ``EvalRunner`` takes them.

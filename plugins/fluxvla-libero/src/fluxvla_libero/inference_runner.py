@@ -68,7 +68,7 @@ class LiberoInferenceRunner:
         mixed_precision_dtype, enable_mixed_precision_training, execution, quantization: see there.
         policy: ``checkpoint``, ``expert``, ``untrained``, ``random``, or a registered one's table.
         live_port: also show the episode, while it happens, to any browser on this machine.
-        video_size: side of the videos' pictures.
+        video_size: side of the videos' images.
         record_fps: of the videos; must divide 20.
         device: of torch.
         free_tasks: allow other instructions, as ``--free-task`` does.
@@ -234,7 +234,7 @@ class LiberoInferenceRunner:
 
     @contextmanager
     def _live(self) -> Iterator[Any]:
-        """A function that shows pictures side by side; it does nothing without a live view."""
+        """A function that shows images side by side; it does nothing without a live view."""
         if self.live_port is None:
             yield lambda pictures: None
             return

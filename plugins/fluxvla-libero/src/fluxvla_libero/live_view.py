@@ -1,4 +1,4 @@
-"""A live view: pictures as a stream that any browser shows, served on this machine only.
+"""A live view: images as a stream that any browser shows, served on this machine only.
 
 Motion JPEG, ``multipart/x-mixed-replace`` (RFC 2046 and Netscape's extension): each part replaces
 the one before. Somebody who looks from elsewhere forwards the port, as with
@@ -20,7 +20,7 @@ _BOUNDARY = "picture"
 
 
 class LiveView:
-    """Serves the newest picture until it is closed; use as a context manager.
+    """Serves the newest image until it is closed; use as a context manager.
 
     Args:
         port: 0 takes any that is free.
@@ -67,7 +67,7 @@ class LiveView:
         self._thread.start()
 
     def show(self, picture: npt.NDArray[np.uint8]) -> None:
-        """The newest ``(H, W, 3)`` uint8 RGB picture; viewers that are slow miss some."""
+        """The newest ``(H, W, 3)`` uint8 RGB image; viewers that are slow miss some."""
         import cv2
 
         _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]))

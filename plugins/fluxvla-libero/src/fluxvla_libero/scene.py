@@ -39,7 +39,7 @@ class LiberoScene:
 
     Args:
         task: the task.
-        render: how pictures are drawn, see ``fluxvla_mujoco.drawing``.
+        render: how images are drawn, see ``fluxvla_mujoco.drawing``.
 
     Raises:
         MissingPlugin, RunFailed: see ``require_libero``.
@@ -154,7 +154,7 @@ class LiberoScene:
 
     def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
         """``(height, width, 3)`` uint8 RGB of a camera of the scene, as the public datasets show
-        it: robosuite's pictures, which are upside down, turned by 180 degrees. That is upright,
+        it: robosuite's images, which are upside down, turned by 180 degrees. That is upright,
         with left and right exchanged."""
         if self._drawing is None:
             self._drawing = Drawing(self.model, self._render, SHOWN_GROUPS)
@@ -167,7 +167,7 @@ class LiberoScene:
         return hashlib.sha256(data.qpos.tobytes() + data.qvel.tobytes()).hexdigest()[:16]
 
     def close(self) -> None:
-        """Free the pictures' contexts and the simulator; any number of times."""
+        """Free the images' contexts and the simulator; any number of times."""
         if self._drawing is not None:
             self._drawing.close()
             self._drawing = None
@@ -205,7 +205,7 @@ class LiberoScene:
         # The controller is made from where the arm's base is, which a reset alone does not say.
         self._sim.reset()
         self._sim.forward()
-        # LIBERO's picture context does so once more, and the solver starts from what it found.
+        # LIBERO's image context does so once more, and the solver starts from what it found.
         self._sim.forward()
         for robot in env.robots:
             # The fingers' target, which is summed up from one command to the next.
@@ -235,7 +235,7 @@ class LiberoScene:
 def _follow(env: Any) -> Any:
     """``mujoco.MjData`` that shows where everything was when the state was last observed.
 
-    robosuite observes 2 ms before a control step ends, its pictures as well as its state.
+    robosuite observes 2 ms before a control step ends, its images as well as its state.
     """
     import mujoco
 
@@ -255,7 +255,7 @@ def _follow(env: Any) -> Any:
     return shown
 
 
-# Of MuJoCo's data, what a picture is drawn from.
+# Of MuJoCo's data, what an image is drawn from.
 _DRAWN = (
     "xpos",
     "xmat",

@@ -19,7 +19,7 @@ CAMERAS: Sequence[str] = (
     "gripperPOV",
 )
 TURNED = frozenset({"corner", "corner2", "corner3", "corner4"})
-"""Cameras that hang upside down in Meta-World's scenes; their pictures are turned by 180 degrees,
+"""Cameras that hang upside down in Meta-World's scenes; their images are turned by 180 degrees,
 as public datasets of Meta-World show ``corner2``."""
 
 PICTURE = 224

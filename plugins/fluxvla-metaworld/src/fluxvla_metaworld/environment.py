@@ -34,15 +34,15 @@ LIMIT = 500
 class MetaWorldEnvironment(MujocoEnvironment):
     """Meta-World's 50 tasks, each with its objects and goals placed by the episode's seed.
 
-    A policy sees pictures and the state (4,): the hand and its fingers. What Meta-World's own
+    A policy sees images and the state (4,): the hand and its fingers. What Meta-World's own
     observation says beyond that, objects and goals, is there for its scripted experts:
     ``privileged``. An episode ends with its first success.
 
     Args:
         tasks: ``MT50``, ``MT10``, or names in a list.
         cameras: which of the scene's, to look through by default; all can be asked for.
-        height, width: of their pictures.
-        render: ``cheap`` pictures (no shadows, no multisampling), or Meta-World's: ``reference``.
+        height, width: of their images.
+        render: ``cheap`` images (no shadows, no multisampling), or Meta-World's: ``reference``.
         max_steps: steps of 1/80 s after which an episode ends; at most 500.
 
     Raises:
@@ -68,7 +68,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
                 f"Meta-World's scenes have no camera {unknown[0]!r}; they have {', '.join(CAMERAS)}"
             )
         if min(height, width) < 16:
-            raise ConfigError(f"pictures of {height}x{width} are too small")
+            raise ConfigError(f"images of {height}x{width} are too small")
         if not 1 <= max_steps <= LIMIT:
             raise ConfigError(f"max_steps must be 1 to {LIMIT}, got {max_steps}")
         self.spec = EnvironmentSpec(
@@ -144,7 +144,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
         return Step(float(reward), self._success, self._success or bool(truncated))
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """The state, and pictures as public datasets of Meta-World show them: upright.
+        """The state, and images as public datasets of Meta-World show them: upright.
 
         Raises:
             ConfigError: there is no such camera.

@@ -1,7 +1,7 @@
 """ACT, the Action Chunking Transformer (Zhao et al. 2023, arXiv 2304.13705).
 
 A conditional variational autoencoder: in training an encoder compresses the demonstrated chunk to
-a latent, from which, with pictures and joint state, a transformer decodes the chunk; to act, the
+a latent, from which, with images and joint state, a transformer decodes the chunk; to act, the
 latent is the prior's mean, zero. Numbers equal those of LeRobot's implementation.
 """
 
@@ -19,14 +19,14 @@ from fluxvla_models.transformer import Decoder, Encoder, positions_1d, positions
 
 
 class ACT(VLA, nn.Module):
-    """Pictures and joint state in, action chunk out.
+    """Images and joint state in, action chunk out.
 
     Only dropout is drawn in the model: the latent's noise comes in with the batch. A loss depends
     on the number of processes while ``dropout`` is above 0.
 
     Args:
         state_dim, action_dim: joints; horizon: actions in a chunk.
-        num_cameras: pictures per sample, all seen by the same network.
+        num_cameras: images per sample, all seen by the same network.
         backbone, backbone_norm, backbone_width: see ``ResNet``. ``frozen_batch`` is meant for
             weights trained on ImageNet; ``group`` for training from nothing.
         backbone_weights: a file with torchvision's weights of ``backbone``, that a training starts

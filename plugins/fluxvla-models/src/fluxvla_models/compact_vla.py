@@ -18,7 +18,7 @@ from fluxvla_models.guidance import Guide
 
 
 class CompactVLA(VLA, nn.Module):
-    """Pictures, instruction and joint state in, action chunk out; a few million parameters.
+    """Images, instruction and joint state in, action chunk out; a few million parameters.
 
     ``forward`` and ``predict_action`` draw nothing: noise and times come in with the batch, so
     the same batch gives the same loss on one process and on many.

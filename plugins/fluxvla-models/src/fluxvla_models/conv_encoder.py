@@ -55,14 +55,14 @@ class SpatialSoftmax(nn.Module):
 
 
 class ConvEncoder(nn.Module):
-    """Pictures to a feature vector: patches, three residual stages, keypoints, a coarse map.
+    """Images to a feature vector: patches, three residual stages, keypoints, a coarse map.
 
     Args:
-        image_size: ``(height, width)`` of each picture, multiples of 16.
+        image_size: ``(height, width)`` of each image, multiples of 16.
         channels: widths of the three stages (strides 4, 8 and 16), multiples of 8.
         keypoints: spatial-softmax keypoints of the stages at stride 4 and at stride 8.
         map_channels: channels of the last stage's map, flattened and joined to the keypoints.
-        num_cameras: pictures per sample; each is encoded by the same weights.
+        num_cameras: images per sample; each is encoded by the same weights.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ from fluxvla_models.resnet import published
 
 
 class DiffusionPolicy(VLA, nn.Module):
-    """Pictures and joint state in, action chunk out.
+    """Images and joint state in, action chunk out.
 
     Nothing is drawn in the model: noise, steps and the places of crops come in with the batch, and
     the noise that DDPM adds on its way back follows from the noise that it starts from.
@@ -30,9 +30,9 @@ class DiffusionPolicy(VLA, nn.Module):
     Args:
         state_dim, action_dim: joints; horizon: actions in a chunk, a multiple of
             ``2 ** len(down_dims)``.
-        num_cameras: pictures per sample.
+        num_cameras: images per sample.
         n_obs_steps: observations that a chunk is made from, the present one last. With more than
-            one, pictures and states have a dimension for them behind the batch's; neither datasets
+            one, images and states have a dimension for them behind the batch's; neither datasets
             nor runners of FluxVLA give a model observations of earlier moments.
         backbone, backbone_norm, backbone_width: see ``ResNet``. ``batch`` is for checkpoints that
             were trained so; their statistics stay as they are.

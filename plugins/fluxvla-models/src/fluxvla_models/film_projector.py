@@ -9,7 +9,7 @@ from torch import Tensor, nn
 class FiLMProjector(nn.Module):
     """Visual features scaled and shifted by the instruction, joined with state and instruction.
 
-    The scaling is FiLM (Perez et al. 2018): the instruction chooses what in the picture counts.
+    The scaling is FiLM (Perez et al. 2018): the instruction chooses what in the image counts.
 
     Args:
         vision_dim, text_dim, state_dim: widths of what comes in; the model fills them in.

@@ -37,12 +37,12 @@ def position_grid(height: int, width: int, device: torch.device | str = "cpu") -
 
 
 class KeypointEncoder(nn.Module):
-    """Pictures ``(B, 3, H, W)`` to feature vectors ``(B, 2 * keypoints)``.
+    """Images ``(B, 3, H, W)`` to feature vectors ``(B, 2 * keypoints)``.
 
     Args:
         backbone, norm, width: see ``ResNet``.
         keypoints: how many.
-        resize: ``(height, width)`` that pictures are resized to first, bilinear, antialiased.
+        resize: ``(height, width)`` that images are resized to first, bilinear, antialiased.
         crop: ``(height, width)`` that is cut from them then: the middle, or where ``forward`` says.
     """
 
@@ -68,7 +68,7 @@ class KeypointEncoder(nn.Module):
         corner between its first and its last possible row and column.
 
         Raises:
-            ConfigError: a picture is smaller than the crop.
+            ConfigError: an image is smaller than the crop.
         """
         if self.resize is not None:
             images = functional.interpolate(
@@ -85,9 +85,9 @@ def cropped(images: Tensor, size: tuple[int, ...], places: Tensor | None) -> Ten
     spare = images.shape[-2] - height, images.shape[-1] - width
     if min(spare) < 0:
         raise ConfigError(
-            f"pictures of {images.shape[-2]} x {images.shape[-1]} pixels are smaller than "
+            f"images of {images.shape[-2]} x {images.shape[-1]} pixels are smaller than "
             f"crop_shape {height} x {width}",
-            next="resize_shape or crop_shape of the model, or larger pictures",
+            next="resize_shape or crop_shape of the model, or larger images",
         )
     if places is None:
         top, left = round(spare[0] / 2), round(spare[1] / 2)

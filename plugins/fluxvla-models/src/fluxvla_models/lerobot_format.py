@@ -208,7 +208,7 @@ def features_of(
 
 
 def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
-    """The policy's cameras, by feature, and the height and width of their pictures.
+    """The policy's cameras, by feature, and the height and width of their images.
 
     Raises:
         CheckpointError: it has none, their sizes differ, or it takes what no robot has.
@@ -219,7 +219,7 @@ def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[in
     if len(sizes) != 1 or any(len(shape) != 3 or shape[0] != 3 for shape in sizes):
         told = ", ".join(f"{name} {shape}" for name, shape in found.items()) or "none"
         raise CheckpointError(
-            f"cameras with pictures of one size are expected, the policy has {told}", where=where
+            f"cameras with images of one size are expected, the policy has {told}", where=where
         )
     other = [name for name, (kind, _) in features.items() if kind not in ("VISUAL", "STATE")]
     if other:

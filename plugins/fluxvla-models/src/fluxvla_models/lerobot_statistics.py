@@ -131,7 +131,7 @@ def tables(
     """Transforms from a robot's observation to a batch, and their statistics.
 
     Args:
-        cameras: the pictures' features, in the order of the model; size: their height and width.
+        cameras: the images' features, in the order of the model; size: their height and width.
         joints, dim: widths of state and action.
     """
     scales = [normalization.affine(name, "VISUAL", 3) for name in cameras]

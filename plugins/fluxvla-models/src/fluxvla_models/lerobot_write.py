@@ -1,6 +1,6 @@
 """Writing ACT and Diffusion Policy as LeRobot 0.6 saves them: config, weights and processors.
 
-LeRobot's policies take pictures as cameras give them and normalise each camera by itself; what it
+LeRobot's policies take images as cameras give them and normalise each camera by itself; what it
 cannot say, such as resizing before the policy, is refused rather than lost.
 """
 
@@ -57,7 +57,7 @@ class Preparation:
         features: ``input_features`` and ``output_features``: name -> type and shape.
         modes: ``VISUAL``, ``STATE``, ``ACTION`` -> how it is normalised.
         statistics: ``<feature>.<statistic>`` -> numbers.
-        size: height and width of pictures.
+        size: height and width of images.
     """
 
     features: Mapping[str, Mapping[str, Any]]
@@ -197,11 +197,11 @@ def _preparation(checkpoint: ForeignCheckpoint, model: Mapping[str, Any]) -> Pre
     tables = _acting(checkpoint.transforms)
     size = _size(checkpoint, tables.pop("ResizeImages", None))
     numbers = tables.pop("NormalizeStatesAndActions", None)
-    pictures = next((tables.pop(n) for n in _PICTURES if n in tables), None)
-    if numbers is None or pictures is None or tables:
+    images = next((tables.pop(n) for n in _PICTURES if n in tables), None)
+    if numbers is None or images is None or tables:
         what = f"{next(iter(tables))} is" if tables else "a normalisation is not"
         raise CheckpointError(
-            f"{what} among the transforms; LeRobot's processors only normalise: pictures, states "
+            f"{what} among the transforms; LeRobot's processors only normalise: images, states "
             "and actions",
             next="train with ResizeImages, NormalizeImages and NormalizeStatesAndActions",
         )
@@ -226,9 +226,9 @@ def _preparation(checkpoint: ForeignCheckpoint, model: Mapping[str, Any]) -> Pre
         rows, modes[kind] = _numbers(entries[key], numbers, norm_type, feature, width)
         features[feature] = {"type": kind, "shape": [width]}
         statistics |= {f"{feature}.{name}": _float(row) for name, row in rows.items()}
-        if feature == STATE:  # LeRobot has pictures between the two
+        if feature == STATE:  # LeRobot has images between the two
             for name, (mean, std) in zip(
-                checkpoint.img_keys, _scales(pictures, len(checkpoint.img_keys)), strict=True
+                checkpoint.img_keys, _scales(images, len(checkpoint.img_keys)), strict=True
             ):
                 camera = name if name.startswith("observation.") else f"observation.images.{name}"
                 features[camera] = {"type": "VISUAL", "shape": [3, *size]}
@@ -252,7 +252,7 @@ def _acting(tables: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]
 
 
 def _size(checkpoint: ForeignCheckpoint, resize: Mapping[str, Any] | None) -> tuple[int, int]:
-    """Height and width of pictures, which LeRobot takes as the cameras give them."""
+    """Height and width of images, which LeRobot takes as the cameras give them."""
     robot = checkpoint.embodiment
     used = (
         [camera for camera in robot.cameras if camera.name in checkpoint.img_keys] if robot else []
@@ -263,15 +263,15 @@ def _size(checkpoint: ForeignCheckpoint, resize: Mapping[str, Any] | None) -> tu
     if len(sizes) != 1:
         listed = ", ".join(f"{height} x {width}" for height, width in sorted(sizes)) or "none"
         raise CheckpointError(
-            f"LeRobot's policy takes pictures of one size as its cameras give them; cameras and "
+            f"LeRobot's policy takes images of one size as its cameras give them; cameras and "
             f"ResizeImages have {listed}",
-            next="record and train with pictures of the size that the policy sees",
+            next="record and train with images of the size that the policy sees",
         )
     return sizes.pop()
 
 
 def _scales(table: Mapping[str, Any], cameras: int) -> list[tuple[Floats, Floats]]:
-    """Offset and scale, each ``(3,)``, of each camera's pictures in 0..1."""
+    """Offset and scale, each ``(3,)``, of each camera's images in 0..1."""
     if str(table["type"]).endswith("SimpleNormalizeImages"):
         return [(np.full(3, 0.5), np.full(3, 0.5))] * cameras
     means, stds = (np.asarray(table[name], np.float64).reshape(-1, 3) for name in ("means", "stds"))
@@ -324,7 +324,7 @@ def _is_range(offset: Floats, scale: Floats, min: Floats, max: Floats) -> bool:
 
 
 def _crop(resize: Sequence[int] | None, crop: Sequence[int] | None) -> dict[str, Any]:
-    """LeRobot's settings: where pictures are resized first, the crop is a share of their sides."""
+    """LeRobot's settings: where images are resized first, the crop is a share of their sides."""
     if resize is None or crop is None:
         return {
             "resize_shape": None if resize is None else list(resize),

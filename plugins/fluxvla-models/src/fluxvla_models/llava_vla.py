@@ -23,7 +23,7 @@ Part = Mapping[str, Any] | nn.Module
 
 
 class LlavaVLA(VLA, nn.Module):
-    """Pictures and an instruction through a vision-language model, its hidden states to actions.
+    """Images and an instruction through a vision-language model, its hidden states to actions.
 
     Either ``vlm_backbone``, or ``vision_backbone``, ``projector`` and ``llm_backbone``, whose input
     are then the projected patches followed by the instruction (Liu et al. 2023, LLaVA).

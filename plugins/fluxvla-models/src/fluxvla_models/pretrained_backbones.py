@@ -19,11 +19,11 @@ from fluxvla_core.models import model_folder as checked_folder
 
 
 class SigLIPBackbone(nn.Module):
-    """SigLIP's picture encoder (Zhai et al. 2023): a feature for each patch of each camera.
+    """SigLIP's image encoder (Zhai et al. 2023): a feature for each patch of each camera.
 
     Args:
         model_folder: of a ``siglip`` or ``siglip_vision_model``.
-        num_cameras: pictures per sample, all seen by the same encoder.
+        num_cameras: images per sample, all seen by the same encoder.
         pretrained: load the folder's weights; else they are drawn anew, which is right where a
             checkpoint overwrites them.
 
@@ -159,7 +159,7 @@ class PaliGemmaBackbone(nn.Module):
     def forward(
         self, images: Tensor, img_masks: Tensor, tokens: Tensor, masks: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Hidden states ``(B, L, out_dim)`` and their masks ``(B, L)``, pictures first.
+        """Hidden states ``(B, L, out_dim)`` and their masks ``(B, L)``, images first.
 
         Args:
             images: ``(B, 3N, H, W)`` in -1..1; img_masks: ``(B, N)``; tokens, masks: ``(B, L)``.
@@ -264,7 +264,7 @@ def split_views(images: Tensor, cameras: int, size: int) -> Tensor:
         )
     if tuple(images.shape[2:]) != (size, size):
         raise ConfigError(
-            f"pictures are {images.shape[2]} x {images.shape[3]}, the encoder sees {size} x {size}",
+            f"images are {images.shape[2]} x {images.shape[3]}, the encoder sees {size} x {size}",
             next=f"dict(type='ResizeImages', height={size}, width={size})",
         )
     return images.reshape(len(images) * cameras, 3, size, size)

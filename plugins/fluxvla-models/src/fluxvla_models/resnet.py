@@ -107,7 +107,7 @@ class BasicBlock(nn.Module):
 
 
 class ResNet(nn.Module):
-    """Pictures ``(B, 3, H, W)`` to the last stage's map ``(B, 8 * width, ceil(H/32), ceil(W/32))``.
+    """Images ``(B, 3, H, W)`` to the last stage's map ``(B, 8 * width, ceil(H/32), ceil(W/32))``.
 
     Args:
         name: ``resnet18`` or ``resnet34``.

@@ -164,7 +164,7 @@ def positions_1d(length: int, width: int, device: torch.device) -> Tensor:
 
 
 def positions_2d(height: int, width: int, channels: int, device: torch.device) -> Tensor:
-    """Positions of a picture's rows and columns, ``(1, height * width, channels)``.
+    """Positions of an image's rows and columns, ``(1, height * width, channels)``.
 
     Half of the channels say the row, half the column, each counted from 1 and scaled to 0..2 pi
     (DETR's, Carion et al. 2020, appendix A.4).

@@ -1,11 +1,11 @@
-"""Pictures of a MuJoCo scene, drawn when they are asked for and at the price of a control loop.
+"""Images of a MuJoCo scene, drawn when they are asked for and at the price of a control loop.
 
 Simulators draw with MuJoCo's default quality: 4096-pixel shadow maps and 4x multisampling, which
-take about ten times as long as the picture itself on a software renderer. ``render='cheap'`` turns
-both off; ``'reference'`` gives the stock pictures, byte for byte. ``'coarse'`` is cheap, and draws
+take about ten times as long as the image itself on a software renderer. ``render='cheap'`` turns
+both off; ``'reference'`` gives the stock images, byte for byte. ``'coarse'`` is cheap, and draws
 meshes with details below 6 mm left out: where they are scans of hundreds of thousands of faces that
 is several times as fast again, and close-ups look chipped. Which one it was belongs into whatever
-is reported about the pictures.
+is reported about the images.
 
 Importing this module imports no simulator.
 """
@@ -25,7 +25,7 @@ from fluxvla_core.errors import ConfigError, RunFailed
 
 RENDERS = ("cheap", "coarse", "reference")
 DETAIL = 0.006
-"""Metres; what is smaller is left out of coarse pictures."""
+"""Metres; what is smaller is left out of coarse images."""
 _FEW_FACES = 500
 APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 
@@ -116,7 +116,7 @@ _drawn_by: set[str] = set()
 def note_renderer() -> None:
     """Remember what draws; called where an OpenGL context is current.
 
-    In a module-wide set, because contexts are made in many places and pictures say nothing of it.
+    In a module-wide set, because contexts are made in many places and images say nothing of it.
     """
     try:
         from OpenGL import GL
@@ -131,7 +131,7 @@ def note_renderer() -> None:
 
 
 def drawn_by() -> str:
-    """GL backend and renderer of this process's pictures, ``egl: llvmpipe (…)``; "" without any."""
+    """GL backend and renderer of this process's images, ``egl: llvmpipe (…)``; "" without any."""
     return "; ".join(sorted(_drawn_by))
 
 

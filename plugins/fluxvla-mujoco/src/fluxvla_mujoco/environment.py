@@ -31,7 +31,7 @@ class MujocoEnvironment(Environment):
         return divergence(self.simulation)
 
     def drawn_by(self) -> str:
-        """OpenGL backend and renderer of this process's pictures; "" before the first one."""
+        """OpenGL backend and renderer of this process's images; "" before the first one."""
         return drawn_by()
 
 

@@ -1,13 +1,13 @@
 """Contents of a published folder besides its tensors: sizes, statistics, robot.
 
-OpenVLA-OFT's files do not say how long a chunk is, how many pictures there are, or which of
+OpenVLA-OFT's files do not say how long a chunk is, how many images there are, or which of
 several statistics are meant: its code takes them from words of the command line. A folder may hold
 ``fluxvla_openvla.json`` that says so, with any of these keys:
 
 * ``unnorm_key``: which entry of the statistics;
 * ``img_keys``: cameras, in the model's order;
 * ``horizon``, ``action_rate_hz``: of a chunk;
-* ``interpolation``, ``center_crop``: how pictures are resized, and whether the middle 0.9 of them
+* ``interpolation``, ``center_crop``: how images are resized, and whether the middle 0.9 of them
   is cut out, as after training with augmentation;
 * ``bounds``, ``gripper``: of ``NormalizeOpenVLA``;
 * ``model``: a table that goes over the model's (sizes of other towers).
@@ -177,7 +177,7 @@ def language_table(config: Mapping[str, Any], native: bool) -> dict[str, Any]:
 
 
 def check_config(config: Mapping[str, Any], folder: Path) -> None:
-    """Refuse other towers than DINOv2 and SigLIP at 224 pixels, and other pictures or bins.
+    """Refuse other towers than DINOv2 and SigLIP at 224 pixels, and other images or bins.
 
     Raises:
         CheckpointError: with what the config says.

@@ -1,7 +1,7 @@
-"""Pictures as OpenVLA's code prepares them: resize, crop, and augmentation in training.
+"""Images as OpenVLA's code prepares them: resize, crop, and augmentation in training.
 
 ``sample["images"]`` is as of the core's transforms: uint8, a list of ``(3, H, W)`` or one
-``(3N, H, W)``. The model takes pictures in -1..1 (the core's ``SimpleNormalizeImages``), which is
+``(3N, H, W)``. The model takes images in -1..1 (the core's ``SimpleNormalizeImages``), which is
 SigLIP's normalisation, and makes DINOv2's of them itself.
 """
 
@@ -20,12 +20,12 @@ from fluxvla_core.errors import ConfigError
 
 Image = npt.NDArray[np.uint8]
 CROPPED = "cropped"
-"""Key of a sample whose pictures have been cropped."""
+"""Key of a sample whose images have been cropped."""
 INTERPOLATIONS = ("bicubic", "lanczos")
 
 
 class ResizeOpenVLAImages(Transform):
-    """Resize every picture to a square without keeping its aspect, by Pillow, which antialiases.
+    """Resize every image to a square without keeping its aspect, by Pillow, which antialiases.
 
     Args:
         size: pixels of a side.
@@ -46,7 +46,7 @@ class ResizeOpenVLAImages(Transform):
         self.interpolation = interpolation
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """The sample with pictures ``(3N, size, size)`` uint8."""
+        """The sample with images ``(3N, size, size)`` uint8."""
         resized = [self._resize(image) for image in split_images(sample["images"])]
         return {**sample, "images": np.concatenate(resized)}
 
@@ -62,13 +62,13 @@ class ResizeOpenVLAImages(Transform):
 
 
 class RandomCropOpenVLAImages(RandomTransform):
-    """Cut out a square of ``area`` of the picture at random and resize it back.
+    """Cut out a square of ``area`` of the image at random and resize it back.
 
     Source: OpenVLA's fine-tuning, which takes 0.9. Acting, ``CenterCropOpenVLAImages`` cuts out the
     middle; it comes after this one in the list and leaves alone what has been cropped.
 
     Args:
-        area: share of the picture's area.
+        area: share of the image's area.
     """
 
     training_only = True
@@ -77,7 +77,7 @@ class RandomCropOpenVLAImages(RandomTransform):
         self.side = _side(area, type(self).__name__)
 
     def __call__(self, sample: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-        """The sample with pictures of the same size, cropped at one place each."""
+        """The sample with images of the same size, cropped at one place each."""
         cropped = []
         for image in split_images(sample["images"]):
             top, left = rng.uniform(0.0, 1.0 - self.side, 2)
@@ -86,17 +86,17 @@ class RandomCropOpenVLAImages(RandomTransform):
 
 
 class CenterCropOpenVLAImages(Transform):
-    """Cut out the middle ``area`` of the picture and resize it back, unless it has been cropped.
+    """Cut out the middle ``area`` of the image and resize it back, unless it has been cropped.
 
     Args:
-        area: share of the picture's area, as in training.
+        area: share of the image's area, as in training.
     """
 
     def __init__(self, area: float = 0.9) -> None:
         self.side = _side(area, type(self).__name__)
 
     def __call__(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """The sample with pictures of the same size."""
+        """The sample with images of the same size."""
         if CROPPED in sample:
             return {key: value for key, value in sample.items() if key != CROPPED}
         begin = (1.0 - self.side) / 2
@@ -106,7 +106,7 @@ class CenterCropOpenVLAImages(Transform):
 
 
 class JitterOpenVLAColors(RandomTransform):
-    """Change brightness, contrast, saturation and hue at random, each picture by itself.
+    """Change brightness, contrast, saturation and hue at random, each image by itself.
 
     Source: OpenVLA's fine-tuning, whose values are the defaults; the operations are TensorFlow's.
 
@@ -135,7 +135,7 @@ class JitterOpenVLAColors(RandomTransform):
         self.saturation, self.hue = saturation, hue
 
     def __call__(self, sample: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-        """The sample with changed pictures, uint8."""
+        """The sample with changed images, uint8."""
         changed = [self._jitter(image, rng) for image in split_images(sample["images"])]
         return {**sample, "images": np.concatenate(changed)}
 
@@ -149,13 +149,13 @@ class JitterOpenVLAColors(RandomTransform):
 
 
 def crop_and_resize(image: Image, top: float, left: float, side: float) -> Image:
-    """Cut out a rectangle and resize it to the picture's size, linearly and without antialiasing.
+    """Cut out a rectangle and resize it to the image's size, linearly and without antialiasing.
 
     As TensorFlow's ``crop_and_resize``: the rectangle's first and last samples lie on its borders.
 
     Args:
         image: ``(3, H, W)`` uint8.
-        top, left, side: of the rectangle, as shares of the picture.
+        top, left, side: of the rectangle, as shares of the image.
     """
     height, width = image.shape[1:]
     pixels = image.astype(np.float32) / 255

@@ -1,7 +1,7 @@
-"""The language model, and how prompts, pictures and actions stand in its sequence.
+"""The language model, and how prompts, images and actions stand in its sequence.
 
-The sequence is: first token, pictures (and what else is projected), the rest of the prompt,
-actions. Padding stands between the pictures and the rest of the prompt, so that the last token of
+The sequence is: first token, images (and what else is projected), the rest of the prompt,
+actions. Padding stands between the images and the rest of the prompt, so that the last token of
 every prompt is followed at once by the actions. It is masked out, and positions count without it:
 the published models, whose padding follows at the end, compute the same.
 """

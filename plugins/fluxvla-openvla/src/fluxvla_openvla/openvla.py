@@ -19,13 +19,13 @@ from fluxvla_openvla.sizes import LanguageSize, TowerSize
 
 
 class OpenVLA(Prismatic):
-    """One picture and an instruction in, one action out, as ``action_dim`` tokens.
+    """One image and an instruction in, one action out, as ``action_dim`` tokens.
 
     The defaults are OpenVLA-7B (7.54 billion parameters).
 
     Args:
         action_dim: dimensions of an action; each is one token.
-        image_size: pixels of a picture's side.
+        image_size: pixels of an image's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         predict_stop_token: learn the token after the actions too, as OpenVLA does.
         freeze_vision_backbone: do not train the towers that see.
@@ -74,7 +74,7 @@ class OpenVLA(Prismatic):
             ``loss``, scalar, and ``sample_losses`` ``(B,)``.
 
         Raises:
-            ConfigError: pictures or actions of another shape.
+            ConfigError: images or actions of another shape.
         """
         self.check_actions(actions)
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
@@ -114,8 +114,10 @@ class OpenVLA(Prismatic):
         return self.action_tokens.decode(tokens).unsqueeze(1)
 
     def _sequence(self, images: Tensor, prompt: Prompt) -> tuple[Tensor, Tensor]:
-        """Embeddings ``(B, S, width)`` of pictures and prompt, and which of them are real."""
-        seen = self.see(images, prompt)
-        embeddings = torch.cat([self.embed(prompt.first), seen, self.embed(prompt.rest)], 1)
-        front = torch.ones(len(seen), 1 + seen.shape[1], dtype=torch.bool, device=seen.device)
+        """Embeddings ``(B, S, width)`` of images and prompt, and which of them are real."""
+        features = self.encode_images(images, prompt)
+        embeddings = torch.cat([self.embed(prompt.first), features, self.embed(prompt.rest)], 1)
+        front = torch.ones(
+            len(features), 1 + features.shape[1], dtype=torch.bool, device=features.device
+        )
         return embeddings, torch.cat([front, prompt.mask], 1)

@@ -28,18 +28,18 @@ from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize
 
 
 class OpenVLAOFT(Prismatic):
-    """Pictures, instruction and joint state in, an action chunk out.
+    """Images, instruction and joint state in, an action chunk out.
 
     The defaults are the published LIBERO policies: chunks of 8 actions of 7 dimensions, two
-    pictures, a state of 8 numbers, L1 regression.
+    images, a state of 8 numbers, L1 regression.
 
     Args:
         horizon, action_dim: of a chunk.
-        num_images: pictures of an observation, the third-person one first.
+        num_images: images of an observation, the third-person one first.
         state_dim: numbers of the state; 0 for a policy that does not see it.
         head: ``l1`` or ``diffusion``.
         use_film: modulate the vision features by the instruction (OpenVLA-OFT+, for ALOHA).
-        image_size: pixels of a picture's side.
+        image_size: pixels of an image's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         num_train_steps, num_inference_steps: of the diffusion, in training and acting.
         freeze_vision_backbone: do not train the towers that see.
@@ -134,21 +134,21 @@ class OpenVLAOFT(Prismatic):
             ``loss``, scalar, and ``sample_losses`` ``(B,)``.
 
         Raises:
-            ConfigError: pictures, actions or states of another shape.
+            ConfigError: images, actions or states of another shape.
         """
         self.check_actions(actions)
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
-        seen = self._context(images, prompt, states)
+        context = self._context(images, prompt, states)
         if self.head == "l1":
-            errors = (self._head(seen, prompt) - actions).abs()
+            errors = (self._head(context, prompt) - actions).abs()
         else:
             assert noise is not None
             assert time is not None
             steps, drawn = time[:, 0].long(), noise[:, 0]
             kept = kept_share(self.num_train_steps).to(steps.device)[steps, None, None]
             noised = kept.sqrt() * actions + (1 - kept).sqrt() * drawn
-            step = step_embedding(steps, seen.shape[2])
-            errors = (self._head(seen, prompt, noised, step) - drawn).square()
+            step = step_embedding(steps, context.shape[2])
+            errors = (self._head(context, prompt, noised, step) - drawn).square()
         if action_masks is not None:
             errors = errors * action_masks.unsqueeze(-1)
         return {"loss": errors.mean(), "sample_losses": errors.detach().mean((1, 2))}
@@ -172,7 +172,7 @@ class OpenVLAOFT(Prismatic):
         lang_masks: Tensor,
         states: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Pictures and state ``context`` ``(B, P, width)``, and the prompt, split."""
+        """Images and state ``context`` ``(B, P, width)``, and the prompt, split."""
         prompt = self.read_prompt(images, lang_tokens, lang_masks)
         context = self._context(images, prompt, states)
         return {"context": context, **vars(prompt)}
@@ -215,21 +215,21 @@ class OpenVLAOFT(Prismatic):
         return True
 
     def _context(self, images: Tensor, prompt: Prompt, states: Tensor | None) -> Tensor:
-        """Pictures and state: ``(B, P, width)``."""
-        seen = self.see(images, prompt)
+        """Images and state: ``(B, P, width)``."""
+        features = self.encode_images(images, prompt)
         if not self.state_dim:
-            return seen
+            return features
         if states is None or states.shape[-1] != self.state_dim:
             shape = None if states is None else tuple(states.shape)
             raise ConfigError(
                 f"OpenVLAOFT: states have shape {shape}, state_dim is {self.state_dim}",
                 cause="the model was made for another robot, or its state is not in the batch",
             )
-        return torch.cat([seen, self.proprio_projector(states).unsqueeze(1)], 1)
+        return torch.cat([features, self.proprio_projector(states).unsqueeze(1)], 1)
 
     def _head(
         self,
-        seen: Tensor,
+        context: Tensor,
         prompt: Prompt,
         noised: Tensor | None = None,
         step: Tensor | None = None,
@@ -239,16 +239,18 @@ class OpenVLAOFT(Prismatic):
         Places of actions hold zeros, or their noised numbers, one a token; ``step`` ``(B, width)``
         says how much noise there is.
         """
-        batch, count = len(seen), self.horizon * self.action_dim
-        places = torch.zeros(batch, count, seen.shape[2], dtype=seen.dtype, device=seen.device)
+        batch, count = len(context), self.horizon * self.action_dim
+        places = torch.zeros(
+            batch, count, context.shape[2], dtype=context.dtype, device=context.device
+        )
         if noised is not None and step is not None:
             places = self.noisy_action_projector(noised.reshape(batch, count, 1))
-            seen = torch.cat([seen, step.to(seen.dtype).unsqueeze(1)], 1)
-        front = [self.embed(prompt.first), seen]
+            context = torch.cat([context, step.to(context.dtype).unsqueeze(1)], 1)
+        front = [self.embed(prompt.first), context]
         back = [places, self.embed(self.stop_tokens(batch))]
         embeddings = torch.cat([*front, self.embed(prompt.rest), *back], 1)
-        real = torch.ones(embeddings.shape[:2], dtype=torch.bool, device=seen.device)
-        begin = 1 + seen.shape[1]
+        real = torch.ones(embeddings.shape[:2], dtype=torch.bool, device=context.device)
+        begin = 1 + context.shape[1]
         real[:, begin : begin + prompt.mask.shape[1]] = prompt.mask
         states = hidden_states(self.language_model, embeddings, real, causal=False)
         # As with tokens, an action's numbers are read at the places before them.

@@ -28,8 +28,8 @@ class Prismatic(VLA, nn.Module):
 
     Args:
         horizon, action_dim: of a chunk.
-        num_images: pictures of an observation.
-        image_size: pixels of a picture's side.
+        num_images: images of an observation.
+        image_size: pixels of an image's side.
         dino, siglip, language: sizes, as tables of what differs from OpenVLA-7B's.
         use_film: modulate the vision features by the mean of the prompt's embeddings.
 
@@ -95,8 +95,8 @@ class Prismatic(VLA, nn.Module):
         """Token ids ``(B, L)`` -> embeddings ``(B, L, width)``."""
         return self.language_model.model.embed_tokens(tokens)
 
-    def see(self, images: Tensor, prompt: Prompt) -> Tensor:
-        """Pictures ``(B, 3N, H, W)`` in -1..1 -> ``(B, N * patches, width)``.
+    def encode_images(self, images: Tensor, prompt: Prompt) -> Tensor:
+        """Images ``(B, 3N, H, W)`` in -1..1 -> ``(B, N * patches, width)``.
 
         With FiLM by the mean of the prompt's embeddings, the stop token's among them, padding not.
         OpenVLA-OFT's code averages the padding of shorter prompts in a batch too, which made
@@ -115,10 +115,10 @@ class Prismatic(VLA, nn.Module):
         return torch.full((batch, 1), self.size.stop_token, device=device)
 
     def read_prompt(self, images: Tensor, lang_tokens: Tensor, lang_masks: Tensor) -> Prompt:
-        """Check the pictures and split the prompt.
+        """Check the images and split the prompt.
 
         Raises:
-            ConfigError: another number of pictures, or another size.
+            ConfigError: another number of images, or another size.
         """
         expected = (3 * self.num_images, self.image_size, self.image_size)
         if tuple(images.shape[1:]) != expected:
@@ -126,7 +126,7 @@ class Prismatic(VLA, nn.Module):
                 f"{type(self).__name__}: images have shape {tuple(images.shape[1:])}, "
                 f"{self.num_images} x 3 planes of {self.image_size} x {self.image_size} "
                 "are expected",
-                cause="img_keys and num_images disagree, or no transform resizes the pictures",
+                cause="img_keys and num_images disagree, or no transform resizes the images",
                 next="let img_keys name as many cameras as num_images says, and put "
                 "ResizeOpenVLAImages into the transforms",
             )
@@ -153,8 +153,8 @@ def _check(
 ) -> None:
     if dino.patch_size != siglip.patch_size or image_size % dino.patch_size:
         raise ConfigError(
-            f"{who}: pictures of {image_size} pixels, patches of {dino.patch_size} (dino) and "
-            f"{siglip.patch_size} (siglip): both towers must cut a picture into the same whole "
+            f"{who}: images of {image_size} pixels, patches of {dino.patch_size} (dino) and "
+            f"{siglip.patch_size} (siglip): both towers must cut an image into the same whole "
             "patches"
         )
     for name, size in (("dino", dino), ("siglip", siglip)):

@@ -15,7 +15,7 @@ TEMPLATE = "In: What action should the robot take to {instruction}?\nOut:"
 EMPTY_TOKEN = 29871
 """Llama's token of a lone space, which stood before the actions in training."""
 FIRST_TOKEN = 1
-"""``<s>``: pictures stand behind it."""
+"""``<s>``: images stand behind it."""
 
 
 class ProcessOpenVLAPrompts(Transform):
@@ -69,7 +69,7 @@ class ProcessOpenVLAPrompts(Transform):
         if not ids or ids[0] != FIRST_TOKEN:
             raise ConfigError(
                 f"ProcessOpenVLAPrompts: the prompt's first token is {ids[0] if ids else None}, "
-                f"not {FIRST_TOKEN} (<s>), behind which the pictures stand",
+                f"not {FIRST_TOKEN} (<s>), behind which the images stand",
                 cause="the tokenizer is not Llama 2's, or its files do not say that it adds <s>",
             )
         if ids[-1] != self.empty_token:

@@ -111,8 +111,8 @@ def with_new_parts(
 
     Args:
         changes: the model's parameters that OpenVLA does not have.
-        platform: how its pictures, states and actions are prepared.
-        cameras: names of the pictures.
+        platform: how its images, states and actions are prepared.
+        cameras: names of the images.
         seed: of the new weights.
 
     Raises:

@@ -43,8 +43,8 @@ class Attention(nn.Module):
         batch, tokens, width = x.shape
         qkv = self.qkv(x).reshape(batch, tokens, 3, self.num_heads, width // self.num_heads)
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
-        seen = functional.scaled_dot_product_attention(query, key, value)
-        return self.proj(seen.transpose(1, 2).reshape(batch, tokens, width))
+        attended = functional.scaled_dot_product_attention(query, key, value)
+        return self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
 
 
 class Mlp(nn.Module):
@@ -124,7 +124,7 @@ class Tower(nn.Module):
 
     Args:
         size: of its parts.
-        image_size: pixels of a picture's side.
+        image_size: pixels of an image's side.
         language_width: see ``Block``.
     """
 
@@ -167,7 +167,7 @@ class DinoSiglip(nn.Module):
 
     Args:
         dino, siglip: sizes of the towers.
-        image_size: pixels of a picture's side.
+        image_size: pixels of an image's side.
         language_width: see ``Block``.
     """
 
@@ -180,14 +180,14 @@ class DinoSiglip(nn.Module):
         self.width = dino.width + siglip.width
 
     def forward(self, images: Tensor, language: Tensor | None = None) -> Tensor:
-        """Pictures to features.
+        """Images to features.
 
         Args:
             images: ``(B, 3N, H, W)`` in -1..1, which is SigLIP's normalisation.
             language: ``(B, language_width)`` for FiLM.
 
         Returns:
-            ``(B, N * patches, width)``, one picture after the other.
+            ``(B, N * patches, width)``, one image after the other.
         """
         batch, planes = images.shape[:2]
         count = planes // 3
@@ -217,7 +217,7 @@ class Projector(nn.Module):
 
 
 def for_dino(images: Tensor) -> Tensor:
-    """Pictures ``(B, 3, H, W)`` in -1..1 -> normalised by ImageNet's mean and deviation."""
+    """Images ``(B, 3, H, W)`` in -1..1 -> normalised by ImageNet's mean and deviation."""
     # Plane by plane, with numbers that kernels are given by value: nothing is copied from the host.
     planes = zip(images.unbind(1), _DINO_MEAN, _DINO_STD, strict=True)
     return torch.stack([(plane * 0.5 + 0.5 - mean) / std for plane, mean, std in planes], 1)

@@ -17,14 +17,14 @@ from fluxvla_report.svg import ROW_HEIGHT, Mark, Row, Series, Shade, line_chart,
 LEAST_RANGE = 0.1
 STAGES: Mapping[str, str] = {
     "receipt": "how old the oldest stream was when the robot was read",
-    "sync": "matching state and pictures in time",
+    "sync": "matching state and images in time",
     "preprocess": "making the policy's input",
     "inference": "the model",
     "postprocess": "making joint targets from its output",
     "policy": "the policy call as a whole",
     "send": "handing one command to the robot",
 }
-"""Stage -> what it is, in the order from a picture to a command."""
+"""Stage -> what it is, in the order from an image to a command."""
 
 
 def episode_view(episode: Episode, put: Callable[[Video], Mapping[str, Any]]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def stage_times(episode: Episode) -> list[StageTime]:
 
 
 def total_ms(episode: Episode) -> float | None:
-    """From a picture's arrival to the command that follows from it: the sum of the medians."""
+    """From an image's arrival to the command that follows from it: the sum of the medians."""
     rows = stage_times(episode)
     return sum(row.p50 for row in rows) if len(rows) > 1 else None
 

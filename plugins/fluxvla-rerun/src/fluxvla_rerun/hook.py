@@ -39,7 +39,7 @@ class RerunViewer(Hook):
             name. None writes none.
         viewer: ``spawn`` starts a viewer on this machine; ``rerun+http://HOST:9876/proxy`` sends to
             one that runs elsewhere; None shows nothing.
-        jpeg_quality: 1 to 100, of pictures in the recording; None keeps every bit of them.
+        jpeg_quality: 1 to 100, of images in the recording; None keeps every bit of them.
         budget_s: seconds that it may be behind the run before it is left out.
 
     Raises:

@@ -28,8 +28,8 @@ class CollectCommand:
         parser.add_argument(
             "--cameras", nargs="+", metavar="NAME", help="default: the first of the scene"
         )
-        parser.add_argument("--height", type=int, default=144, help="of the pictures")
-        parser.add_argument("--width", type=int, default=192, help="of the pictures")
+        parser.add_argument("--height", type=int, default=144, help="of the images")
+        parser.add_argument("--width", type=int, default=192, help="of the images")
         parser.add_argument(
             "--noise",
             type=float,

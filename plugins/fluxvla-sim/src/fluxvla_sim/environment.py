@@ -29,7 +29,7 @@ class SimEnvironment(MujocoEnvironment):
     arm's limits. A task's scene is built when it is first asked for, and kept.
 
     Args:
-        render: ``cheap`` pictures (no shadows, no multisampling), ``coarse`` ones, or
+        render: ``cheap`` images (no shadows, no multisampling), ``coarse`` ones, or
             ``reference``: as the model files ask. See ``fluxvla_mujoco.drawing``.
         ends_with_success: end an episode when its task is done, not after its last step.
 
@@ -113,7 +113,7 @@ class SimEnvironment(MujocoEnvironment):
         )
 
     def observe(self, cameras: Sequence[Camera]) -> Observation:
-        """State, instruction, and pictures in the sizes that are asked for."""
+        """State, instruction, and images in the sizes that are asked for."""
         scene = self.scene
         return {
             "qpos": scene.state.astype(np.float32),

@@ -23,7 +23,7 @@ class SimEvalRunner(EvalRunner):
             the policy's own seeds, so that right and wrong instructions are compared pair by pair.
         replan_every: how many actions of a chunk are executed before the policy is queried again.
         max_steps: control steps (20 ms) after which an episode ends, if later than by itself.
-        render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
+        render: ``cheap``, ``coarse`` or ``reference`` images, see ``SimEnvironment``.
         video_height, video_width, video_fps: of the videos.
         **kwargs: as ``EvalRunner`` takes them.
 

@@ -33,7 +33,7 @@ def sim_cameras(
             f"it has {', '.join(robot.cameras)}"
         )
     if height < 1 or width < 1:
-        raise ConfigError(f"pictures need a positive size, got {height}x{width}")
+        raise ConfigError(f"images need a positive size, got {height}x{width}")
     return tuple(Camera(name, height, width) for name in names)
 
 
@@ -62,9 +62,9 @@ class AlohaSimOperator(SimOperator):
             :meth:`task_success` checks until an episode's instruction says otherwise.
         seed: places the objects in the first episode; each later one adds 1.
         camera_names: cameras of the scene, in the order of the images.
-        height, width: of every picture, in pixels.
+        height, width: of every image, in pixels.
         realtime: follow the wall clock instead of simulated time.
-        render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
+        render: ``cheap``, ``coarse`` or ``reference`` images, see ``SimEnvironment``.
         arms: ``viperx300``, as a real ALOHA's config says it.
 
     Raises:
@@ -95,9 +95,9 @@ class URSimOperator(SimOperator):
         task: ``lift_cube``.
         seed: places the cube in the first episode; each later one adds 1.
         camera_names: ``front`` and ``wrist``, in the order of the images.
-        height, width: of every picture, in pixels.
+        height, width: of every image, in pixels.
         realtime: follow the wall clock instead of simulated time.
-        render: ``cheap``, ``coarse`` or ``reference`` pictures, see ``SimEnvironment``.
+        render: ``cheap``, ``coarse`` or ``reference`` images, see ``SimEnvironment``.
 
     Raises:
         ConfigError: an unknown task, camera or way to render.

@@ -1,4 +1,4 @@
-"""Pictures from MuJoCo without a window, from any thread, in any size.
+"""Images from MuJoCo without a window, from any thread, in any size.
 
 A robot's scene is drawn by several threads: the one that observes, the one that records, the
 cameras' thread of a ROS 2 node. What qualities there are and what they cost is in
@@ -43,7 +43,7 @@ def _gl_context_class(mujoco: Any) -> Any:
 class Renderer:
     """One OpenGL context for one model: any camera, any size; it grows with the largest.
 
-    Any thread may draw, one at a time: the context is given back after each picture.
+    Any thread may draw, one at a time: the context is given back after each image.
 
     Args:
         model: ``mujoco.MjModel``, whose quality is set by then.
@@ -74,7 +74,7 @@ class Renderer:
 
         Raises:
             ValueError: the model has no such camera.
-            RunFailed: a picture of this size cannot be drawn here.
+            RunFailed: an image of this size cannot be drawn here.
         """
         return self._draw(data, camera, height, width, None)
 
@@ -86,12 +86,12 @@ class Renderer:
         They are along the camera's axis, as depth cameras measure, and NaN where nothing is.
         """
         buffer = np.empty((height, width), np.float32)
-        picture = self._draw(data, camera, height, width, buffer)
+        image = self._draw(data, camera, height, width, buffer)
         extent, planes = self._model.stat.extent, self._model.vis.map
         near, far = planes.znear * extent, planes.zfar * extent
         # 0 at the far plane and 1 at the near one, as mjDEPTH_ZEROFAR has it.
         metres = near * far / (near + buffer[::-1].astype(np.float64) * (far - near))
-        return picture, np.where(buffer[::-1] > 0, metres, np.nan).astype(np.float32)
+        return image, np.where(buffer[::-1] > 0, metres, np.nan).astype(np.float32)
 
     def _draw(
         self,
@@ -125,7 +125,7 @@ class Renderer:
         return np.ascontiguousarray(bottom_up[::-1])
 
     def close(self) -> None:
-        """Free the context; any number of times. The next picture makes another."""
+        """Free the context; any number of times. The next image makes another."""
         if self._gl is not None:
             self._gl.make_current()
             if self._context is not None:
@@ -165,14 +165,14 @@ def _release_current_context() -> None:
 
 
 class DrawnScene:
-    """A scene with pictures; a subclass sets ``model`` and ``data``."""
+    """A scene with images; a subclass sets ``model`` and ``data``."""
 
     model: Any
     data: Any
     _renderer: Renderer | None = None
 
     def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
-        """A new ``(height, width, 3)`` uint8 RGB picture."""
+        """A new ``(height, width, 3)`` uint8 RGB image."""
         if self._renderer is None:
             self._renderer = Renderer(self.model)
         return self._renderer.render(self.data, camera, height, width)

@@ -33,7 +33,7 @@ class SimOperator(Operator):
         cameras: in the order of the images.
         seed: of the first episode; :meth:`connect` resets to it.
         realtime: follow the wall clock.
-        render: quality of the pictures.
+        render: quality of the images.
 
     Raises:
         ConfigError: the robot has no such task.
@@ -118,7 +118,7 @@ class SimOperator(Operator):
             return np.array(scene.state)
 
     def get_frame(self) -> Frame:
-        """State and pictures of this moment.
+        """State and images of this moment.
 
         Raises:
             NotReady: not connected.

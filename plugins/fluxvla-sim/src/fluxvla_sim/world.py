@@ -56,7 +56,7 @@ class Scene(Protocol):
         """``(7 n,)`` the true poses of what can be moved: metres in the world frame, wxyz."""
 
     def render(self, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
-        """A new ``(height, width, 3)`` uint8 RGB picture."""
+        """A new ``(height, width, 3)`` uint8 RGB image."""
 
     def close(self) -> None:
         """Free the renderer; any number of times."""
@@ -106,7 +106,7 @@ class SimWorld:
     Args:
         tasks: all start from the same scenes, so that the instruction alone says what is right.
         max_steps: control steps in an episode.
-        open_scene: from the pictures' quality to a scene.
+        open_scene: from the images' quality to a scene.
         open_expert: from the scene's model to an expert.
         begin: the facts before the first step.
         noise: from a generator to ``(max_steps, D)`` offsets of about unit size, in rad, that

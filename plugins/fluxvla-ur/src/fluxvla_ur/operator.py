@@ -59,9 +59,9 @@ class UROperator(RosOperator):
     Args:
         model: ``ur3e``, ``ur5e`` or ``ur10e``.
         controller: the active ros2_control controller; one of ``CONTROLLERS``.
-        img_front_topic, img_left_topic: colour pictures of the front and the wrist camera; a topic
+        img_front_topic, img_left_topic: colour images of the front and the wrist camera; a topic
             that ends in ``/compressed`` carries ``CompressedImage``.
-        img_front_depth_topic, img_left_depth_topic: depth pictures.
+        img_front_depth_topic, img_left_depth_topic: depth images.
         puppet_arm_left_topic: joint states.
         puppet_arm_left_cmd_topic: joint commands; None takes the controller's.
         puppet_gripper_left_topic: the gripper's position, a number.
@@ -76,13 +76,13 @@ class UROperator(RosOperator):
             (``fluxvla_ur.servo`` says why). With the others 30.
         camera_names: what front and wrist camera are called, in this order; with fewer names the
             last is not used.
-        height, width: of every picture, in pixels.
+        height, width: of every image, in pixels.
         joint_prefix: comes before each joint's name (``tf_prefix`` of the driver).
         gripper_joint: read the gripper from this joint of the joint states instead of its topic.
         gripper_closed, gripper_open: the gripper's raw values at its ends, in state and command.
         gripper_message: type of its state and command: std_msgs ``Float64`` or ``Float32``.
         trajectory_time_s: with a trajectory controller, how far ahead each target is set.
-        camera_rate_hz: pictures a second that should come; None: as many as are sent.
+        camera_rate_hz: images a second that should come; None: as many as are sent.
         **connection: as ``fluxvla_core.ros2.RosOperator`` takes it: ``domain_id``, how long to wait
             for streams, how old they may be.
 

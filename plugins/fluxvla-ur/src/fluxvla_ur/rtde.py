@@ -81,7 +81,7 @@ class URRTDEOperator(Operator):
         model: ``ur3e``, ``ur5e`` or ``ur10e``.
         publish_rate: commands a second.
         cameras: name -> device number, path or URL, in the order of the images.
-        height, width: of every picture, in pixels.
+        height, width: of every image, in pixels.
         gripper: whether there is a Robotiq gripper behind its URCap; without one the gripper's
             number is what it was last sent.
         gripper_port, gripper_speed, gripper_force: of the gripper, the last two 0 to 1.
@@ -160,7 +160,7 @@ class URRTDEOperator(Operator):
         # without anybody's asking; what was lost once is not trusted again before ``connect``.
         self._broken = False
 
-    # The contract.
+    # Methods of the Operator contract.
 
     def without_cameras(self) -> URRTDEOperator | None:
         """This operator, to be connected without its cameras; None without a gripper.
@@ -239,12 +239,12 @@ class URRTDEOperator(Operator):
         return self._reading().scaling
 
     def get_frame(self) -> Frame:
-        """State and the newest pictures, in fresh arrays, with their receipt stamps.
+        """State and the newest images, in fresh arrays, with their receipt stamps.
 
         Raises:
             NotReady: not connected, or the part without cameras.
             Stale: a stream is silent.
-            BadMessage: pictures have another size.
+            BadMessage: images have another size.
             Faulted: the gripper reports a fault.
         """
         reading, gripper = self._reading(), self._gripper_position()
@@ -323,7 +323,7 @@ class URRTDEOperator(Operator):
         with self._lock:
             self._release()
 
-    # Pieces of the above.
+    # Private methods.
 
     def _divided(self, part: Part) -> URRTDEOperator | None:
         if not self._has_gripper:

@@ -17,10 +17,10 @@ Image = npt.NDArray[np.uint8]
 
 
 class VideoCamera:
-    """A thread that keeps a camera's newest picture.
+    """A thread that keeps a camera's newest image.
 
     Args:
-        camera: its name and the size that its pictures have.
+        camera: its name and the size that its images have.
         source: a device's number, or a path or URL that OpenCV opens.
     """
 
@@ -60,16 +60,16 @@ class VideoCamera:
         self._thread.start()
 
     def newest(self) -> tuple[float, Image] | None:
-        """Receipt (monotonic, s) and the newest ``(H, W, 3)`` RGB picture; None before the first.
+        """Receipt (monotonic, s) and the newest ``(H, W, 3)`` RGB image; None before the first.
 
         Raises:
-            BadMessage: the pictures have another size.
+            BadMessage: the images have another size.
         """
         newest = self._newest
         size = self.camera.height, self.camera.width, 3
         if newest is not None and newest[1].shape != size:
             raise BadMessage(
-                f"camera {self.camera.name} gives {newest[1].shape} pictures, "
+                f"camera {self.camera.name} gives {newest[1].shape} images, "
                 f"the embodiment says {size}"
             )
         return newest
@@ -84,9 +84,9 @@ class VideoCamera:
 
     def _run(self) -> None:
         while not self._closing.is_set():
-            there, picture = self._capture.read()
+            there, image = self._capture.read()
             if not there:
-                # Every read of a device that is gone fails at once; its newest picture grows old.
+                # Every read of a device that is gone fails at once; its newest image grows old.
                 self._closing.wait(0.05)
                 continue
-            self._newest = time.monotonic(), np.ascontiguousarray(picture[..., ::-1])
+            self._newest = time.monotonic(), np.ascontiguousarray(image[..., ::-1])

@@ -80,11 +80,11 @@ class CropImages(Transform):
     """Crop the same rectangle from every image; a list stays a list.
 
     Args:
-        top, left: of the rectangle's corner, in pixels of the picture as it arrives here.
+        top, left: of the rectangle's corner, in pixels of the image as it arrives here.
         height, width: of the rectangle.
 
     Raises:
-        DataError: a picture is smaller than the rectangle asks for.
+        DataError: an image is smaller than the rectangle asks for.
     """
 
     def __init__(self, top: int, left: int, height: int, width: int) -> None:
@@ -109,7 +109,7 @@ class CropImages(Transform):
         if bottom > image.shape[1] or right > image.shape[2]:
             raise DataError(
                 f"CropImages: rows {self.top}:{bottom}, columns {self.left}:{right} are not in a "
-                f"picture of {image.shape[1]} x {image.shape[2]} pixels"
+                f"image of {image.shape[1]} x {image.shape[2]} pixels"
             )
         return image[:, self.top : bottom, self.left : right]
 
@@ -144,7 +144,7 @@ class NormalizeImages(Transform):
     """Normalise by mean and std: ``(x - mean) / (std + 1e-8)``; gives ``(3N, H, W)`` float32.
 
     Args:
-        means, stds: one group of 3, for all cameras, or one group a camera; in the picture's own
+        means, stds: one group of 3, for all cameras, or one group a camera; in the image's own
             units, that is 0..255 for uint8.
         scale_to_unit_interval: divide by 255 first; means and stds are then in 0..1.
 
@@ -216,7 +216,7 @@ def split_images(images: Images) -> list[Image]:
             )
         return list(images.reshape(-1, 3, *images.shape[1:]))
     if not images:
-        raise DataError("the sample has no pictures")
+        raise DataError("the sample has no images")
     for image in images:
         if image.ndim != 3 or len(image) != 3:
             raise DataError(

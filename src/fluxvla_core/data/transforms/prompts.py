@@ -95,16 +95,16 @@ class ProcessPromptsWithImage(ProcessPrompts):
     eyes of GR00T N1.5) was trained.
 
     Args:
-        tokenizer, max_len: as of ``ProcessPrompts``; the places of pictures count.
+        tokenizer, max_len: as of ``ProcessPrompts``; the places of images count.
         num_images: cameras, as many as ``img_keys`` names.
-        fixed_img_tokens: places for each picture.
+        fixed_img_tokens: places for each image.
         system_prompt: the system's words; none with an empty text.
         task_pos: ``after_images`` or ``before_images``.
         padding_side: ``left`` or ``right``.
 
     Raises:
         ConfigError: as ``ProcessPrompts``; ``<IMG_CONTEXT>`` is not a token of the tokenizer;
-            samples have another number of pictures, or an instruction holds ``<IMG_CONTEXT>``.
+            samples have another number of images, or an instruction holds ``<IMG_CONTEXT>``.
     """
 
     keeps_images = True
@@ -142,7 +142,7 @@ class ProcessPromptsWithImage(ProcessPrompts):
         seen = len(sample.get("img_masks", ()))
         if seen not in (0, self.num_images):
             raise ConfigError(
-                f"{self._who}: num_images is {self.num_images}, the sample has {seen} pictures",
+                f"{self._who}: num_images is {self.num_images}, the sample has {seen} images",
                 next=f"as many as there are img_keys: --set <{self._who}>.num_images={seen}",
             )
         return super().__call__(sample)
@@ -153,18 +153,18 @@ class ProcessPromptsWithImage(ProcessPrompts):
         if found != expected:
             raise ConfigError(
                 f"{self._who}: the chat around the instruction {text!r} has {found} places for "
-                f"pictures, {expected} expected",
+                f"images, {expected} expected",
                 cause=f"the instruction itself holds {_PLACE}",
             )
         return ids
 
     def _chat(self, text: str) -> str:
-        pictures = "".join(
+        images = "".join(
             f"<image {i}><img>{_PLACE * self.fixed_img_tokens}</img>"
             for i in range(1, self.num_images + 1)
         )
         first = self.task_pos == "before_images"
-        content = f"{text}\n{pictures}" if first else f"{pictures}{text}"
+        content = f"{text}\n{images}" if first else f"{images}{text}"
         system = _turn("system", self.system_prompt) if self.system_prompt else ""
         return f"{system}{_turn('user', content)}<|im_start|>assistant\n"
 
@@ -175,12 +175,12 @@ class ProcessPromptsWithImage(ProcessPrompts):
         if list(added.values()) != [1]:
             raise ConfigError(
                 f"{self._who}: {_PLACE} is not a token of this tokenizer, it is cut into several",
-                cause="the tokenizer is not the one of the model that sees pictures",
+                cause="the tokenizer is not the one of the model that sees images",
             )
         return int(next(iter(added)))
 
     def _counted(self) -> str:
-        return f" with {self.num_images} x {self.fixed_img_tokens} places for pictures"
+        return f" with {self.num_images} x {self.fixed_img_tokens} places for images"
 
 
 _PLACE = "<IMG_CONTEXT>"

@@ -1,4 +1,4 @@
 """Control of an arm: clock, chunk joining, action filters, limits, stops.
 
-Nothing in it imports policies, pictures, tasks or recordings; an import contract keeps it so.
+Nothing in it imports policies, images, tasks or recordings; an import contract keeps it so.
 """

@@ -148,7 +148,7 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
     logging.getLogger().addHandler(LinkLog(link))
     robot, execute = setup.build_control_side(reporter)
     if isinstance(robot, UndividedRobot):
-        assert frames is not None, "the main process shares memory for its pictures"
+        assert frames is not None, "the main process shares memory for its images"
         robot.serve(frames, setup.cameras or (), setup.settings.safety.max_age_s)
         inbox.watch = robot.check_reading
     observer = LinkObserver(link, inbox)

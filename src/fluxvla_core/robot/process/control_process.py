@@ -47,7 +47,7 @@ class ControlProcess:
         setup: what it is built from.
         robot: reads the cameras in this process.
         interrupts: signals; passed on.
-        frames: shows this process the pictures of an operator that runs as a whole in the other.
+        frames: shows this process the images of an operator that runs as a whole in the other.
 
     Attributes:
         link: to it.
@@ -171,7 +171,7 @@ def launch(
 
     Args:
         setup: what it is built from.
-        frames: for the pictures of an operator that runs there as a whole; remains open.
+        frames: for the images of an operator that runs there as a whole; remains open.
 
     Raises:
         OSError: the system has no room for it.

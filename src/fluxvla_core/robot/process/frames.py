@@ -31,7 +31,7 @@ _NUMBERS = 64
 _ALIGNED = 64
 # Room for the JSON values: names, stamps, or an error's message.
 _TEXT = 64 * 1024
-_PICTURE, _DEPTH, _BASE = "picture ", "depth ", "base"
+_PICTURE, _DEPTH, _BASE = "image ", "depth ", "base"
 _MORE, _MEASURED = "more ", "measured"
 
 
@@ -149,7 +149,7 @@ class FrameChannel:
         at = _aligned(len(text))
         for array in message.arrays.values():
             room = self._data[at : at + array.nbytes]
-            # numpy releases the GIL while it copies a picture.
+            # numpy releases the GIL while it copies an image.
             np.copyto(room.view(array.dtype).reshape(array.shape), array)
             at += _aligned(array.nbytes)
         self._numbers[_ANSWERED] = self._numbers[_ASKED]
@@ -160,18 +160,18 @@ def message_of_frame(frame: Frame, cameras: Iterable[str], source: str) -> Frame
     """State, stamps, base, and the images and depth of ``cameras`` of a frame.
 
     Args:
-        frame: of the operator; a picture that is None has not come yet.
+        frame: of the operator; an image that is None has not come yet.
         cameras: the ones that are asked for.
         source: what gave it, for messages.
 
     Raises:
-        BadFrame: the state or a picture is no array of numbers.
+        BadFrame: the state or an image is no array of numbers.
     """
     stamps = {str(k): float(v) if is_number(v) else None for k, v in frame.stamps.items()}
     pictures = {n: frame.images[n] for n in cameras if frame.images.get(n) is not None}
     arrays = {STATE: _numbers(frame.state, f"the state of {source}")} | {
-        _PICTURE + name: _numbers(picture, f"camera {name} of {source}")
-        for name, picture in pictures.items()
+        _PICTURE + name: _numbers(image, f"camera {name} of {source}")
+        for name, image in pictures.items()
     }
     if isinstance(frame, RobotFrame):
         depths = {n: frame.depths[n] for n in cameras if frame.depths.get(n) is not None}

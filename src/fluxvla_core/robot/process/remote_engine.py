@@ -58,7 +58,7 @@ class RemoteEngine(Engine):
         interrupts: signals; passed on.
         reporter: shows progress and warnings.
         history: of the runner's earlier runs.
-        frames: shows this process the pictures of an operator that runs as a whole in the other.
+        frames: shows this process the images of an operator that runs as a whole in the other.
     """
 
     def __init__(

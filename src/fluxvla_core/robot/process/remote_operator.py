@@ -1,4 +1,4 @@
-"""``RemoteOperator``: in the main process, the pictures of an operator in the control process."""
+"""``RemoteOperator``: in the main process, the images of an operator in the control process."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RemoteOperator(Operator):
         """The descriptors that a new control process is to have; this end keeps its own.
 
         Args:
-            cameras: names of the cameras whose pictures are asked for.
+            cameras: names of the cameras whose images are asked for.
 
         Raises:
             OSError: the system has no room for it.

@@ -55,7 +55,7 @@ class UndividedRobot(Robot):
 
         Args:
             channel: the control process's end.
-            cameras: names of the cameras whose pictures are sent.
+            cameras: names of the cameras whose images are sent.
             max_age_s: how long ``get_frame`` may take while the arm moves.
         """
         self._cameras, self._max_age_s = tuple(cameras), max_age_s

@@ -23,22 +23,22 @@ import numpy.typing as npt
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording import ros_messages as ros
 
-# Pictures of one topic that are remembered as written.
+# Images of one topic that are remembered as written.
 _REMEMBERED = 256
-# On camera pictures a higher level saves a few percent and takes twice as long.
+# On camera images a higher level saves a few percent and takes twice as long.
 _LEVEL = 1
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
-# Pictures of one moment lie side by side; a reader that goes through time needs few chunks.
+# Images of one moment lie side by side; a reader that goes through time needs few chunks.
 _KEPT_CHUNKS = 8
-_LARGEST_CHUNK = 1 << 30  # bytes; rosbags begins another after 1 MiB, or a picture
+_LARGEST_CHUNK = 1 << 30  # bytes; rosbags begins another after 1 MiB, or an image
 
 
 class Bag:
     """A rosbag2 with one MCAP file; ``folder`` must not exist and is made.
 
     Log times are real time: that of the first event, and from there on the loop's clock, so that a
-    wall clock that is stepped meanwhile changes nothing. A picture that was looked at is written
+    wall clock that is stepped meanwhile changes nothing. An image that was looked at is written
     as it is, once; others become JPEGs, where OpenCV is installed.
 
     Args:

@@ -1,6 +1,6 @@
-"""A recorded episode, read back: its events, and the pictures of a bag.
+"""A recorded episode, read back: its events, and the images of a bag.
 
-An episode that was not recorded with ``record`` has events and no pictures: its policy can be
+An episode that was not recorded with ``record`` has events and no images: its policy can be
 replayed, its robot cannot. What a process left that was killed is read as far as it goes.
 """
 
@@ -37,7 +37,7 @@ _LARGEST_TRACE = 1 << 30  # bytes: a day of one arm at 50 Hz
 
 
 class Pictures:
-    """One camera's pictures in the order of their times; each is read when it is asked for.
+    """One camera's images in the order of their times; each is read when it is asked for.
 
     ``times`` are seconds on the loop's clock, when each arrived.
 
@@ -68,12 +68,12 @@ class Pictures:
         self._places.insert(at, (place, kind))
 
     def newest(self, time: float) -> int | None:
-        """Index of the newest picture that had arrived by ``time``; None before the first."""
+        """Index of the newest image that had arrived by ``time``; None before the first."""
         index = bisect_right(self.times, time + ROUNDING_S) - 1
         return index if index >= 0 else None
 
     def shown(self, time: float) -> npt.NDArray[Any]:
-        """The newest picture that had arrived by ``time``, or the first there is; see ``read``."""
+        """The newest image that had arrived by ``time``, or the first there is; see ``read``."""
         return self.read(self.newest(time) or 0)
 
     def read(self, index: int) -> npt.NDArray[Any]:
@@ -89,8 +89,8 @@ class Recorded:
         path: the episode's folder, or its MCAP file.
         events: in the order in which they happened.
         whole: whether the record was finished.
-        pictures: camera -> its pictures.
-        depths: camera -> its depth pictures, NaN where nothing was measured.
+        images: camera -> its images.
+        depths: camera -> its depth images, NaN where nothing was measured.
 
     Raises:
         DataError: the record does not say what it is of.
@@ -130,7 +130,7 @@ class Recorded:
 
     @property
     def native(self) -> bool:
-        """Whether every picture that arrived was recorded, not only those that were looked at."""
+        """Whether every image that arrived was recorded, not only those that were looked at."""
         return bool(self.start.get("native"))
 
     @property
@@ -152,7 +152,7 @@ class Recorded:
     def states(self) -> tuple[Array, Array]:
         """Times ``(N,)``, ascending, and states ``(N, state_dim)`` of every reading.
 
-        A state that came with pictures is as old as they are: newer ones may have been read before
+        A state that came with images is as old as they are: newer ones may have been read before
         it. Its time is when it arrived; one that was read with a command has the command's.
         """
         found = [e for e in self.events if e.get("state") is not None]
@@ -304,9 +304,9 @@ def _read(path: Path) -> Recorded:
     events, whole = _with_rest(file.parent, bag.events, bag.whole)
     cameras = Recorded(path, events, whole, {}).embodiment.camera_names
     colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
-    pictures = _sorted(bag, colours, bag.unpacker.picture)
+    images = _sorted(bag, colours, bag.unpacker.picture)
     depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
-    return Recorded(path, events, whole, pictures, depths)
+    return Recorded(path, events, whole, images, depths)
 
 
 def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Event], bool]:
@@ -329,7 +329,7 @@ def _sorted(
     by_topic: Mapping[str, str],
     unpack: Callable[[memoryview, str], npt.NDArray[Any]],
 ) -> dict[str, Pictures]:
-    """Camera -> its pictures on those of its topics that are named."""
+    """Camera -> its images on those of its topics that are named."""
     found: dict[str, Pictures] = {}
     for topic, kind, ns, place in bag.pictures:
         camera = by_topic.get(topic)

@@ -37,7 +37,7 @@ from fluxvla_core.ros2 import RobotFrame, depth_stream
 
 
 class EpisodeRecorder(EpisodeObserver):
-    """Writes events, pictures and videos of an episode into a folder.
+    """Writes events, images and videos of an episode into a folder.
 
     Args:
         folder: where the record goes; opened with ``EpisodePrepared``, finished with
@@ -45,7 +45,7 @@ class EpisodeRecorder(EpisodeObserver):
         robot, policy: those that act in the episode.
         cameras: names of those that the policy looks at.
         video_fps: frames a second of the videos; None records none.
-        everything: record pictures too, in a bag; otherwise lines of JSON.
+        everything: record images too, in a bag; otherwise lines of JSON.
         reporter: learns what was not recorded, and where the record is.
 
     ``summary`` is what ``episode.json`` holds, once the episode has ended.
@@ -195,7 +195,7 @@ class EpisodeRecorder(EpisodeObserver):
         self._trace.write(event)
 
     def _beside(self, frame: RobotFrame, stamps: Mapping[str, float]) -> dict[str, Any]:
-        """Record what a frame has besides state and pictures; what of it belongs into an event."""
+        """Record what a frame has besides state and images; what of it belongs into an event."""
         for camera, metres in frame.depths.items():
             stamp = stamps.get(depth_stream(camera), stamps[STATE])
             self._trace.depth(camera, stamp, metres)

@@ -74,7 +74,7 @@ class ReplayOperator(Operator):
         found = open_recording(self.recording)
         if found.embodiment.cameras and not found.pictures:
             raise DataError(
-                "this episode has no pictures: its robot cannot be replayed",
+                "this episode has no images: its robot cannot be replayed",
                 where=str(found.path),
                 cause="it was run without --record",
                 next="ReplayPolicy can replay its actions; record again with --record DIR",
@@ -243,7 +243,7 @@ class ReplayPolicy(Policy):
     runner's safety is the same as for any policy.
 
     Args:
-        recording: an episode's folder, with or without pictures, or its MCAP file.
+        recording: an episode's folder, with or without images, or its MCAP file.
         actions: ``chunks`` or ``commands``.
         context: what the run knows (injected): its reporter learns when the recording ends.
 

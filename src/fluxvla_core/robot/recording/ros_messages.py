@@ -2,7 +2,7 @@
 
 What ROS has a type for is a message of that type, so that any ROS tool plots it: joint vectors are
 ``sensor_msgs/JointState``, a base's speed is a ``nav_msgs/Odometry``, a policy's chunk is a
-``trajectory_msgs/JointTrajectory``, pictures are ``sensor_msgs/Image``, or ``CompressedImage``
+``trajectory_msgs/JointTrajectory``, images are ``sensor_msgs/Image``, or ``CompressedImage``
 where nobody looked at them; depth is ``16UC1``. The rest of the event is JSON in a
 ``std_msgs/String``, which comes after those messages and completes the event. No value is written
 twice.
@@ -70,13 +70,13 @@ def typestore() -> Any:
 
 
 def camera_topic(camera: str, kind: str = IMAGE) -> str:
-    """The topic of a camera's pictures; ``frame_id`` has the camera's true name."""
+    """The topic of a camera's images; ``frame_id`` has the camera's true name."""
     topic = CAMERAS + (re.sub(r"[^0-9A-Za-z_]", "_", camera) or "_")
     return topic if kind == IMAGE else f"{topic}/compressed"
 
 
 def depth_topic(camera: str) -> str:
-    """The topic of a camera's depth pictures."""
+    """The topic of a camera's depth images."""
     return f"{camera_topic(camera)}/depth"
 
 
@@ -154,7 +154,7 @@ class Packer:
         bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
         done, coded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         if not done:
-            raise RunFailed(f"a picture of {camera} cannot be made a JPEG")
+            raise RunFailed(f"an image of {camera} cannot be made a JPEG")
         message = self._store.types[JPEG](
             header=self._header(ns, camera), format="jpeg", data=np.asarray(coded).reshape(-1)
         )
@@ -282,7 +282,7 @@ class Unpacker:
             shape = message.height, message.width, 3
             pixels = np.array(message.data, np.uint8)
             if pixels.size != shape[0] * shape[1] * 3:
-                raise DataError(f"a recorded picture of {shape[0]} x {shape[1]} is cut short")
+                raise DataError(f"a recorded image of {shape[0]} x {shape[1]} is cut short")
             return pixels.reshape(shape)
         if not has_jpeg():
             raise DataError(
@@ -295,7 +295,7 @@ class Unpacker:
         small = size is not None and size[0] * size[1] <= MOST_PIXELS
         bgr = cv2.imdecode(message.data, cv2.IMREAD_COLOR) if small else None
         if bgr is None:
-            raise DataError(f"a recorded picture of {message.header.frame_id} is no JPEG")
+            raise DataError(f"a recorded image of {message.header.frame_id} is no JPEG")
         return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def depth(self, data: memoryview, kind: str = IMAGE) -> npt.NDArray[np.float32]:

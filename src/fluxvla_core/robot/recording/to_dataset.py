@@ -1,6 +1,6 @@
 """Recorded episodes as a LeRobot v3.0 dataset, to train on what a robot did.
 
-A row is what was known at its time: the newest state and pictures that had arrived. Its action is
+A row is what was known at its time: the newest state and images that had arrived. Its action is
 the command that the robot had one row later, where the joints were to be by then: demonstrations
 (``fluxvla collect``) are recorded so, too.
 """
@@ -51,7 +51,7 @@ def recordings_to_dataset(
 
     Raises:
         DataError: a source holds no recording, nothing is left to write, a recording has no
-            pictures, ``fps`` is above the robot's rate, or ``out`` exists.
+            images, ``fps`` is above the robot's rate, or ``out`` exists.
         SpecMismatch: two recordings are of different robots.
         RunFailed: rosbags is missing, or the disk is full.
     """
@@ -101,13 +101,13 @@ def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recor
 
 
 def _with_cameras(recordings: Sequence[Recorded]) -> EmbodimentSpec:
-    """The robot of all recordings, with the cameras that all of them have pictures of."""
+    """The robot of all recordings, with the cameras that all of them have images of."""
     spec = check_same_embodiment(recordings)
     kept = tuple(c for c in spec.cameras if all(c.name in r.pictures for r in recordings))
     if spec.cameras and not kept:
         bare = next(r for r in recordings if not r.pictures)
         raise DataError(
-            "this episode has no pictures",
+            "this episode has no images",
             where=str(bare.path),
             cause="it was run without --record",
             next="record again with fluxvla run … --record DIR",
@@ -147,7 +147,7 @@ def _write(
 def _pictures(
     recorded: Recorded, cameras: Sequence[str], times: Array, fps: float, say: Reporter
 ) -> dict[str, npt.NDArray[np.intp]]:
-    """Camera -> which of its pictures is the newest at each of ``times``; warns of sparse ones."""
+    """Camera -> which of its images is the newest at each of ``times``; warns of sparse ones."""
     found = {}
     for name in cameras:
         index = newest_at(np.array(recorded.pictures[name].times), times)
@@ -155,7 +155,7 @@ def _pictures(
         fresh = len(np.unique(index))
         if fresh < 0.75 * len(times):
             say.warn(
-                f"{recorded.path}: {len(times)} rows show {fresh} pictures of {name}; "
+                f"{recorded.path}: {len(times)} rows show {fresh} images of {name}; "
                 f"--fps {fps * fresh / len(times):.2g} would show each once"
             )
     return found

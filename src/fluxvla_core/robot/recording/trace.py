@@ -2,7 +2,7 @@
 
 Everything is handed over at once and written by a thread of its own: recording never makes a
 command late. What waits to be written is bounded; what finds no room is dropped and counted,
-pictures long before events.
+images long before events.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ SUMMARY_FILE = "episode.json"
 REST_FILE = "rest.jsonl"
 """The newest events of the process that commands the robot, where the one that records was killed:
 its last half second, and how the robot was stopped."""
-# What may wait: pictures in bytes (35 of 640x480 in colour), events in number (minutes of them).
+# What may wait: images in bytes (35 of 640x480 in colour), events in number (minutes of them).
 _WAITING_BYTES = 32 * 1024 * 1024
 _WAITING_EVENTS = 20_000
 # How often the system is given what was written: so much is lost when the process is killed.
 _FLUSH_S = 0.5
-# How often the robot is asked for pictures that nobody looked at; it keeps the newest few.
+# How often the robot is asked for images that nobody looked at; it keeps the newest few.
 _POLL_S = 0.03
 
 Picture = npt.NDArray[np.uint8]
 Source = Callable[[str, float], tuple[Sequence[tuple[float, Picture]], int]]
 """``pictures_after`` of an operator: camera and a time -> the kept ones of those that arrived
-later, ``(stamp, picture)``, oldest first, and how many arrived since it was connected. It must be
+later, ``(stamp, image)``, oldest first, and how many arrived since it was connected. It must be
 safe to call from any thread."""
 
 
@@ -60,15 +60,15 @@ class Log(Protocol):
     def picture(
         self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
     ) -> None:
-        """Append one ``(H, W, 3)`` uint8 RGB picture that arrived at ``stamp``.
+        """Append one ``(H, W, 3)`` uint8 RGB image that arrived at ``stamp``.
 
         One that need not be ``exact`` may lose a little: a camera's whole stream is large.
-        A log that holds no pictures drops them.
+        A log that holds no images drops them.
         """
         return
 
     def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
-        """Append one ``(H, W)`` depth picture that arrived at ``stamp``."""
+        """Append one ``(H, W)`` depth image that arrived at ``stamp``."""
         return
 
     def flush(self) -> None:
@@ -79,7 +79,7 @@ class Log(Protocol):
 
 
 class JsonLines(Log):
-    """A file of lines in ``folder``. It holds no pictures."""
+    """A file of lines in ``folder``. It holds no images."""
 
     def __init__(self, folder: Path, name: str = EVENTS_FILE) -> None:
         self._file = (folder / name).open("w", encoding="utf-8")
@@ -108,8 +108,8 @@ class Recording:
 
     Args:
         names: ``state`` and ``action`` -> joint names.
-        cameras: those whose pictures are all recorded, if ``source`` gives them.
-        source: see ``Source``; None: pictures are recorded when somebody looks. Videos show what
+        cameras: those whose images are all recorded, if ``source`` gives them.
+        source: see ``Source``; None: images are recorded when somebody looks. Videos show what
             it gives, too.
     """
 
@@ -119,7 +119,7 @@ class Recording:
 
 
 class _Poll:
-    """One camera's pictures, as its robot gives them: up to when, and how many were missed."""
+    """One camera's images, as its robot gives them: up to when, and how many were missed."""
 
     def __init__(self, since: float) -> None:
         self.newest = since
@@ -155,7 +155,7 @@ class EpisodeTrace:
     Args:
         folder: made if need be; one episode each.
         video_fps: frames a second of the videos; None writes none.
-        recording: record into a bag, with pictures; None writes lines of JSON.
+        recording: record into a bag, with images; None writes lines of JSON.
 
     Raises:
         RunFailed: the folder cannot be made or written to, or rosbags is not installed.
@@ -199,12 +199,12 @@ class EpisodeTrace:
             self._put_image("frames", (camera, None, image))
 
     def picture(self, camera: str, stamp: float, image: Picture) -> None:
-        """Record a ``(H, W, 3)`` uint8 picture that arrived at ``stamp``; once is enough."""
+        """Record a ``(H, W, 3)`` uint8 image that arrived at ``stamp``; once is enough."""
         if self._recording is not None:
             self._put_image("pictures", (camera, stamp, image))
 
     def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
-        """Record an ``(H, W)`` depth picture that arrived at ``stamp``; once is enough."""
+        """Record an ``(H, W)`` depth image that arrived at ``stamp``; once is enough."""
         if self._recording is not None:
             self._put_image("pictures", (camera, stamp, metres))
 

@@ -72,8 +72,8 @@ class VideoWriter:
                 where=str(self.path),
             )
         even = np.ascontiguousarray(frame[: self._stream.height, : self._stream.width])
-        picture = self._av.VideoFrame.from_ndarray(even, format="rgb24")
-        self._mux(self._stream.encode(picture))
+        image = self._av.VideoFrame.from_ndarray(even, format="rgb24")
+        self._mux(self._stream.encode(image))
         self.frames += 1
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
 State, command, gripper scale, placement of objects and reward are those of gym-aloha 0.1.5: same
 model files, same 2 ms steps, ten to a command, same order of MuJoCo calls, so that a trajectory is
-bit-identical to the stock environments'. What is left out is their price: three 480x640 pictures
+bit-identical to the stock environments'. What is left out is their price: three 480x640 images
 with shadows after every step.
 """
 
@@ -70,7 +70,7 @@ class TwoArms(DrawnScene):
     A subclass says in ``file`` which, places the objects in :meth:`reset`, and gives the reward.
 
     Args:
-        render: quality of the pictures, see ``fluxvla_mujoco.drawing``.
+        render: quality of the images, see ``fluxvla_mujoco.drawing``.
 
     Attributes:
         steps: commands since the last reset.

@@ -20,9 +20,9 @@ class Cameras(threading.Thread):
 
     Args:
         model: of the scene.
-        publishers: stream -> publisher, of pictures (a camera's name) and of depth.
+        publishers: stream -> publisher, of images (a camera's name) and of depth.
         cameras: names, of those that have a publisher.
-        settings: rates, latencies and the size of the pictures.
+        settings: rates, latencies and the size of the images.
         faults: shared with the other streams.
         look: takes ``mujoco.MjData`` to fill with the scene's positions, and gives their stamp.
         stopping: ends the thread.
@@ -83,7 +83,7 @@ class Cameras(threading.Thread):
             return
         stamp = self._look(data)
         mujoco, model = import_mujoco(), self._model
-        # All that a picture needs of the physics, given the positions.
+        # All that an image needs of the physics, given the positions.
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)

@@ -46,7 +46,7 @@ class SimCommand:
             type=float,
             default=50.0,
             metavar="HZ",
-            help="of joint states and everything except pictures, up to 500, in simulated time; "
+            help="of joint states and everything except images, up to 500, in simulated time; "
             "default 50",
         )
         parser.add_argument(
@@ -57,10 +57,10 @@ class SimCommand:
             help="how long a stream's messages are under way, in simulated time; their stamps say "
             "when they were made",
         )
-        parser.add_argument("--height", type=int, default=480, help="of the pictures")
-        parser.add_argument("--width", type=int, default=640, help="of the pictures")
+        parser.add_argument("--height", type=int, default=480, help="of the images")
+        parser.add_argument("--width", type=int, default=640, help="of the images")
         parser.add_argument(
-            "--render", choices=RENDERS, default="cheap", help="quality of the pictures"
+            "--render", choices=RENDERS, default="cheap", help="quality of the images"
         )
         parser.add_argument(
             "--cameras", nargs="+", metavar="NAME", help="the scene's cameras; all by default"
@@ -83,7 +83,7 @@ class SimCommand:
             "/sim/speed_scaling moves it",
         )
         parser.add_argument(
-            "--best-effort", action="store_true", help="offer pictures as camera drivers do"
+            "--best-effort", action="store_true", help="offer images as camera drivers do"
         )
         parser.add_argument(
             "--fault",

@@ -2,7 +2,7 @@
 
 The calling thread steps the physics on absolute deadlines and publishes the robot's state; a second
 one draws the cameras (:mod:`fluxvla_sim.ros2.cameras`) from a copy of the positions, so that a slow
-renderer makes pictures rarer and nothing else late. Three topics are the simulation's own:
+renderer makes images rarer and nothing else late. Three topics are the simulation's own:
 ``/sim/reset`` (``std_msgs/Int64``: a seed), ``/sim/fault`` (``std_msgs/String``: as ``--fault``
 takes it, or ``STREAM=well``) and ``/sim/facts`` (``std_msgs/String``: JSON, ten times a simulated
 second and whenever an episode begins or a task is done). A robot may have more, for what a person
@@ -343,7 +343,7 @@ def simulate(
     """A robot in a world until Ctrl-C or SIGTERM, or for ``seconds``; says what it does.
 
     Args:
-        render: quality of the pictures, see ``fluxvla_mujoco.drawing``.
+        render: quality of the images, see ``fluxvla_mujoco.drawing``.
 
     Raises:
         As ``RobotNode`` and its ``run``.
@@ -365,6 +365,6 @@ def simulate(
         scene.close()
         counts = node.counts
         reporter.info(
-            f"{counts.periods} periods ({counts.late} late), {counts.pictures} pictures, "
+            f"{counts.periods} periods ({counts.late} late), {counts.pictures} images, "
             f"{counts.commands} commands"
         )

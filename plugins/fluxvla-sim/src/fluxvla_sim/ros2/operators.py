@@ -142,7 +142,7 @@ class InSimulation(RosOperator):
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
         """As the robot's operator; times are on ``clock``."""
         found, arrived = super().pictures_after(camera, after / self.real_time_factor)
-        return [(at * self.real_time_factor, picture) for at, picture in found], arrived
+        return [(at * self.real_time_factor, image) for at, image in found], arrived
 
     def begin_episode(self, instruction: str, episode: int) -> None:
         """Robot at home, objects where ``seed + episode`` puts them; waits until that is seen.
@@ -213,7 +213,7 @@ class InSimulation(RosOperator):
 
     def _shows_episode(self) -> bool:
         """Whether everything that this operator reads is of the newest episode alone."""
-        # A robot that jumps is nothing that matching in time reckons with: a picture of the new
+        # A robot that jumps is nothing that matching in time reckons with: an image of the new
         # episode must not find the state of the old one within the skew that is allowed. Nor does
         # the simulator take commands in an episode's first 0.1 s.
         wait_s = max(self.max_skew_s, _SETTLE_S / self.real_time_factor)

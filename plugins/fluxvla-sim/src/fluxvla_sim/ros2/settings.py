@@ -26,11 +26,11 @@ class NodeSettings:
         real_time_factor: simulated seconds in a second.
         state_hz: states a simulated second, of every stream of them. Above ``CONTROL_HZ`` the
             physics goes in smaller parts of a control period, down to its own 2 ms.
-        camera_hz: pictures a simulated second of each camera, if the machine can; a camera that
+        camera_hz: images a simulated second of each camera, if the machine can; a camera that
             nobody listens to is not drawn.
         latencies: stream -> simulated seconds that its messages are under way, with true stamps.
-        height, width: of every picture, in pixels.
-        best_effort: offer pictures as camera drivers do by default, not reliably.
+        height, width: of every image, in pixels.
+        best_effort: offer images as camera drivers do by default, not reliably.
         faults: (seconds after the start, stream, fault), faults that begin by themselves.
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
     """
@@ -77,7 +77,7 @@ class NodeSettings:
 
 
 def depths(driver: Driver) -> dict[str, str]:
-    """Stream -> topic of the depth pictures of those cameras that a robot has."""
+    """Stream -> topic of the depth images of those cameras that a robot has."""
     return {depth_stream(c): driver.depths[c] for c in driver.cameras if c in driver.depths}
 
 
@@ -103,7 +103,7 @@ def check_fault(driver: Driver, stream: str, fault: Fault) -> None:
         raise UsageError(f"{stream} is said once, at the start: it can have no fault")
     check_stream(driver, stream)
     if fault.mode == "nan" and stream not in driver.states:
-        raise UsageError(f"{stream} is a camera: a picture's numbers cannot be NaN")
+        raise UsageError(f"{stream} is a camera: an image's numbers cannot be NaN")
     if fault.mode == "nan" and driver.states[stream][1] == ODOMETRY:
         raise UsageError(f"{stream} is odometry: only joints and bare numbers are made NaN")
     if fault.mode == "clock" and stream in driver.states and driver.states[stream][1] == FLOAT64:

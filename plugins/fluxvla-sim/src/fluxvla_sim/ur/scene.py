@@ -126,7 +126,7 @@ class URScene(DrawnScene):
         self.data.ctrl[:6] = action[:6]
         self.data.ctrl[6] = (1.0 - action[6]) * FINGER_COMMAND
         self._mujoco.mj_step(self.model, self.data, substeps)
-        # Positions derived from the joints lag one step behind after mj_step; pictures need them.
+        # Positions derived from the joints lag one step behind after mj_step; images need them.
         self._mujoco.mj_step1(self.model, self.data)
 
     @property

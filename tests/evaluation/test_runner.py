@@ -433,6 +433,7 @@ def test_the_weights_are_quantised_as_the_evaluation_says(checkpoint, name):
     ],
 )
 def test_a_model_cannot_compute_in_unknown_ways(tmp_path, walking, options, text):
+    pytest.importorskip("torch")
     options = {"policy": "checkpoint", "ckpt_path": str(tmp_path / "none"), **options}
     with pytest.raises(ConfigError, match=text):
         evaluate(tmp_path, **options)

@@ -2,17 +2,17 @@
 
     python -m benchmarks.rtc [--checkpoint work_dirs/aloha_sim_pi05_tiny] [--episodes 10]
 
-The tiny PI0.5 of ``configs/aloha_sim_pi05_tiny.py``, whose actions are relative to the state, hands
-the cube over in the simulated ALOHA. It is asked every 0.5 s and answers after a delay, which is
-simulated as in ``chunk_joining.py``. In each row another joiner goes from one chunk to the next:
-the new one replaces the old one (``latest_only``), is faded in (``overlap``), averaged with it
-(``temporal_ensemble``) or continues it by guidance in every denoising step (``rtc``; a policy that
-was trained with ``prefix_conditioning`` continues as it was trained to). Figures of a row, over all
-its episodes: successes with their 95 % Wilson interval; seconds until done; ``gap_rad``, how far
-the first action of a chunk that is not over when the chunk arrives lies from where the chunk
-before it would have been by then, mean and largest over the joins (of the joint that differs most);
-the largest step of the joined target from one command to the next; acceleration and jerk of the
-commands (rms over the arms' joints); and the share of late chunks, for which the arm had to wait.
+The tiny PI0.5 of ``configs/aloha_sim_pi05_tiny.py`` hands the cube over in the simulated ALOHA. It
+is asked every 0.5 s and answers after a delay, which is simulated as in ``chunk_joining.py``. In
+each row another joiner goes from one chunk to the next: the new one replaces the old one
+(``latest_only``), is faded in (``overlap``), averaged with it (``temporal_ensemble``) or continues
+it by guidance in every denoising step (``rtc``; a policy that was trained with
+``prefix_conditioning`` continues as it was trained to). Figures of a row, over all its episodes:
+successes with their 95 % Wilson interval; seconds until done; ``gap_rad``, how far the first action
+of a chunk that is not over when the chunk arrives lies from where the chunk before it would have
+been by then, mean and largest over the joins (of the joint that differs most); the largest step of
+the joined target from one command to the next; acceleration and jerk of the commands (rms over the
+arms' joints); and the share of late chunks, for which the arm had to wait.
 Writes ``benchmarks/results/rtc.json``.
 """
 

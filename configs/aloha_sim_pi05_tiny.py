@@ -7,8 +7,16 @@ fluxvla run --config configs/aloha_sim_pi05_tiny.py --section inference --task 1
 
 The architecture is the published one, the sizes are not: a vision tower that has seen nothing
 before gets the middle of the table in patches of 8 pixels. The tokenizer is MiniLM's, which has a
-token for each of the 256 numbers that a state in words is made of. As openpi does for ALOHA, joints
-are predicted relative to the state, grippers are not.
+token for each of the 256 numbers that a state in words is made of.
+
+Joints are predicted as absolute targets, not relative to the state as in openpi's ALOHA recipe: a
+relative target carries a deviation of the arm along, and depends on every digit of a state that a
+model this small reads from words. With relative targets, all else equal, 6 of 100 episodes
+succeeded.
+
+Measured: 240 demonstrations, 3,000 steps of batch 32 in 17 minutes on two cores that other programs
+used, too; 47 of 50 lifts and 48 of 50 hand-overs, on seeds that no demonstration has (2 of 100 with
+the other task's instruction, 0 of 100 untrained).
 """
 
 _base_ = "aloha_sim_transfer.py"
@@ -33,7 +41,6 @@ train_dataloader = dict(
     per_device_batch_size=16,
     dataset=dict(
         action_window_size=HORIZON,
-        relative_actions=True,
         transforms=[
             dict(type="ResizeImages", height=144, width=192),
             dict(type="CropImages", top=68, left=76, height=48, width=48),

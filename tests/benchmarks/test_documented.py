@@ -12,6 +12,7 @@ import pytest
 from benchmarks import memory
 from benchmarks.rtc import DELAYS, WAYS
 from benchmarks.step_loop import MOST_MS, ONE_LAYER, SMALL
+from fluxvla_core.config.load import load_config
 from fluxvla_core.robot.control.joiners import METHODS
 
 ROOT = Path(__file__).parents[2]
@@ -147,12 +148,17 @@ def test_how_chunks_are_joined_at_each_delay(way: str) -> None:
     ((_, *said),) = (row for row in table if row[0] == f"`{way}`")
     (episodes,) = {row["episodes"] for row in found}
     assert f"{episodes} episodes per row and delay" in page("control")
-    assert {row["successes"] for row in found} == {0}
-    assert "completes no hand-over yet" in page("control")
+    assert min(row["interval"][0] for row in found) > 0.3
+    every = results("rtc")["rows"]
+    done, tried = (sum(row[key] for row in every) for key in ("successes", "episodes"))
+    assert f"succeeds in {done} of {tried} episodes" in page("control")
     assert {row["late"] for row in found} == {0.0}
     assert "No chunk was late" in page("control")
-    assert f"after {results('rtc')['step']} training steps" in page("control")
+    step = load_config(ROOT / "configs" / "aloha_sim_pi05_tiny.py").tree["runner"]["max_steps"]
+    assert results("rtc")["step"] == step
+    assert f"after {step} training steps" in page("control")
     assert said == [
+        joined(found, "successes", 0),
         joined(found, "gap_rad", 2),
         joined(found, "largest_step_rad", 2),
         joined(found, "acceleration_rms", 1),

@@ -120,6 +120,11 @@ NOT_RUN: dict[tuple[str, str], str] = {
                 "docs/installation.md",
                 "pip install -c constraints.txt -e . -e plugins/fluxvla-libero",
             ),
+            (
+                "docs/installation.md",
+                "pip wheel --no-deps -w wheels . plugins/fluxvla-ddp plugins/fluxvla-models "
+                "plugins/fluxvla-report",
+            ),
             ("plugins/fluxvla-deepspeed/README.md", "pip install 'fluxvla-deepspeed[deepspeed]'"),
             ("plugins/fluxvla-gr00t/README.md", "pip install fluxvla-gr00t 'fluxvla-core[hub]'"),
             (

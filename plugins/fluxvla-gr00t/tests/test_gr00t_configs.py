@@ -13,6 +13,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
 from fluxvla_core.operators import Camera, Continuation, EmbodimentSpec, Joint
+from tests.policies.benched import DIVIDED, stages_of
 
 from . import published
 
@@ -195,6 +196,7 @@ def test_a_config_trains_from_a_published_checkpoint_and_acts(version, name, tmp
     chunk = policy.predict_action(observation)
     assert chunk.shape == (6, 3)
     assert np.isfinite(chunk).all()
+    assert stages_of(tmp_path / "work", tmp_path / "measured") == DIVIDED
 
 
 def record(folder, cameras):

@@ -26,6 +26,7 @@ from fluxvla_core.models import load_policy
 from fluxvla_core.spec.embodiment import Camera, Joint
 from fluxvla_core.training.foreign import import_checkpoint
 from tests.oracles import fill
+from tests.policies.benched import DIVIDED, WHOLE, stages_of
 
 GOLDEN = Path(__file__).parent / "golden"
 KEYS = Path(__file__).parent / "keys"
@@ -187,6 +188,9 @@ def test_raw_pictures_and_joints_to_commands(case: str, tmp_path: Path, monkeypa
         )
     chunk = policy.predict_action(observation(policy.cameras))
     close(torch.from_numpy(chunk).float()[: len(golden["commands"])], golden["commands"])
+    divided = isinstance(model, DiffusionPolicy)
+    stages = stages_of(tmp_path / "ours", tmp_path / "measured")
+    assert stages == (DIVIDED if divided else WHOLE)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -15,6 +15,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
+from tests.policies.benched import DIVIDED, WHOLE, stages_of
 
 from . import published, tiny
 
@@ -137,6 +138,8 @@ def test_it_trains_from_published_weights_and_acts(
     assert chunk.shape == (horizon, actions)
     assert np.isfinite(chunk).all()
     assert np.abs(chunk).max() <= 3.0
+    stages = stages_of(tmp_path / "work", tmp_path / "measured")
+    assert stages == (WHOLE if name == "openvla_libero" else DIVIDED)
 
 
 def table(values):

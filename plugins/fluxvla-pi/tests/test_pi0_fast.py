@@ -9,6 +9,7 @@ from fluxvla_pi.action_tokens import ActionWords, ProcessActionTokens
 from fluxvla_pi.pi0_fast import PI0FAST
 
 from fluxvla_core.data import PretrainedTokenizer
+from fluxvla_core.data.example import StandInTokenizer
 from fluxvla_core.errors import ConfigError
 
 from .oracles import pi_inputs as tiny
@@ -50,6 +51,12 @@ def test_a_chunk_is_written_as_an_answer():
     assert mask.sum() == len(tokens) < 64
     assert not found["action_tokens"][~mask].any()
     assert found["action_tokens"].shape == found["action_token_masks"].shape == (64,)
+
+
+def test_a_dry_run_without_the_tokenizers_files_has_tokens_of_its_shape():
+    found = ProcessActionTokens(StandInTokenizer(), max_len=64)({"actions": chunk()})
+    assert found["action_tokens"].shape == (64,)
+    assert found["action_token_masks"].sum() == 4 + tiny.HORIZON * tiny.ROBOT_ACTIONS // 4 + 2
 
 
 def test_paligemmas_words_are_the_default():

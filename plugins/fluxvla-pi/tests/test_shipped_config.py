@@ -18,6 +18,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
+from tests.policies.benched import DIVIDED, stages_of
 
 from .oracles.pi_inputs import EXPERT, GEMMA, VISION, VOCABULARY
 from .published_folders import tokenizer_folder
@@ -102,6 +103,7 @@ def test_it_trains_from_published_weights_and_acts(tmp_path, monkeypatch):
     )
     assert found.shape == (50, 14)
     assert np.isfinite(found).all()
+    assert stages_of(tmp_path / "out", tmp_path / "measured") == DIVIDED
 
 
 TINY = ROOT / "configs" / "aloha_sim_pi05_tiny.py"
@@ -124,3 +126,21 @@ def test_prompts_of_any_state_fit_the_tiny_one(value):
     for text in tree["inference"]["task_descriptions"].values():
         sample = prompt({"task_description": text, "states": np.full(14, value)})
         assert tokens(sample)["lang_masks"].sum() <= tables[-2]["max_len"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_tiny_one_learns_the_demos_tasks(tmp_path):
+    """As its first lines say, and far above what an untrained one reaches."""
+    pytest.importorskip("fluxvla_sim")
+    dataset, work = tmp_path / "dataset", tmp_path / "work"
+    assert main(["collect", "aloha", "--out", str(dataset), "--episodes", "240"]) == 0
+    sets = {
+        "runner": [f"train_dataloader.dataset.data_root_path={dataset}"],
+        "eval": ["eval.episodes=20", "eval.instruction_swap=false"],
+    }
+    for section, words in sets.items():
+        asked = ["--section", section, "--nproc", "2", "--work-dir", str(work)]
+        assert main(["run", "--config", str(TINY), *asked, "--cfg-options", *words]) == 0
+    found = json.loads((work / "eval" / "results.json").read_text())["groups"]
+    assert found["policy"]["all"]["low"] > max(0.3, found["untrained"]["all"]["high"]), found

@@ -18,6 +18,7 @@ from fluxvla_core import Camera, EmbodimentSpec, Joint
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.models import load_policy
+from tests.policies.benched import WHOLE, stages_of
 
 from .oracles import pi_inputs as tiny
 from .published_folders import GOLDEN
@@ -116,3 +117,4 @@ def test_it_trains_from_published_weights_and_acts(tmp_path, monkeypatch):
     )
     assert found.shape == (10, 7)
     assert np.isfinite(found).all()
+    assert stages_of(tmp_path / "out", tmp_path / "measured") == WHOLE

@@ -16,6 +16,7 @@ from fluxvla_core.data import PrivateInferenceDataset
 from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, UsageError
 from fluxvla_core.models import load_policy
 from tests.oracles import fill
+from tests.policies.benched import DIVIDED, stages_of
 
 from .tiny import (
     ACTION,
@@ -108,6 +109,7 @@ def test_it_acts_as_in_lerobot(source, tmp_path, tokenizer, golden, monkeypatch,
         expected = golden[f"act.{number}.actions"].double()
         assert chunk.shape == (HORIZON, ACTION)
         assert relative(torch.from_numpy(chunk), expected) < 1e-5
+    assert stages_of(out, tmp_path / "measured") == DIVIDED
 
 
 def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(

@@ -89,7 +89,11 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / NAME
     if not os.path.lexists(path):
-        raise CheckpointError(f"{NAME} is missing, so this is not a checkpoint", where=str(folder))
+        raise CheckpointError(
+            f"{NAME} is missing, so this is not a checkpoint",
+            where=str(folder),
+            next="name a checkpoint, or the work dir of a training that has saved one",
+        )
     try:
         content = read_bytes(path, CheckpointError, at_most=_LARGEST)
     except CheckpointError as error:

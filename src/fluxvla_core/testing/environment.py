@@ -160,7 +160,8 @@ class EnvironmentConformance:
             state, dim = environment.state, spec.embodiment.state_dim
             assert state.shape == (dim,), (
                 f"state has the shape {state.shape}, expected ({dim},): one number for each of "
-                f"{', '.join(spec.embodiment.state_names)}"
+                f"{', '.join(spec.embodiment.state_names)}; a state of other values than an action "
+                "has them in EmbodimentSpec(state_joints=...)"
             )
             assert state.dtype == np.float64, f"state is {state.dtype}, expected float64"
             assert np.isfinite(state).all(), (

@@ -379,7 +379,10 @@ class OperatorConformance(DividedOperatorChecks):
     def test_a_later_stop_sends_the_arm_nothing(self, connected: Any) -> None:
         before = self.settled(connected)
         if before is None:
-            pytest.skip("nobody counts commands: override commands_heard")
+            pytest.skip(
+                "nobody counts commands: override commands_heard in a test of the plugin, and name "
+                "its file with fluxvla plugins check --kit FILE"
+            )
         connected.send_action(self.hold(connected))
         connected.stop()
         stopped = self.settled(connected)

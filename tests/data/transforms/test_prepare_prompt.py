@@ -32,6 +32,10 @@ def test_the_state_in_words():
     assert found == "Task: put it away, State: 0 -1 128 255 255 255 1 0;\nAction: "
 
 
+def test_pi0_fast_says_action_itself():
+    assert prompt("PreparePromptWithState", "go", [0.5], ending="") == "Task: go, State: 192;\n"
+
+
 def test_padded_states_can_be_left_out():
     found = prompt("PreparePromptWithState", "go", [0.5, 0.0, 0.0], state_dim=1)
     assert found == "Task: go, State: 192;\nAction: "

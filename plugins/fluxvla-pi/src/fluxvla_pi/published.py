@@ -87,8 +87,8 @@ class _Shapes:
         return self._layout.theirs(ours) in self._shapes
 
     def family(self) -> str:
-        """Which model it is: only some have a time or an expert."""
-        if not self.has("action_out_proj.weight") and not self.has("llm_expert.norm.weight"):
+        """Which model it is: PI0-FAST has no expert, PI0 embeds times in another way."""
+        if not self._depth("llm_expert.layers", "self_attn.q_proj.weight"):
             return FAST
         return "pi05" if self.has("time_mlp_in.weight") else "pi0"
 

@@ -83,8 +83,8 @@ FAULTS = {
     ),
     "another width": Fault(
         "forward_gives_a_loss", "nn.Linear(5, width)", "nn.Linear(6, width)",
-        "it was given states (2, 5) float32, actions (2, 4, 3) float32, noise (2, 4, 3) float32: "
-        "set state_dim, cameras", (*TRAINING[1:], *ACTING),
+        "it was given states (2, 5) float32, actions (2, 4, 3) float32, noise (2, 2, 4, 3) "
+        "float32: set state_dim, cameras", (*TRAINING[1:], *ACTING),
     ),
     "asks for more": Fault(
         "forward_gives_a_loss", "def forward(self, states, actions, noise)",

@@ -196,7 +196,7 @@ class ModelConformance(Conformance):
         stated = numbers(self.stated())
         takes = f"; {self.entry_point} was made with {stated}" if stated else ""
         hint = (
-            "set state_dim, cameras, image, words, vocabulary and action_shape of this kit's "
+            "set state_dim, cameras, picture, words, vocabulary and action_shape of this kit's "
             "subclass to what it takes, or override batch(model, size) (fluxvla plugins check: "
             f"--kit FILE with such a subclass){takes}"
         )

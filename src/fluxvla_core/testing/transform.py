@@ -90,7 +90,7 @@ class TransformConformance(Conformance):
     def apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:
         """Call it as the pipeline does."""
         hint = (
-            "set state_dim, horizon, cameras and image of this kit's subclass to what it takes, "
+            "set state_dim, horizon, cameras and picture of this kit's subclass to what it takes, "
             "or override sample(number) for one that comes after other transforms (fluxvla "
             "plugins check: --kit FILE with such a subclass)"
         )

@@ -108,7 +108,7 @@ class CropImages(Transform):
         bottom, right = self.top + self.height, self.left + self.width
         if bottom > image.shape[1] or right > image.shape[2]:
             raise DataError(
-                f"CropImages: rows {self.top}:{bottom}, columns {self.left}:{right} are not in a "
+                f"CropImages: rows {self.top}:{bottom}, columns {self.left}:{right} are not in an "
                 f"image of {image.shape[1]} x {image.shape[2]} pixels"
             )
         return image[:, self.top : bottom, self.left : right]

@@ -39,9 +39,9 @@ class RunContext:
         task: ``--task``: an id from the config, or the instruction that it stands for.
         task_file: ``--tasks``: a file with one of these a line.
         free_task: ``--free-task``: other instructions are allowed, too.
-        nproc: ``--nproc``: how many processes work on this; where nobody said, 1 for a training
-            and None otherwise. Refused where a runner neither trains nor has ``workers``, which it
-            overrides.
+        nproc: ``--nproc``: how many processes work on this, by default 1 for a training and None
+            otherwise. It overrides ``workers``; a runner that neither trains nor has ``workers``
+            refuses it.
         reporter: where progress goes.
     """
 

@@ -83,11 +83,11 @@ class CheckPlugin:
         behind.add_argument(
             "--hardware",
             action="store_true",
-            help="of an operator: a robot is behind it, and may be moved once you have agreed at "
-            "the terminal",
+            help="operators only: a real robot is connected; it is moved only once you have agreed "
+            "at the terminal",
         )
         behind.add_argument(
-            "--simulated", action="store_true", help="of an operator: no robot is behind it"
+            "--simulated", action="store_true", help="operators only: no real robot is connected"
         )
         add_plugin_files(parser)
 

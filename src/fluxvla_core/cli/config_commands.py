@@ -49,7 +49,7 @@ class Check:
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument("file", help="a .py, .toml or config.resolved.json")
-        parser.once("--section", help="what this section needs must be there; others may lack it")
+        parser.once("--section", help="only the plugins of this section have to be installed")
         add_overrides(parser)
         add_plugin_files(parser)
 

@@ -22,7 +22,7 @@ class TrainOptions:
     """The settings of a train runner; its constructor and ``plugins show`` are made from them."""
 
     learning_rate: float
-    """peak rate of AdamW."""
+    """peak learning rate of the optimizer."""
     collator: Any
     """table of ``fluxvla.collators``, or a callable from samples to a batch."""
     max_epochs: int | None = None
@@ -75,7 +75,7 @@ class TrainOptions:
     """train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
     ``alpha``, ``dropout``, ``modules_to_save``."""
     ema_decay: float | None = None
-    """keep averaged weights too, and act with those; None does not."""
+    """decay of averaged weights (EMA), which are kept too and used for inference; None: none."""
     val_iter_interval: int | None = None
     """with a ``val_dataloader``: its loss every N steps and at the end; None with every
     checkpoint. The best one by it is kept and called ``best``."""

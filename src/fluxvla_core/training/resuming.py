@@ -150,7 +150,7 @@ def check_same_run(
             raise CheckpointError(
                 f"the {what} is {ours}, the checkpoint's run had {before}",
                 where=where,
-                cause="the rest of its epoch would be another one's",
+                cause="the order of samples would change in the middle of an epoch",
                 next="set it back, or start a new run in another --work-dir",
             )
     if saved["step_samples"] != plan.step_samples:
@@ -202,7 +202,10 @@ def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
         what = "ema_decay is set, and the checkpoint's run kept no averaged weights"
         back = "resume without ema_decay"
     else:
-        what = "ema_decay is not set, and the checkpoint's run kept averaged weights, which act"
+        what = (
+            "ema_decay is not set, and the checkpoint's run kept averaged weights, which are used "
+            "for inference"
+        )
         back = "set it back: the checkpoint's config.resolved.json has its value"
     raise CheckpointError(
         what,

@@ -164,7 +164,10 @@ class EpisodeRecorder(EpisodeObserver):
         self.summary = self._counted.to_dict()
         try:
             self.summary = self._trace.close(self.summary)
-            lost = [f"{count} {what}" for what, count in self._trace.dropped.items() if count]
+            # The file's key is older than the word that everything else uses.
+            words = {"pictures": "images"}
+            dropped = self._trace.dropped.items()
+            lost = [f"{count} {words.get(what, what)}" for what, count in dropped if count]
             if lost:
                 self._reporter.warn(
                     f"{' and '.join(lost)} were not recorded: "

@@ -13,7 +13,7 @@ from fluxvla_sim.aloha.cube import AlohaScene, sample_cube
 from fluxvla_sim.aloha.expert import Expert
 from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.ros2.drivers import AlohaDriver, MobileBase, URDriver, command_values
-from fluxvla_sim.ros2.node import Judge
+from fluxvla_sim.ros2.node import Judge, RobotNode
 from fluxvla_sim.ros2.operators import AlohaSimROSOperator, SlowedClock, URSimROSOperator
 from fluxvla_sim.ros2.settings import NodeSettings, stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
@@ -24,6 +24,17 @@ from fluxvla_core.ros2 import BadMessage, Fault
 from fluxvla_core.testing.ros2 import ros_domain
 
 __all__ = ["ros_domain"]
+
+
+def test_what_a_signal_handler_calls_takes_no_lock():
+    """A handler runs in the thread that it interrupts: a lock that is held there stays held."""
+    node = object.__new__(RobotNode)  # not connected
+    for name in ("_lock", "_stopping"):
+        setattr(node, name, None)
+
+    node.stop()
+
+    assert node._stop_wanted
 
 
 class TestWhatTheSimulatorTells:

@@ -130,6 +130,8 @@ class RobotNode:
         self._faults = Faults()
         # The scene's data, the driver's target and what is set by topics.
         self._lock = threading.Lock()
+        # Set by ``stop``. An event has a lock, which the interrupted thread may hold in a handler.
+        self._stop_wanted = False
         self._stopping = threading.Event()
         self._commanded = False
         self._parts = 0
@@ -168,7 +170,7 @@ class RobotNode:
 
     def stop(self) -> None:
         """Let ``run`` return; from any thread or signal handler."""
-        self._stopping.set()
+        self._stop_wanted = True
 
     def close(self) -> None:
         """Leave the graph; any number of times."""
@@ -180,7 +182,7 @@ class RobotNode:
         part = 1.0 / (CONTROL_HZ * settings.parts * settings.real_time_factor)
         pending = sorted(self._settings.faults, key=lambda item: item[0])
         start = deadline = time.monotonic()
-        while not self._stopping.is_set():
+        while not self._stop_wanted:
             now = time.monotonic()
             if seconds is not None and now - start >= seconds:
                 return
@@ -197,7 +199,7 @@ class RobotNode:
                 self.counts.late += 1
                 deadline += behind if behind > _FAR_BEHIND_S else 0.0
             else:
-                self._stopping.wait(-behind)
+                time.sleep(-behind)
 
     def _part(self, outbox: Outbox, now: float) -> None:
         parts = self._settings.parts

@@ -13,13 +13,11 @@ import ctypes
 import functools
 import importlib
 import importlib.util
-import math
 import os
 import re
 import secrets
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -137,6 +135,7 @@ class Connection:
         keep_large_blocks()
         from rclpy.context import Context
         from rclpy.signals import SignalHandlerOptions
+        from rclpy.task import Future
 
         clean = re.sub(r"\W+", "_", name).strip("_") or "node"
         self.name = f"{clean}_{os.getpid()}_{secrets.token_hex(2)}"
@@ -144,6 +143,7 @@ class Connection:
         self.streams: dict[str, Stream] = {}
         self._watchers: list[Callable[[], None]] = []
         self._closing = threading.Event()
+        self._closed: Any = Future()
         self._lock = threading.Lock()
         self._context = Context()
         transports = ExitStack()
@@ -227,11 +227,17 @@ class Connection:
             if self._closing.is_set():
                 return
             self._closing.set()
+        self._closed.set_result(None)
         self._executor.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_S)
 
     def _watch(self) -> None:
+        # A main thread that ends without close() is noticed, and the process does not hang on a
+        # thread that it must join.
+        if not threading.main_thread().is_alive() or not self._context.ok():
+            self._closed.set_result(None)
+            return
         for stream in self.streams.copy().values():
             stream.refresh()
         for callback in self._watchers:
@@ -240,18 +246,10 @@ class Connection:
     def _spin(self) -> None:
         # The thread that sends commands waits for the interpreter lock while this one has it.
         realtime.raise_priority()
-        main = threading.main_thread()
         try:
-            # The watch timer wakes this at least every WATCH_S, so a main thread that ends without
-            # close() is noticed, and the process does not hang on a thread that it must join.
-            checked_at = -math.inf
-            while not self._closing.is_set():
-                # Both take locks; this loop turns at every message.
-                if (now := time.monotonic()) - checked_at >= WATCH_S:
-                    if not main.is_alive() or not self._context.ok():
-                        break
-                    checked_at = now
-                self._executor.spin_once(timeout_sec=WATCH_S)
+            # The loop is the executor's: EventsExecutor has it in C++, without Python between two
+            # messages.
+            self._executor.spin_until_future_complete(self._closed)
         except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error
         finally:

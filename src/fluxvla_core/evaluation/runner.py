@@ -88,7 +88,7 @@ class EvalRunner(Runner):
         self.context = context or RunContext(config=cfg or {})
         name = type(self).__name__
         self.options = given = bind_options(self.Options, options, name, self.context)
-        given.check(self.config_error)
+        given.check(self.context)
         if given.environment is None:
             raise ConfigError(
                 f"{name} has no environment: where is the policy to act?",
@@ -266,8 +266,7 @@ class EvalRunner(Runner):
 
     def config_error(self, key: str, problem: str) -> ConfigError:
         """An error about a key of this section."""
-        where = self.context.where(f"{self.context.section}.{key}")
-        return ConfigError(f"{key} {problem}", where=where)
+        return self.context.error(key, problem)
 
     @contextmanager
     def _pool(self) -> Iterator[WorkerPool]:

@@ -32,6 +32,8 @@ from fluxvla_core.ros2.streams import Stream
 WATCH_S = 0.25
 """How often the graph is looked at: publishers that come, go or change what they offer."""
 _JOIN_S = 5.0
+# Without any timeout, rclpy 9.1's EventsExecutor keeps the GIL while it waits.
+_SPIN_S = 3600.0
 LARGE_FRAMES = Path(__file__).with_name("fastdds_large_frames.xml")
 _LOOPBACK = Path(__file__).with_name("fastdds_loopback.xml")
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -169,7 +171,7 @@ class Connection:
         try:
             self.domain: int = self._context.get_domain_id()
             self.every(WATCH_S, self._watch)
-            self._executor = _executor(self._context, small)
+            self._loops_in_cpp, self._executor = _executor(self._context, small)
             self._executor.add_node(self.node)
         except BaseException:
             self._context.try_shutdown()
@@ -236,6 +238,7 @@ class Connection:
         # A main thread that ends without close() is noticed, and the process does not hang on a
         # thread that it must join.
         if not threading.main_thread().is_alive() or not self._context.ok():
+            self._closing.set()
             self._closed.set_result(None)
             return
         for stream in self.streams.copy().values():
@@ -247,9 +250,11 @@ class Connection:
         # The thread that sends commands waits for the interpreter lock while this one has it.
         realtime.raise_priority()
         try:
-            # The loop is the executor's: EventsExecutor has it in C++, without Python between two
-            # messages.
-            self._executor.spin_until_future_complete(self._closed)
+            while not self._closing.is_set():
+                if self._loops_in_cpp:
+                    self._executor.spin_until_future_complete(self._closed, _SPIN_S)
+                else:
+                    self._executor.spin_once(timeout_sec=WATCH_S)
         except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error
         finally:
@@ -259,15 +264,16 @@ class Connection:
             self._context.try_shutdown()
 
 
-def _executor(context: Any, events: bool) -> Any:
+def _executor(context: Any, events: bool) -> tuple[bool, Any]:
+    """An executor, and whether it loops over messages in C++."""
     # Jazzy has no such module.
     if events and importlib.util.find_spec("rclpy.experimental") is not None:
         from rclpy.experimental import EventsExecutor
 
-        return EventsExecutor(context=context)
+        return True, EventsExecutor(context=context)
     from rclpy.executors import SingleThreadedExecutor
 
-    return SingleThreadedExecutor(context=context)
+    return False, SingleThreadedExecutor(context=context)
 
 
 def _check_domain(domain_id: int | None) -> None:

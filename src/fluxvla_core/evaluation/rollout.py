@@ -3,12 +3,16 @@
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
 commands are formed by the same path as on a robot: a chunk's actions are joined linearly from the
 last command on and kept within the same limits. Other actions pass the limits unchanged.
+
+A policy that acts on several observations also gets those of the action steps before: of every
+action that is executed, as far back as it looks.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,8 +22,9 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
-from fluxvla_core.contracts.policy import Actor
-from fluxvla_core.errors import RunFailed, SpecMismatch
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.contracts.policy import Actor, with_history
+from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
 from fluxvla_core.robot.control.clamps import PassThrough
 from fluxvla_core.robot.control.limits import CommandLimiter
@@ -141,6 +146,8 @@ def run_episode(
     problem: str | None = None
     # The environment may have another instruction for each episode.
     instruction = (instruction_of or task).instruction
+    stride = history_stride(actor, spec.embodiment.rate_hz)
+    before: deque[Observation] = deque(maxlen=max(actor.n_obs_steps - 1, 0))
     if on_step is not None:
         on_step(environment, 0)
     while not ended and steps < limit:
@@ -150,9 +157,11 @@ def run_episode(
         # Before the policy is queried: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
         observed_at = time.perf_counter()
-        chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
+        asked = with_history(observation, actor.n_obs_steps, tuple(before))
+        chunk = shaped(actor.predict_action(asked), spec.embodiment.dim)
         answered = time.perf_counter()
-        del observation  # so that the next images can have its memory: fresh pages cost more
+        before.append(observation)
+        del observation, asked  # so that the next images can have its memory: fresh pages cost more
         spent["observe"] += observed_at - at
         spent["policy"] += answered - observed_at
         calls += 1
@@ -160,7 +169,8 @@ def run_episode(
         if problem is not None:
             success = False
             break
-        for target in commands.targets(chunk[: settings.replan_every]):
+        targets = commands.targets(chunk[: settings.replan_every])
+        for left, target in zip(reversed(range(len(targets))), targets, strict=True):
             at = time.perf_counter()
             outcome = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
@@ -176,6 +186,10 @@ def run_episode(
                 on_step(environment, steps)
             if ended or steps >= limit:
                 break
+            if left and left % stride == 0 and left // stride < actor.n_obs_steps:
+                at = time.perf_counter()
+                before.append(environment.observe(settings.cameras))
+                spent["observe"] += time.perf_counter() - at
     return {
         "success": success,
         "problem": problem,
@@ -191,6 +205,25 @@ def run_episode(
             **{f"{name}_seconds": value for name, value in spent.items()},
         },
     }
+
+
+def history_stride(actor: Actor, rate_hz: float) -> int:
+    """Control steps between two observations of a policy's history: those of one of its actions.
+
+    Raises:
+        ConfigError: the policy needs a history, and its actions are no whole number of steps.
+    """
+    own = actor.action_rate_hz
+    if actor.n_obs_steps == 1 or own is None:
+        return 1
+    stride = round(rate_hz / own)
+    if stride < 1 or abs(stride * own - rate_hz) > 1e-9 * rate_hz:
+        raise ConfigError(
+            f"the policy acts on {actor.n_obs_steps} observations (n_obs_steps) 1/{own:g} s apart, "
+            f"the environment takes steps of 1/{rate_hz:g} s: it cannot be observed in between",
+            next="train on data whose frame rate divides the environment's rate",
+        )
+    return stride
 
 
 def shaped(chunk: Any, dim: int) -> Array:

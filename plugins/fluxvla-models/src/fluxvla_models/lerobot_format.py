@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from fluxvla_models.lerobot_statistics import read_normalization, tables
 from fluxvla_models.lerobot_write import write_act, write_diffusion
@@ -39,11 +39,7 @@ class _LeRobotFormat(CheckpointFormat):
         """Actions in a chunk."""
 
     def recognizes(self, folder: Path) -> bool:
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") == self.kind and "input_features" in config
+        return policy_type(folder) == self.kind
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_models.fast_tokenizer import SETTINGS
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
 
 from fluxvla_core.data import PretrainedTokenizer
 from fluxvla_core.errors import CheckpointError
@@ -44,11 +44,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
 
     def recognizes(self, folder: Path) -> bool:
         """Whether ``config.json`` is of such a policy."""
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") == FAST
+        return policy_type(folder) == FAST
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()

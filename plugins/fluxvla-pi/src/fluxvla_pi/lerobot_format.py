@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE
+from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE, policy_type
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
@@ -48,11 +48,7 @@ class LeRobotPiFormat(CheckpointFormat):
 
     def recognizes(self, folder: Path) -> bool:
         """Whether ``config.json`` is of such a policy."""
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") in FAMILIES
+        return policy_type(folder) in FAMILIES
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()

@@ -25,8 +25,8 @@ class Prefix:
 
     @property
     def rope_positions(self) -> Tensor:
-        """``(B, P)``: padding takes no place."""
-        return self.real.long().cumsum(1) - 1
+        """``(B, P)``: :func:`rope_positions` of its tokens."""
+        return rope_positions(self.real)
 
     @property
     def mask(self) -> Tensor:
@@ -35,6 +35,11 @@ class Prefix:
         Padding does so, too: nobody attends to it, and a row without any key has no softmax.
         """
         return self.real[:, None, None]
+
+
+def rope_positions(real: Tensor) -> Tensor:
+    """``(B, L)`` int64 of tokens that are ``real`` ``(B, L)``, or padding, which takes no place."""
+    return real.long().cumsum(1) - 1
 
 
 def embed_prefix(

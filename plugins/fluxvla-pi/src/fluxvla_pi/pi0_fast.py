@@ -22,7 +22,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA, built_without_memory, has_values
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.gemma import GemmaDecoder, rope_of
-from fluxvla_pi.paligemma import Prefix, embed_prefix
+from fluxvla_pi.paligemma import Prefix, embed_prefix, rope_positions
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, siglip_size
 
@@ -144,7 +144,7 @@ class PI0FAST(VLA, nn.Module):
         places = torch.arange(hidden.shape[1], device=hidden.device)
         # All of the prefix is one block; each token of the answer is one of its own.
         blocks = (places - prefix.hidden.shape[1] + 1).clamp(min=0)
-        hidden, _ = self._layers(hidden, _positions(real), _mask(blocks, real))
+        hidden, _ = self._layers(hidden, rope_positions(real), _mask(blocks, real))
         logits = self._logits(hidden[:, -said.shape[1] :])
         wanted, counted = action_tokens[:, 1:], action_token_masks[:, 1:].float()
         losses = functional.cross_entropy(
@@ -206,7 +206,7 @@ class PI0FAST(VLA, nn.Module):
         blocks = torch.zeros(hidden.shape[1], dtype=torch.long, device=hidden.device)
         if not self.bos_in_prompt:
             blocks[-1] = 1
-        hidden, known = self._layers(hidden, _positions(real), _mask(blocks, real))
+        hidden, known = self._layers(hidden, rope_positions(real), _mask(blocks, real))
         groups, dtype = self.llm_backbone.layers[0].groups, prefix.hidden.dtype
         ended, said = torch.zeros_like(one[:, 0]), []
         for step in range(self.max_decoding_steps):
@@ -219,7 +219,7 @@ class PI0FAST(VLA, nn.Module):
             real = torch.cat([real, one], dim=1)
             mask = folded_mask(real[:, None, None], groups, dtype)
             hidden = self.llm_backbone.embed(token).to(dtype)
-            hidden, known = self._layers(hidden, _positions(real)[:, -1:], mask, known)
+            hidden, known = self._layers(hidden, rope_positions(real)[:, -1:], mask, known)
         return torch.cat(said, dim=1)
 
     def _prefix(
@@ -302,11 +302,6 @@ class PI0FAST(VLA, nn.Module):
             self.words.check(built.vocab_size, "PI0FAST")
             self._tokenizer = built
         return self._tokenizer
-
-
-def _positions(real: Tensor) -> Tensor:
-    """``(B, L)``: padding takes no place."""
-    return real.long().cumsum(1) - 1
 
 
 def _mask(blocks: Tensor, real: Tensor) -> Tensor:

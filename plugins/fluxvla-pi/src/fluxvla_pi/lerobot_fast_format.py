@@ -18,6 +18,7 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, without_cameras
 from fluxvla_core.results import read_json
 from fluxvla_pi.action_tokens import ActionWords
+from fluxvla_pi.lerobot_fast_write import TOKENIZER, write_fast
 from fluxvla_pi.lerobot_format import (
     cameras_in,
     count_of,
@@ -31,16 +32,17 @@ from fluxvla_pi.lerobot_format import (
     width_of,
 )
 from fluxvla_pi.lerobot_processors import from_files
+from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.published import FAST, weights_in
 
 _FIXED = {"n_obs_steps": 1, "use_peft": False}
-_TOKENIZER = "lerobot/fast-action-tokenizer"
 
 
 class LeRobotPi0FastFormat(CheckpointFormat):
     """LeRobot's ``pi0_fast`` policies."""
 
     name: ClassVar[str] = "lerobot"
+    model_types: ClassVar[Sequence[str]] = (PI0FAST.__name__,)
 
     def recognizes(self, folder: Path) -> bool:
         """Whether ``config.json`` is of such a policy."""
@@ -113,10 +115,14 @@ class LeRobotPi0FastFormat(CheckpointFormat):
             notes=notes_of(preparation, tokenizer),
         )
 
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write ``checkpoint`` into ``folder``; see ``CheckpointFormat``."""
+        write_fast(checkpoint, folder)
+
 
 def _action_tokenizer(folder: Path, config: Mapping[str, Any], where: str) -> Path:
     """The folder of the FAST tokenizer."""
-    name = str(config.get("action_tokenizer_name", _TOKENIZER))
+    name = str(config.get("action_tokenizer_name", TOKENIZER))
     inside = folder / Path(name).name
     for place in (Path(name), inside):
         if (place / SETTINGS).is_file():

@@ -112,6 +112,5 @@ def test_answers_of_openpi(tied, openpi):
         found = tied.answer(**whole(seen()))
     expected = openpi["answers.training"]
     assert torch.equal(found, expected[:, : found.shape[1]])
-    assert len(expected.unique()) > 8
     # Its sampling has the first token where training has it, and the others one place further.
     assert torch.equal(found[:, 0], openpi["answers.sampled"][:, 0])

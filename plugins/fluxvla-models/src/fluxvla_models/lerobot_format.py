@@ -44,7 +44,7 @@ class _LeRobotFormat(CheckpointFormat):
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        cameras, size = pictures(config, where)
+        cameras, size = image_features(config, where)
         joints, dim = width(config, "input_features", STATE, where), action_dim(config, where)
         model = self.model(config, where)
         normalization = read_normalization(folder, config)
@@ -203,7 +203,7 @@ def features_of(
     return features
 
 
-def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
+def image_features(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
     """The policy's cameras, by feature, and the height and width of their images.
 
     Raises:
@@ -250,7 +250,7 @@ def _common(config: Mapping[str, Any], where: str) -> dict[str, Any]:
     return {
         "state_dim": width(config, "input_features", STATE, where),
         "action_dim": action_dim(config, where),
-        "num_cameras": len(pictures(config, where)[0]),
+        "num_cameras": len(image_features(config, where)[0]),
         "backbone": _value(config, "vision_backbone", where),
     }
 

@@ -25,7 +25,7 @@ from fluxvla_pi.lerobot_format import (
     features_of,
     normalization,
     notes_of,
-    of_pictures,
+    of_images,
     of_words,
     resolution_of,
     statistics_of,
@@ -55,7 +55,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
 
         Args:
             tokenizer: the folder of PaliGemma's tokenizer.
-            absent: cameras without pictures, which LeRobot masks.
+            absent: cameras without images, which LeRobot masks.
 
         Raises:
             CheckpointError: it is damaged, does something that PI0-FAST here does not, or the
@@ -104,7 +104,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
             tensors=weights.tensors,
             img_keys=without_cameras(cameras_in(inputs, where), absent, where),
             transforms=[
-                *of_pictures(resolution_of(config, where)),
+                *of_images(resolution_of(config, where)),
                 normalization(preparation),
                 {"type": "PreparePromptWithState", "ending": ""},
                 of_words(preparation, tokenizer),

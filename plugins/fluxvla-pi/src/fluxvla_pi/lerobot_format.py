@@ -57,7 +57,7 @@ class LeRobotPiFormat(CheckpointFormat):
 
         Args:
             tokenizer: the folder of PaliGemma's tokenizer.
-            absent: cameras without pictures, which LeRobot masks.
+            absent: cameras without images, which LeRobot masks.
 
         Raises:
             CheckpointError: it is damaged, or does something that PI0 here does not.
@@ -128,7 +128,7 @@ class LeRobotPiFormat(CheckpointFormat):
 
 
 def resolution_of(config: Mapping[str, Any], where: str) -> list[int]:
-    """Height and width that pictures are brought to."""
+    """Height and width that images are brought to."""
     size = config.get("image_resolution", [224, 224])
     if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
         raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
@@ -183,11 +183,11 @@ def _transforms(
         prompt: dict[str, Any] = {"type": "PreparePrompt", "clean": False}
     else:
         prompt = {"type": "PreparePromptWithState"}
-    return [*of_pictures(size), numbers, prompt, of_words(preparation, tokenizer)]
+    return [*of_images(size), numbers, prompt, of_words(preparation, tokenizer)]
 
 
-def of_pictures(size: Sequence[int]) -> list[dict[str, Any]]:
-    """The transforms that bring pictures to ``size``, height and width."""
+def of_images(size: Sequence[int]) -> list[dict[str, Any]]:
+    """The transforms that bring images to ``size``, height and width."""
     height, width = size
     resize = {"type": "ResizeImagesWithPad", "height": height, "width": width}
     return [{**resize, "interpolation": "linear"}, {"type": "SimpleNormalizeImages"}]

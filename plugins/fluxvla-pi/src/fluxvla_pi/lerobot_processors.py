@@ -254,7 +254,7 @@ def _modes(given: Any, where: str) -> dict[str, str]:
         )
     if given.get("VISUAL", "IDENTITY") != "IDENTITY":
         raise CheckpointError(
-            f"pictures are normalized by {given['VISUAL']}; PI0 and PI0.5 take them as they are",
+            f"images are normalized by {given['VISUAL']}; PI0 and PI0.5 take them as they are",
             where=where,
         )
     return {

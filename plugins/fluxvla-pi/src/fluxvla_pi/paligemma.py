@@ -1,4 +1,4 @@
-"""PaliGemma (Beyer et al. 2024, arXiv 2407.07726): pictures and words as one row of tokens."""
+"""PaliGemma (Beyer et al. 2024, arXiv 2407.07726): images and words as one row of tokens."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def embed_prefix(
     lang_tokens: Tensor,
     lang_masks: Tensor,
 ) -> Prefix:
-    """Pictures and words as tokens, pictures first.
+    """Images and words as tokens, images first.
 
     Args:
         images: ``(B, 3N, H, W)`` in -1..1.

@@ -1,7 +1,7 @@
 """PI0-FAST (Pertsch et al. 2025, arXiv 2501.09747): PaliGemma that answers with action tokens.
 
 The state stands in the prompt. A chunk of actions is an answer in FAST tokens, one after the other:
-pictures and prompt attend to each other, the answer to them and to what it has said already. There
+images and prompt attend to each other, the answer to them and to what it has said already. There
 is no action expert, and nothing is denoised.
 """
 
@@ -43,7 +43,7 @@ class PI0FAST(VLA, nn.Module):
             missing.
         temperature: of sampling; 0 takes the likeliest token.
         strict_decoding: see ``FastTokenizer.decode_actions``.
-        bos_in_prompt: when acting, pictures and prompt attend to the answer's first token, which
+        bos_in_prompt: when acting, images and prompt attend to the answer's first token, which
             they do not in training: as LeRobot's PI0-FAST acts.
         tied_head: the words that are answered are those that are embedded, as in PaliGemma; False
             trains both, as LeRobot does.

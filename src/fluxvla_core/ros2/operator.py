@@ -152,6 +152,10 @@ class RosOperator(Operator):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if "pictures_after" in vars(cls) and "images_after" not in vars(cls):
+            message = f"{cls.__name__}.pictures_after is deprecated, name it images_after"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            cls.images_after = vars(cls)["pictures_after"]  # type: ignore[method-assign]
         if "admit" in vars(cls):
             message = f"{cls.__name__}.admit is deprecated, call it check_command"
             warnings.warn(message, DeprecationWarning, stacklevel=2)
@@ -254,7 +258,7 @@ class RosOperator(Operator):
         """
         return min(received.receipt for received in self._reader.states().values())
 
-    def pictures_after(
+    def images_after(
         self, camera: str, after: float
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
         """Images that a camera sent after a time, for recordings; any thread may call it.
@@ -272,7 +276,15 @@ class RosOperator(Operator):
         connection = self._connection
         if connection is None:
             return [], 0
-        return frames.pictures_after(connection, self._specs, camera, after)
+        return frames.images_after(connection, self._specs, camera, after)
+
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """Deprecated name of :meth:`images_after`."""
+        message = "RosOperator.pictures_after is deprecated, use images_after"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return RosOperator.images_after(self, camera, after)
 
     def send_action(self, action: npt.ArrayLike) -> None:
         """Publish one ``(dim,)`` command.

@@ -293,7 +293,7 @@ class Strategy(TrainRunner):
                 the two keeps averages.
         """
         from fluxvla_core.checkpoints import checkpoint as ckpt
-        from fluxvla_core.training import resuming
+        from fluxvla_core.training import resume_checks, resuming
         from fluxvla_core.training.optimizer_state import SavedOptimizer
         from fluxvla_core.training.progress import Progress
 
@@ -301,7 +301,7 @@ class Strategy(TrainRunner):
         if checkpoint is None:
             return 0
         where = str(checkpoint.path)
-        saved, notes = resuming.check_settings(
+        saved, notes = resume_checks.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
         for note in notes if self.world.is_rank0 else ():

@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 
 from fluxvla_core.build import parameters
-from fluxvla_core.config.docstrings import argument_texts
 from fluxvla_core.config.runtime_signature import inspect_signature, misfits
 from fluxvla_core.config.signature import Signature, read_signature
-from fluxvla_core.config.source import Opaque, Source, find, linearize
+from fluxvla_core.config.source import Opaque, Source, argument_texts, find, linearize
 from fluxvla_core.plugins._metadata import Plugin
 from tests.conftest import Install
 

@@ -23,8 +23,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.frame import RobotFrame
-from fluxvla_core.contracts.part import Part
-from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.robot import Operator, Part
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection

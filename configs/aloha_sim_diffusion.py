@@ -6,12 +6,13 @@ fluxvla run --config configs/aloha_sim_diffusion.py --section runner
 fluxvla run --config configs/aloha_sim_diffusion.py --section eval
 fluxvla run --config configs/aloha_sim_diffusion.py --section inference --task 1
 
-Hyperparameters are those of the convolutional policy in the appendix of arXiv 2303.04137, but for
-the observations: the present one alone.
+Hyperparameters are those of the convolutional policy in the appendix of arXiv 2303.04137: two
+observations, the present one and that of the action before, 16 actions, of which 8 are executed.
 """
 
 DATASET = "work_dirs/aloha_sim_diffusion/dataset"
-HORIZON = 16  # 1.6 s at 10 Hz, of which the first half is executed
+OBSERVATIONS = 2
+HORIZON = 16  # 1.6 s at 10 Hz; a chunk begins with the action of the first observation
 STEPS = 100
 
 model = dict(
@@ -20,6 +21,7 @@ model = dict(
     action_dim=14,
     horizon=HORIZON,
     num_cameras=1,
+    n_obs_steps=OBSERVATIONS,
     backbone="resnet18",
     backbone_norm="group",
     keypoints=32,
@@ -38,6 +40,8 @@ train_dataloader = dict(
         data_root_path=DATASET,
         img_keys=["top"],
         action_window_size=HORIZON,
+        n_obs_steps=OBSERVATIONS,
+        past_actions=OBSERVATIONS - 1,
         cache_frames=True,
         transforms=[
             dict(type="ResizeImages", height=144, width=192),

@@ -133,7 +133,7 @@ def test_a_dataset_shows_what_its_model_takes(shared, name):
     settings = {"n_obs_steps": 2, "past_actions": 1}
     check_observations(Two(), load(shared, **settings), RunContext())
     wrong = load(shared, **{**settings, name: settings[name] - 1})
-    told = rf"{name} of Two is {settings[name]}, that of the dataset {settings[name] - 1}"
+    told = rf"{name} of the model is {settings[name]}, that of the dataset {settings[name] - 1}"
     mixture = DistributedRepeatingDataset([wrong])
     for dataset in (wrong, mixture):
         with pytest.raises(ConfigError, match=told) as caught:

@@ -60,7 +60,7 @@ def check_observations(
             takes, has = getattr(wanted, name), getattr(shown, name)
             if takes != has:
                 raise ConfigError(
-                    f"{name} of {type(wanted).__name__} is {takes}, that of the dataset {has}",
+                    f"{name} of the model is {takes}, that of the dataset {has}",
                     where=context.where(f"{section}.dataset.{name}"),
                     cause="a model's samples have its observations, and the actions that belong "
                     "to them",

@@ -35,7 +35,7 @@ from fluxvla_core.training.footprint import (
     kept_by_fake,
     optimizer_bytes,
 )
-from fluxvla_core.training.model import ForwardArguments
+from fluxvla_core.training.model import ForwardArguments, check_observations
 from fluxvla_core.training.parameters import Layout, trainable
 from fluxvla_core.training.strategy import Strategy
 
@@ -102,6 +102,8 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     _compare(rehearsal)
     if model is not None and batch is not None:
         try:
+            if rehearsal.data is not None and rehearsal.data.dataset is not None:
+                check_observations(model, rehearsal.data.dataset, context)
             ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
         except ConfigError as error:
             rehearsal.refused, batch = error, None

@@ -30,6 +30,7 @@ def shake(scene, seed, steps=12):
     return scene.state_hash()
 
 
+@pytest.mark.early
 def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
     """After other episodes in the scene, and from a model that LIBERO built again."""
     init = init_states("libero_object", 2)

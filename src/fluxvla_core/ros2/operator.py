@@ -23,8 +23,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.frame import RobotFrame
-from fluxvla_core.contracts.part import Part
-from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.robot import Operator, Part
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection
@@ -408,6 +407,9 @@ class RosOperator(Operator):
         for spec in self._specs:
             message = message_class(spec.message)
             connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
+        self._stream_reader = StreamReader(
+            connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on
+        )
         self._publishers = {
             command.topic: connection.publisher(command.topic, message_class(command.message))
             for command in commands
@@ -457,8 +459,8 @@ class RosOperator(Operator):
     @property
     def _reader(self) -> StreamReader:
         """Reader of the streams; raises NotReady without a connection."""
-        connection = self._connected()
-        return StreamReader(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
+        self._connected()
+        return self._stream_reader
 
     def _state_of(self, messages: Mapping[str, Received]) -> tuple[Array, float]:
         """The ``(state_dim,)`` state, and the receipt of the oldest message in it."""

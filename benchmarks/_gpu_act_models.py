@@ -34,13 +34,24 @@ _TINY_HEAD = {
 }  # fmt: skip
 
 
+def model_table(family: str, tiny: bool) -> dict[str, Any]:
+    """The table of the model in a config."""
+    if family == "pi05":
+        return {"type": "PI05FlowMatching", "num_steps": 10, **(_TINY_PI05 if tiny else {})}
+    return {
+        "type": "GR00T",
+        "vlm_backbone": {"type": "EagleBackbone", **(_TINY_EAGLE if tiny else {})},
+        "vla_head": {"type": "GR00TActionHead", **(_TINY_HEAD if tiny else {})},
+    }
+
+
 @dataclass(frozen=True)
 class Case:
     """One policy.
 
     Args:
         family: ``pi05`` or ``gr00t``.
-        cameras: pictures of an observation.
+        cameras: images of an observation.
         goal_ms: what p50 is to stay below on one H200.
     """
 
@@ -55,20 +66,9 @@ class Case:
 
     def model(self, size: str, device: str) -> Any:
         """Weights are drawn on the device, which takes a GPU a second and a CPU a minute."""
-        tiny = size == "tiny"
         torch.manual_seed(0)
         with torch.device(device):
-            if self.family == "pi05":
-                return build_vla_from_cfg(
-                    {"type": "PI05FlowMatching", "num_steps": 10, **(_TINY_PI05 if tiny else {})}
-                ).eval()
-            return build_vla_from_cfg(
-                {
-                    "type": "GR00T",
-                    "vlm_backbone": {"type": "EagleBackbone", **(_TINY_EAGLE if tiny else {})},
-                    "vla_head": {"type": "GR00TActionHead", **(_TINY_HEAD if tiny else {})},
-                }
-            ).eval()
+            return build_vla_from_cfg(model_table(self.family, size == "tiny")).eval()
 
     def batch(self, model: Any, seed: int) -> dict[str, Tensor]:
         """An observation and noise on the host, a prompt being as long as its budget."""
@@ -89,8 +89,8 @@ class Case:
             found["states"] = torch.randn(1, model.vla_head.state_dim, generator=drawn)
         seen = torch.ones(tokens.shape, dtype=torch.bool)
         seen[:, -words // 4 :] = False
-        pictures = torch.rand(1, 3 * self.cameras, side, side, generator=drawn) * 2 - 1
-        return {**found, "images": pictures, "lang_tokens": tokens, "lang_masks": seen}
+        images = torch.rand(1, 3 * self.cameras, side, side, generator=drawn) * 2 - 1
+        return {**found, "images": images, "lang_tokens": tokens, "lang_masks": seen}
 
 
 CASES = (Case("pi05", 2, 20.0), Case("pi05", 3, 20.0), Case("gr00t", 2, 15.0))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,19 @@ import torch.distributed as dist
 from torch.profiler import ProfilerActivity
 from torch.utils.data import DataLoader
 
+from benchmarks._gpu_act_models import Case, model_table
 from benchmarks._pi05_model import SIZES, BenchPi05
 from fluxvla_core import RunContext, build_runner_from_cfg
+from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.training import memory
 from fluxvla_core.training.batches import StepPlan, StepSampler
 from fluxvla_core.training.model import checkpoint_activations, compile_units, units_of
 
+BENCH = "bench"
+FAMILIES = (BENCH, "pi05", "gr00t")
+"""``BenchPi05``, and models of plugins, with the weights that they draw."""
 OURS, HAND = "runner", "by hand"
 KEYS = ("images", "lang_tokens", "lang_masks", "actions", "noise", "time")
 LEARNING_RATE, WEIGHT_DECAY, MAX_NORM = 5e-5, 0.01, 1.0
@@ -35,6 +41,7 @@ MIXED = {"param_dtype": torch.bfloat16, "reduce_dtype": torch.float32, "cast_for
 class Setup:
     """What both sides do; ``batch`` is a process's."""
 
+    family: str = BENCH
     size: str = "pi05"
     device: str = "cuda"
     nproc: int = 1
@@ -55,16 +62,38 @@ class Setup:
         """Arguments of the model."""
         return {"size": self.size, "attention": self.attention, "device": self.device}
 
+    @property
+    def table(self) -> dict[str, Any]:
+        """The model in a config."""
+        if self.family == BENCH:
+            return {"type": "BenchPi05", **self.model}
+        return model_table(self.family, self.size == "tiny")
+
+    def built(self, device: str) -> Any:
+        """The model, in train mode; on ``meta`` it takes no memory."""
+        if self.family == BENCH:
+            return BenchPi05(**{**self.model, "device": device})
+        with torch.device(device):
+            return build_vla_from_cfg(self.table)
+
+
+def keys_of(setup: Setup) -> Sequence[str]:
+    """What a batch has; of ``BenchPi05`` always the same."""
+    return KEYS if setup.family == BENCH else tuple(_of_family(setup))
+
 
 class Samples:
     """Random samples from a pool in memory; prompts are 3/10 to all of the longest."""
 
     def __init__(self, setup: Setup) -> None:
+        if setup.family != BENCH:
+            self.data = _of_family(setup)
+            return
         s, rng = SIZES[setup.size], np.random.default_rng(0)
-        pictures = (POOL, 3 * s.cameras, s.picture, s.picture)
+        images = (POOL, 3 * s.cameras, s.picture, s.picture)
         chunk = (POOL, s.actions, s.action_dim)
         self.data = {
-            "images": rng.integers(0, 256, pictures, np.uint8),
+            "images": rng.integers(0, 256, images, np.uint8),
             "lang_tokens": rng.integers(0, s.words, (POOL, s.prompt)),
             "actions": rng.standard_normal(chunk, np.float32),
             "noise": rng.standard_normal(chunk, np.float32),
@@ -85,10 +114,26 @@ class Samples:
         return {name: values[index % POOL] for name, values in self.data.items()}
 
 
+def _of_family(setup: Setup) -> dict[str, Any]:
+    """``POOL`` samples of what a plugin's model learns from, with two cameras."""
+    model, rng = setup.built("meta"), np.random.default_rng(0)
+    case = Case(setup.family, 2, 0.0)
+    rows = [case.batch(model, seed) for seed in range(POOL)]
+    found = {name: torch.cat([row[name] for row in rows]).numpy() for name in rows[0]}
+    if setup.whole_prompts:
+        found["lang_masks"][:] = True
+    found["noise"] = found["noise"][:, None]
+    found["actions"] = rng.standard_normal((POOL, *model.action_shape), np.float32)
+    found["action_masks"] = np.ones((POOL, model.action_shape[0]), np.float32)
+    found["time"] = 1 - rng.beta(1.5, 1.0, (POOL, 1)).astype(np.float32)
+    taken = inspect.signature(type(model).forward).parameters
+    return {name: values for name, values in found.items() if name in taken}
+
+
 def our_config(setup: Setup) -> dict[str, Any]:
     """The config tree of our side."""
     return {
-        "model": {"type": "BenchPi05", **setup.model},
+        "model": setup.table,
         "train_dataloader": {
             "per_device_batch_size": setup.batch,
             "per_device_num_workers": setup.workers,
@@ -106,7 +151,7 @@ def our_config(setup: Setup) -> dict[str, Any]:
             "seed": SEED,
             "device": setup.device,
             "peak_tflops": setup.peak_tflops,
-            "collator": {"type": "DictCollator", "keys": list(KEYS)},
+            "collator": {"type": "DictCollator", "keys": list(keys_of(setup))},
         },
     }
 
@@ -142,7 +187,7 @@ def by_hand(setup: Setup) -> Callable[[int], float]:
     if setup.nproc > 1:
         dist.init_process_group("nccl" if setup.device == "cuda" else "gloo")
     torch.manual_seed(SEED)
-    model: Any = BenchPi05(**setup.model)
+    model: Any = setup.built(setup.device)
     if setup.recompute:
         checkpoint_activations(model)
     if setup.compile:
@@ -165,7 +210,7 @@ def by_hand(setup: Setup) -> Callable[[int], float]:
             dataset,
             batch_sampler=order,
             num_workers=setup.workers,
-            collate_fn=DictCollator(KEYS),
+            collate_fn=DictCollator(keys_of(setup)),
             pin_memory=setup.device == "cuda",
         )
     )

@@ -3,6 +3,10 @@
     python -m benchmarks.gpu_step [--batch 16] [--nproc 1] [--recompute] [--compile] [--profile]
     python -m benchmarks.gpu_step --size tiny --device cpu     the same in seconds, no figures kept
 
+``--family pi05`` and ``gr00t`` measure the models of ``fluxvla-pi`` and ``fluxvla-gr00t`` instead
+(any size but ``tiny`` is the published one), and write a file of their own. GR00T looks for the
+places of its images in each prompt: its operations cannot be counted, and there is no MFU.
+
 ``FSDPTrainRunner`` against a torch loop written by hand: the same model (``_pi05_model.py``),
 random batches made on the host (pictures as uint8), bf16 compute over fp32 weights, fused AdamW
 and clipping. By hand one process has plain autocast; several have ``fully_shard``. The sides take
@@ -31,13 +35,14 @@ from typing import Any
 import torch
 
 from benchmarks import _results
-from benchmarks._gpu_step_sides import HAND, OURS, Setup, measure
-from benchmarks._pi05_model import ATTENTION, SIZES, BenchPi05
+from benchmarks._gpu_step_sides import BENCH, FAMILIES, HAND, OURS, Setup, measure
+from benchmarks._pi05_model import ATTENTION, SIZES
 from fluxvla_core.testing.training import run_ranks
 from fluxvla_core.training import memory
 
 RATE_GOAL, MFU_GOAL = 25.0, 0.35
 LONGEST_S = 3600.0
+_WHAT = {BENCH: "a model of pi0.5's size", "pi05": "PI05FlowMatching", "gr00t": "GR00T N1.5"}
 Found = Mapping[str, Any]
 
 
@@ -72,7 +77,7 @@ def summarise(runs: Mapping[str, Sequence[Found]], setup: Setup) -> dict[str, An
         "rate_of_runner_to_by_hand": statistics.median(ratios),
     }
     mfu = sides[OURS]["mfu"]
-    if setup.size == "pi05" and "H200" in ours["device"]:
+    if setup.size == "pi05" and setup.family != "gr00t" and "H200" in ours["device"]:
         summary["goals"] = {"samples_per_s_of_a_gpu": RATE_GOAL, "mfu": MFU_GOAL}
         summary["goals_met"] = {
             "samples_per_s_of_a_gpu": setup.batch / sides[OURS]["step_s"] >= RATE_GOAL,
@@ -103,7 +108,7 @@ def options() -> argparse.ArgumentParser:
     parser = _results.options(__file__)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--profile", action="store_true", help="where a step's time goes, as text")
-    choices = {"size": SIZES, "device": ("cuda", "cpu"), "attention": ATTENTION}
+    choices = {"family": FAMILIES, "size": SIZES, "device": ("cuda", "cpu"), "attention": ATTENTION}
     for name, value in asdict(Setup()).items():
         word = f"--{name.replace('_', '-')}"
         if isinstance(value, bool):
@@ -152,19 +157,22 @@ def main(words: Sequence[str] | None = None) -> int:
         return 2 if words else 0
     begun = _results.head("fluxvla-fsdp", "torch", "numpy")
     runs, table = alternate(setup, args.rounds, args.profile)
-    model = BenchPi05(setup.size, device="meta")
+    model = setup.built("meta")
     summary = {
         **begun,
-        "what": "a training step of a model of pi0.5's size, bf16 over fp32 weights",
+        "what": f"a training step of {_WHAT[setup.family]}, bf16 over fp32 weights",
         "cuda": torch.version.cuda,
         "parameters": sum(p.numel() for p in model.parameters()),
         **asdict(setup),
         "rounds": args.rounds,
         **rounded(summarise(runs, setup)),
     }
-    if not full and args.out == parser.get_default("out"):  # a tiny model's figures are not results
+    default = args.out == parser.get_default("out")
+    if not full and default:  # a tiny model's figures are not results
         print(json.dumps(summary, indent=1), table, sep="\n")
         return 0
+    if default and setup.family != BENCH:
+        args.out = args.out.with_stem(f"{args.out.stem}_{setup.family}")
     _results.keep(args.out, summary)
     if table:
         args.out.with_suffix(".profile.txt").write_text(table + "\n", encoding="utf-8")

@@ -38,6 +38,20 @@ def test_both_sides_train_the_same_way_on_the_cpu(tmp_path: Path) -> None:
     assert "aten::mm" in table
 
 
+@pytest.mark.parametrize("family", ["pi05", "gr00t"])
+def test_models_of_plugins_train_the_same_way(family: str, tmp_path: Path) -> None:
+    pytest.importorskip({"pi05": "fluxvla_pi", "gr00t": "fluxvla_gr00t"}[family])
+    out = tmp_path / "found.json"
+    words = [*TINY, *SHORT, "--rounds", "1", "--family", family, "--peak-tflops", "0.01"]
+    assert gpu_step.main([*words, "--out", str(out)]) == 0
+    found = json.loads(out.read_text(encoding="utf-8"))
+    ours, hand = found["sides"][OURS], found["sides"][HAND]
+    assert found["family"] == family
+    # GR00T looks for the places of images in each prompt: nothing can be counted beforehand.
+    assert (found["tflop_per_sample"] is None) == (family == "gr00t")
+    assert ours["last_loss"] == pytest.approx(hand["last_loss"], rel=0.02)
+
+
 @pytest.fixture
 def no_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)

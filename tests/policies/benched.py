@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from fluxvla_core.cli.main import main
@@ -14,7 +15,12 @@ WHOLE = DIVIDED - {"prefix", "denoise"} | {"forward"}
 
 def stages_of(checkpoint: Path, out: Path) -> set[str]:
     """The stages that were measured, of an answer whose operations were counted."""
-    words = ["bench-policy", "--checkpoint", str(checkpoint), "--out", str(out)]
+    return stages_measured(["--checkpoint", str(checkpoint)], out)
+
+
+def stages_measured(words: Sequence[str], out: Path) -> set[str]:
+    """As :func:`stages_of`, of what ``words`` name."""
+    words = ["bench-policy", *words, "--out", str(out)]
     assert main([*words, "--calls", "1", "--warmup", "0", "--modes", "eager"]) == 0
     figures = json.loads((out / "figures.json").read_text())
     assert figures["gflops"] > 0

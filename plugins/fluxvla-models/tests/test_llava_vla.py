@@ -16,9 +16,14 @@ from fluxvla_models.pretrained_backbones import (
     Qwen3Backbone,
     SigLIPBackbone,
 )
+from tokenizers import Tokenizer
+from tokenizers.models import WordLevel
+from tokenizers.pre_tokenizers import Whitespace
 
 from fluxvla_core.errors import CheckpointError, ConfigError
+from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.training.weights import put_parts
+from tests.policies.benched import WHOLE, stages_measured
 
 TEXT = {
     "hidden_size": 16,
@@ -367,3 +372,44 @@ def test_names_of_no_place_are_refused(folders: dict[str, str]) -> None:
     ):
         with pytest.raises(ConfigError, match="name_mapping says how weights are called in"):
             new(folders, **more)
+
+
+def test_its_latency_is_measured(folders: dict[str, str], tmp_path: Path) -> None:
+    """``bench-policy`` on a robot with two cameras, from images and joints to commands."""
+    words = tmp_path / "words"
+    words.mkdir()
+    known = {"<pad>": 0, "<unk>": 1, **{f"word{i}": i for i in range(2, 50)}}
+    made = Tokenizer(WordLevel(known, unk_token="<unk>"))
+    made.pre_tokenizer = Whitespace()
+    made.save(str(words / "tokenizer.json"))
+    (words / "tokenizer_config.json").write_text(json.dumps({"pad_token": "<pad>"}))
+    vision = {"type": "SigLIPBackbone", "model_folder": folders["siglip"], "num_cameras": 2}
+    model = {
+        "type": "LlavaVLA",
+        "vision_backbone": vision,
+        "projector": {"type": "FusedMLPProjector"},
+        "llm_backbone": {"type": "Qwen3Backbone", "model_folder": folders["qwen3"]},
+        "vla_head": {**HEAD, "state_dim": 3},
+    }
+    tokenizer = {"type": "PretrainedTokenizer", "model_path": str(words)}
+    dataset = {
+        "type": "ParquetDataset",
+        "img_keys": ["observation.images.front", "observation.images.wrist"],
+        "transforms": [
+            {"type": "ResizeImages", "height": 32, "width": 32},
+            {"type": "SimpleNormalizeImages"},
+            {"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},
+            {"type": "ProcessPrompts", "tokenizer": tokenizer, "max_len": 96},
+        ],
+    }
+    robot = EmbodimentSpec(
+        "arm",
+        tuple(Joint(name, "rad", -1.0, 1.0, 1.0, 1.0) for name in "abc"),
+        (Camera("front", 40, 48), Camera("wrist", 24, 32)),
+        50.0,
+    )
+    (tmp_path / "embodiment.json").write_text(json.dumps(robot.to_dict()))
+    config = tmp_path / "llava.py"
+    config.write_text(f"model = {model!r}\ntrain_dataloader = dict(dataset={dataset!r})\n")
+    told = ["--config", str(config), "--embodiment", str(tmp_path)]
+    assert stages_measured(told, tmp_path / "measured") == WHOLE

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fluxvla_models.lerobot_files import whole
 from fluxvla_pi import lerobot_fast_write
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.lerobot_fast_format import LeRobotPi0FastFormat
@@ -128,6 +129,22 @@ def test_a_tied_head_is_written_under_both_names(tmp_path, source, words):
     found = load_file(tmp_path / "out" / "model.safetensors")
     embedding = LEROBOT.theirs("llm_backbone.embed_tokens.weight")
     assert torch.equal(found[LEROBOT.head], found[embedding])
+
+
+@pytest.mark.parametrize("narrow", [True, False])
+def test_weights_keep_their_dtype_and_the_config_says_it(tmp_path, source, words, narrow):
+    """As LeRobot in bf16, where normalisations stay in float32."""
+    read_ = LeRobotPi0FastFormat().read(source, str(words))
+    tensors = {
+        name: whole(t).bfloat16() if narrow and "norm" not in name else whole(t)
+        for name, t in read_.tensors.items()
+    }
+    (tmp_path / "out").mkdir()
+    LeRobotPi0FastFormat().write(replace(read_, tensors=tensors), tmp_path / "out")
+    dtype = "bfloat16" if narrow else "float32"
+    assert read(tmp_path / "out" / "config.json")["dtype"] == dtype
+    found = load_file(tmp_path / "out" / "model.safetensors")
+    assert {str(t.dtype) for t in found.values()} == {"torch.float32", f"torch.{dtype}"}
 
 
 def test_the_published_tokenizer_keeps_its_name(tmp_path, source, words):

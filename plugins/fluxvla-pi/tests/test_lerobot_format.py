@@ -20,6 +20,7 @@ from fluxvla_core.models import load_policy
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner
 from fluxvla_core.training.formats import read_foreign
+from tests.policies.benched import DIVIDED, stages_of
 
 from .oracles import pi_inputs
 from .published_folders import (
@@ -53,12 +54,14 @@ def bring(tmp_path):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_it_acts_as_there_from_pictures_and_joints_to_commands(tmp_path, bring, family):
     golden = load_file(GOLDEN / f"lerobot061_{family}_policy.safetensors")
-    policy = load_policy(bring(lerobot_folder(tmp_path / "theirs", family)))
+    out = bring(lerobot_folder(tmp_path / "theirs", family))
+    policy = load_policy(out)
     policy.reset(pi_inputs.SEED)
     found = policy.predict_action(observation(family))
     expected = golden["commands"][0].double().numpy()
     assert found.shape == expected.shape == (pi_inputs.HORIZON, pi_inputs.ROBOT_ACTIONS)
     assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+    assert stages_of(out, tmp_path / "measured") == DIVIDED
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -119,7 +119,7 @@ class InferenceRunnerConformance(Conformance):
 
     def test_the_policy_is_asked_with_what_the_robot_sees(self, tmp_path: Path) -> None:
         robot, policy = self.robot(), self.policy()
-        images = {camera.name: robot.picture(camera) for camera in self.spec.cameras}
+        images = {camera.name: robot.image(camera) for camera in self.spec.cameras}
         state = robot.state.copy()
         self.drive(tmp_path, robot, policy)
         assert policy.asked, "run() ended and the policy was never asked, expected a first question"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -86,11 +87,17 @@ class StandInRobot(Operator):
     def clock(self) -> SimulatedClock:
         return self._clock
 
-    def picture(self, camera: Camera) -> npt.NDArray[np.uint8]:
+    def image(self, camera: Camera) -> npt.NDArray[np.uint8]:
         """``(height, width, 3)`` uint8: another shade for each camera, and after each command."""
         number = self._spec.camera_names.index(camera.name)
         shade = (40 + 90 * number + len(self.sent)) % 256
         return np.full((camera.height, camera.width, 3), shade, np.uint8)
+
+    def picture(self, camera: Camera) -> npt.NDArray[np.uint8]:
+        """Deprecated name of :meth:`image`."""
+        message = "StandInRobot.picture is deprecated, use image"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return self.image(camera)
 
     def receive(self, action: Array) -> None:
         """Take a ``(dim,)`` command, whatever it is: the kit says what is wrong with it."""
@@ -109,7 +116,7 @@ class StandInRobot(Operator):
         if not self._open:
             raise NotReady("the stand-in is not connected")
         self.on_frame()
-        images = {camera.name: self.picture(camera) for camera in self._spec.cameras}
+        images = {camera.name: self.image(camera) for camera in self._spec.cameras}
         return Frame(self.state.copy(), images, dict.fromkeys((STATE, *images), self._clock.now()))
 
     def send_action(self, action: Array) -> None:

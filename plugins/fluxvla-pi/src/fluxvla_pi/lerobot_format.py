@@ -270,7 +270,9 @@ def write_policy(
     """
     preparation = _preparation(checkpoint)
     tensors = weights_to_write(checkpoint, LEROBOT)
-    narrow = tensors[LEROBOT.theirs("llm_backbone.norm.weight")].dtype == torch.bfloat16
+    # A matrix tells: LeRobot keeps the weights of normalisations in float32 beside bf16.
+    matrix = LEROBOT.theirs("llm_backbone.layers.0.self_attn.q_proj.weight")
+    narrow = tensors[matrix].dtype == torch.bfloat16
     config = {
         **_config(checkpoint, family, preparation),
         **more,

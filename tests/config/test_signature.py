@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from fluxvla_core.config.docstrings import argument_texts
 from fluxvla_core.config.signature import Signature, read_signature
+from fluxvla_core.config.source import argument_texts
 from fluxvla_core.plugins._metadata import Plugin
 from tests.conftest import Install
 

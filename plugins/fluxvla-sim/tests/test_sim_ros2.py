@@ -2,121 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import signal
-import subprocess
-import sys
 import time
-from collections import deque
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.ros2 import operators
-from fluxvla_sim.ros2.operators import AlohaSimROSOperator, URSimROSOperator
 from fluxvla_sim.ur.scene import HOME as UR_HOME
 from fluxvla_ur.operator import UROperator
 
 from fluxvla_core import BaseInferenceRunner, RunContext
-from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
-from fluxvla_core.ros2 import Connection, Stale, message_class
+from fluxvla_core.errors import Faulted
+from fluxvla_core.ros2 import Stale
 from fluxvla_core.testing.ros2 import ros_domain
 
-__all__ = ["ros_domain"]
+from .simulated import ALOHA, PATIENT, SILENT_S, UR, connect, drive, simulate, topics, wait_for
 
-SMALL = ["--height", "48", "--width", "64", "--camera-hz", "20"]
-# Machines that run tests stall for seconds; where silence is not what is tested, it is forgiven.
-PATIENT = {"height": 48, "width": 64, "connect_timeout_s": 30.0, "max_age_s": 20.0}
-ALOHA = {"arms": "viperx300", "camera_names": ("top",), **PATIENT}
-UR = {"camera_names": ("front",), **PATIENT}
-SILENT_S = 2.0
-
-
-def wait_for(condition, seconds=20.0):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "did not happen in time"
-        time.sleep(0.02)
-
-
-@pytest.fixture
-def simulate(ros_domain):
-    started = []
-
-    def start(*arguments):
-        run = "import sys; from fluxvla_core.cli.main import main; sys.exit(main())"
-        process = subprocess.Popen(
-            [sys.executable, "-c", run, "sim", *arguments, *SMALL, "--log-format", "json"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        started.append(process)
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate(timeout=30.0)
-
-
-@pytest.fixture
-def connect(ros_domain):
-    opened = []
-
-    def make(cls, **arguments):
-        operator = cls(rate_window_s=0.0, **arguments)
-        opened.append(operator)
-        operator.connect()
-        return operator
-
-    yield make
-    for operator in opened:
-        operator.close()
-
-
-@pytest.fixture
-def topics(ros_domain):
-    """The simulation's own topics: ``facts()``, ``tell(topic, value)``; ``listen`` to any."""
-    connection = Connection("test")
-    text = message_class("std_msgs.msg:String")
-    kinds = {"/sim/reset": message_class("std_msgs.msg:Int64"), "/sim/fault": text}
-    kinds["/sim/speed_scaling"] = message_class("std_msgs.msg:Float64")
-    stream = connection.subscribe("facts", "/sim/facts", text, 1)
-    publishers = {topic: connection.publisher(topic, cls) for topic, cls in kinds.items()}
-
-    def tell(topic, value):
-        wait_for(lambda: publishers[topic].get_subscription_count())
-        publishers[topic].publish(kinds[topic](data=value))
-
-    def facts():
-        wait_for(stream.newest)
-        return json.loads(stream.newest().message.data)
-
-    def listen(topic, kind, kept=400):
-        # Not a stream of ours: that leaves out what comes twice or late.
-        heard = deque(maxlen=kept)
-
-        def keep(message):
-            heard.append(message)
-
-        connection.node.create_subscription(message_class(kind), topic, keep, kept)
-        return heard
-
-    yield SimpleNamespace(tell=tell, facts=facts, listen=listen)
-    connection.close()
-
-
-def drive(operator, target, arrived, steps=100, hz=50.0):
-    """Go there in a straight line, as a control loop does, and wait until the arm is there."""
-    start = operator.get_state()
-    for share in np.linspace(0.0, 1.0, steps):
-        operator.send_action(start + share * (target - start))
-        time.sleep(1.0 / hz)
-    wait_for(lambda: arrived(operator.get_state()))
+__all__ = ["connect", "ros_domain", "simulate", "topics"]
 
 
 def stamps(messages):
@@ -369,86 +273,6 @@ class TestUR5e:
         topics.tell("/sim/speed_scaling", 100.0)
         wait_for(lambda: operator.speed_scaling == 1.0)
         operator.send_action(UR_HOME)
-
-
-def frames_of(operator):
-    """Frames; a moment in which there is none is forgiven."""
-    until = time.monotonic() + 20.0
-    while time.monotonic() < until:
-        try:
-            yield operator.get_frame()
-        except Stale:
-            time.sleep(0.02)
-
-
-@pytest.mark.realtime
-class TestInSimulation:
-    """The operators that know that their robot is simulated."""
-
-    def test_episodes_begin_from_seeds(self, simulate, connect, topics):
-        simulate("aloha", "--ros2", "--cameras", "top", "--real-time-factor", "0.5")
-        operator = connect(AlohaSimROSOperator, seed=20, real_time_factor=0.5, **ALOHA)
-        stale = operator.get_frame()
-        operator.begin_episode("pick up the cube with the right arm and hold it", 1)
-        frame = operator.get_frame()
-        assert operator.facts()["seed"] == 21
-        assert (frame.images["top"] != stale.images["top"]).any(), "the cube is elsewhere"
-        # Receipt stamps are on the operator's own, slower clock.
-        assert 0.0 <= operator.clock.now() - frame.stamps["top"] < 5.0
-
-        operator.send_action(HOME)
-        wait_for(lambda: operator.facts()["steps"] > 3)
-        assert (operator.task_success(), operator.task_done()) == (False, False)
-        found = operator.episode_facts()
-        assert found["real_time_factor"] == 0.5
-        assert 0.0 < found["real_time_kept"] < 1.5
-
-        aside = HOME.copy()
-        aside[0] = 0.5
-        drive(operator, aside, lambda state: np.allclose(state, aside, atol=0.06))
-        operator.begin_episode("hand the cube over to the left arm", 0)
-        np.testing.assert_allclose(operator.get_frame().state, HOME, atol=0.02)
-        assert (operator.facts()["seed"], operator.facts()["steps"]) == (20, 0)
-        assert operator.last_action is None, "or a stop would send the arm back there"
-
-    def test_a_new_episode_is_seen_by_the_part_that_does_not_begin_it(self, simulate, connect):
-        simulate("aloha", "--ros2", "--cameras", "top")
-        divided = {
-            divide: connect(lambda d=divide, **a: getattr(AlohaSimROSOperator(**a), d)(), **ALOHA)
-            for divide in ("without_commands", "without_cameras")
-        }
-        cameras, control = divided.values()
-        aside = HOME.copy()
-        aside[0] = 0.5
-        drive(control, aside, lambda state: np.allclose(state, aside, atol=0.06))
-        stale = cameras.get_frame()
-        control.begin_episode("pick up the cube with the right arm and hold it", 1)
-
-        # In between, it must not say what it still has of the episode before.
-        frame = next(frames_of(cameras))
-        np.testing.assert_allclose(frame.state, HOME, atol=0.02)
-        assert (frame.images["top"] != stale.images["top"]).any(), "the cube is elsewhere"
-        assert (control.facts()["seed"], control.task_success()) == (1, False)
-        with pytest.raises(Rejected, match="sends no commands"):
-            cameras.begin_episode("pick up the cube with the right arm and hold it", 2)
-
-    def test_two_clocks_that_differ_are_refused(self, simulate, connect):
-        simulate("aloha", "--ros2", "--cameras", "top")
-        with pytest.raises(ConfigError, match=r"runs at 1 of real time, this operator is set to 0"):
-            connect(AlohaSimROSOperator, real_time_factor=0.5, **ALOHA)
-
-    def test_a_new_episode_that_nobody_sees_is_not_begun(
-        self, simulate, connect, topics, monkeypatch
-    ):
-        simulate("ur5e", "--ros2", "--cameras", "front")
-        operator = connect(URSimROSOperator, **UR)
-        operator.begin_episode("pick up the red cube", 4)
-        assert operator.task_success() is False
-        topics.tell("/sim/fault", "front=freeze")
-        wait_for(lambda: len({operator._stamp("front") for _ in [time.sleep(0.3)] * 2}) == 1)
-        monkeypatch.setattr(operators, "RESET_S", 3.0)
-        with pytest.raises(NotReady, match="the simulator shows nothing of the new episode"):
-            operator.begin_episode("pick up the red cube", 5)
 
 
 @pytest.mark.realtime

@@ -27,7 +27,7 @@ from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.evaluation.rollout import check_step
+from fluxvla_core.evaluation.stepping import check_step
 from fluxvla_core.robot.control.clock import MonotonicClock
 from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
@@ -205,6 +205,7 @@ class _TimedPolicy(Policy):
     action_rate_hz: float
     horizon: int
     continues: bool
+    n_obs_steps: int
 
     def __init__(self, actor: Actor, environment: Environment, cameras: tuple[Camera, ...]) -> None:
         spec, actor = environment.spec.embodiment, Actor.adapt(actor)
@@ -216,6 +217,7 @@ class _TimedPolicy(Policy):
         )
         self.horizon = int(1 if actor.horizon is None else actor.horizon)
         self.continues = self._actor.continues
+        self.n_obs_steps = actor.n_obs_steps
         self.seconds = 0.0
 
     def reset(self, seed: int) -> None:

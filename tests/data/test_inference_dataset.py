@@ -119,6 +119,10 @@ def test_statistics_may_be_a_checkpoints_file(stats, tmp_path):
             {"images": {"top": np.zeros((32, 48, 3))}},
             r"camera 'top' gives float64 of shape \(32, 48, 3\); uint8 of shape",
         ),
+        (
+            {"images": {"top": np.zeros((0, 48, 3), np.uint8)}},
+            r"camera 'top' gives uint8 of shape \(0, 48, 3\); uint8 of shape",
+        ),
         ({"qpos": None}, "the observation has no 'qpos'; it has images, qpos, task_description"),
         ({"qpos": [0.1, float("nan"), 0.3]}, "'qpos' must be one row of finite numbers"),
         ({"qpos": [[0.1, 0.2, 0.3]]}, "'qpos' must be one row of finite numbers"),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
+from fluxvla_core.errors import CheckpointError, ConfigError, DataError, SpecMismatch
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
@@ -235,6 +235,10 @@ def test_pictures_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tm
     # The upper half of the view, whatever its pixels.
     assert policy.model.batch["images"].shape == (1, 3, 12, 32)
     assert float(policy.model.batch["images"].min()) == pytest.approx(200, rel=1e-6)
+
+    large["images"]["front"] = np.zeros((0, 128, 3), np.uint8)
+    with pytest.raises(DataError, match=r"gives uint8 of shape \(0, 128, 3\)"):
+        policy.predict_action(large)
 
 
 def test_bf16_computes_and_still_gives_float64(tmp_path):

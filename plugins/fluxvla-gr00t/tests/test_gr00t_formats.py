@@ -249,6 +249,10 @@ def test_what_lerobot_knows_of_groups_of_joints_is_read(tmp_path, monkeypatch):
     source = published.lerobot_folder("n1.7", tmp_path / "theirs", monkeypatch, **pack)
     decode = {"registry_name": "groot_n1_7_action_decode_v1", "config": {}}
     published.write(source / "policy_postprocessor.json", {"steps": [decode]})
+    with pytest.raises(CheckpointError, match="is True, of the postprocessor False"):
+        LeRobotGR00TFormat().read(source)
+    decode["config"] = {"use_percentiles": True}
+    published.write(source / "policy_postprocessor.json", {"steps": [decode]})
     found = LeRobotGR00TFormat().read(source)
     assert found.img_keys == ("wrist", "front")
     assert found.model["embodiment_id"] == 2
@@ -307,6 +311,8 @@ def test_a_step_that_is_not_done_here_is_refused(version, stem, tmp_path, monkey
     ("version", "pack", "words"),
     [
         ("n1.7", {"normalize_min_max": False}, "normalize_min_max is False"),
+        ("n1.7", {"state_horizon": 2}, "state_horizon is 2, 1 is known here"),
+        ("n1.7", {"video_horizon": 3}, "video_horizon is 3, 1 is known here"),
         ("n1.5", {"formalize_language": True}, "formalize_language is True; False is known"),
     ],
 )
@@ -314,6 +320,47 @@ def test_settings_of_a_step_that_are_not_done_here(version, pack, words, tmp_pat
     source = published.lerobot_folder(version, tmp_path / "theirs", monkeypatch, **pack)
     with pytest.raises(CheckpointError, match=words):
         LeRobotGR00TFormat().read(source)
+
+
+@pytest.mark.parametrize("name", ["image_target_size", "image_crop_size"])
+def test_images_that_are_not_square_are_refused(name, tmp_path, monkeypatch):
+    source = published.lerobot_folder("n1.7", tmp_path / "lerobot's", monkeypatch)
+    file = source / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"][3]["config"][name] = [64, 48]
+    published.write(file, content)
+    with pytest.raises(CheckpointError, match=rf"{name} \[64, 48\] is not square"):
+        LeRobotGR00TFormat().read(source)
+    source = published.folder("n1.7", tmp_path / "nvidia's", monkeypatch)
+    file = source / "processor_config.json"
+    content = json.loads(file.read_text())
+    content["processor_kwargs"][name] = [64, 48]
+    published.write(file, content)
+    with pytest.raises(CheckpointError, match=rf"{name} \[64, 48\] is not square"):
+        FORMATS["n1.7"]().read(source)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "words"),
+    [
+        ("state", {"delta_indices": [-1, 0]}, "several states at once"),
+        ("state", {"sin_cos_embedding_keys": ["arm"]}, "groups arm are normalised in another"),
+        ("state", {"mean_std_embedding_keys": ["grip"]}, "groups grip are normalised in another"),
+        ("action", {"mean_std_embedding_keys": ["grip"]}, "groups grip are normalised in another"),
+    ],
+)
+def test_groups_that_are_normalised_by_themselves(kind, settings, words, tmp_path, monkeypatch):
+    """It can be trained on; acting by the others' formula would be other numbers."""
+    source = published.folder("n1.7", tmp_path / "theirs", monkeypatch)
+    file = source / "processor_config.json"
+    content = json.loads(file.read_text())
+    kwargs = content["processor_kwargs"]
+    kwargs["apply_sincos_state_encoding"] = "sin_cos_embedding_keys" in settings
+    kwargs["modality_configs"]["new_embodiment"][kind].update(settings)
+    published.write(file, content)
+    found = FORMATS["n1.7"]().read(source)
+    assert found.statistics == {"private": {}}
+    assert words in found.notes[0]
 
 
 def test_cameras_that_lerobot_renames_keep_the_robots_name(tmp_path, monkeypatch):

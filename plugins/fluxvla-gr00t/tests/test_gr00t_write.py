@@ -54,7 +54,7 @@ def made(version: str, **more: object) -> ForeignCheckpoint:
         transforms = tables.n15_transforms(model, robot, "words")
     else:
         settings = {"image_target_size": [64, 64], "crop_fraction": 0.95}
-        resize = tables.resize_table(settings)
+        resize = tables.resize_table(settings, "there")
         transforms = tables.n17_transforms(model, robot, "words", resize, True, True)
     middle = {key: {**row, "mean": row["min"], "std": [1.0] * 5} for key, row in ROWS.items()}
     facts: dict[str, object] = {

@@ -111,14 +111,17 @@ def test_statistics_among_the_weights_are_the_same(folder: Path) -> None:
     assert set(old.tensors) == set(new.tensors)
 
 
-@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "IDENTITY"])
+@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
 def test_normalising_by_each_mode(folder: Path, mode: str) -> None:
     """The transform gives LeRobot's formula, written out here, and its inverse gives commands."""
     from fluxvla_core.data import Pipeline
 
     stats = load_file(folder / NORMALIZER)
-    stats |= {f"action.{q}": stats[f"action.{m}"] / 2 for q, m in (("q01", "min"), ("q99", "max"))}
-    stats["action.min"][2] = stats["action.max"][2] = stats["action.mean"][2]
+    for low, high in (("q01", "q99"), ("q10", "q90")):
+        stats[f"action.{low}"] = stats["action.min"] / 2
+        stats[f"action.{high}"] = stats["action.max"] / 2
+    for name in ("min", "max", "q01", "q99", "q10", "q90"):  # one that never moves
+        stats[f"action.{name}"][2] = stats["action.mean"][2]
     save_file(stats, folder / NORMALIZER)
     after = folder / "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
     save_file(stats, after)
@@ -142,11 +145,12 @@ def test_normalising_by_each_mode(folder: Path, mode: str) -> None:
     elif mode == "IDENTITY":
         expected = actions
     else:
-        low, high = ("min", "max") if mode == "MIN_MAX" else ("q01", "q99")
+        low, high = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}.get(
+            mode, ("q10", "q90")
+        )
         wide = own[high] - own[low]
         expected = 2 * (actions - own[low]) / np.where(wide == 0, 1e-8, wide) - 1
-        moving = wide != 0
-        expected, sample["actions"] = expected[:, moving], sample["actions"][:, moving]
+        assert (expected[:, 2] == -1).all()
     np.testing.assert_allclose(sample["actions"], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(sample["states"], states, rtol=1e-6)
 
@@ -204,7 +208,12 @@ def test_processors_that_nobody_wrote(folder: Path) -> None:
     content = json.loads(file.read_text())
     for values, told in (
         ({"config": 3}, "config is no table"),
-        ({"config": {"eps": "x"}}, "eps is 'x', no number"),
+        ({"config": {"eps": "x"}}, "eps is 'x'; a normalizer with 1e-08 is read"),
+        ({"config": {"eps": 1e-5}}, "eps is 1e-05; a normalizer with 1e-08 is read"),
+        (
+            {"config": {"normalize_observation_keys": []}},
+            r"normalize_observation_keys is \[\]; a normalizer with None is read",
+        ),
         ({"state_file": "../x.safetensors"}, "not a file next to it"),
         ({"state_file": "x.safetensors"}, r"x\.safetensors"),
     ):
@@ -232,9 +241,11 @@ def test_a_step_that_is_not_done_here_is_refused(folder: Path, stem: str) -> Non
 def test_what_makes_physical_actions_has_the_last_word(folder: Path) -> None:
     (file,) = folder.glob("policy_postprocessor*_processor.safetensors")
     stats = load_file(file)
-    save_file({**stats, "action.mean": stats["action.mean"] + 1.0}, file)
-    read = LeRobotACT().read(folder).statistics["private"]["action"]["mean"]
-    assert read == pytest.approx((stats["action.mean"] + 1.0).tolist())
+    moved = {name: stats[name] + 1.0 for name in ("action.mean", "observation.state.mean")}
+    save_file({**stats, **moved}, file)
+    read = LeRobotACT().read(folder).statistics["private"]
+    assert read["action"]["mean"] == pytest.approx(moved["action.mean"].tolist())
+    assert read["proprio"]["mean"] == pytest.approx(stats["observation.state.mean"].tolist())
 
 
 def test_a_missing_statistic_and_a_missing_file(folder: Path) -> None:

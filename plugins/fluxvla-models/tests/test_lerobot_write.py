@@ -147,6 +147,8 @@ def numbers(**more: object) -> tuple[dict[str, object], ...]:
     "table",
     [
         {"norm_type": "min_max"},
+        {"norm_type": "min_max", "epsilon": 1e-8, "epsilon_if_zero": True},
+        {"norm_type": "quantile"},
         {"norm_type": "mean_std", "std_floor": 3.0},
         {"norm_type": "none", "state_norm_type": "mean_std"},
         {"norm_type": "mean_std", "action_norm_mask": [True] * 5 + [False], "epsilon": 1e-3},
@@ -156,11 +158,18 @@ def test_every_normalisation_becomes_lerobots(tmp_path: Path, table: dict) -> No
     """What was trained here acts by the same numbers there."""
     from fluxvla_core.data import Pipeline
 
-    checkpoint = act(transforms=numbers(**table))
+    row = {**act().statistics["private"]["action"], "q01": [-2.0] * 6, "q99": [3.0] * 6}
+    still = float(np.float32(1.7))
+    for name in ("mean", "min", "max", "q01", "q99"):  # one that never moves
+        row[name] = [still, *row[name][1:]]
+    checkpoint = act(
+        transforms=numbers(**table), statistics={"private": {"proprio": row, "action": row}}
+    )
     LeRobotACT().write(checkpoint, tmp_path)
     found = LeRobotACT().read(tmp_path)
-    values = np.linspace(-4.0, 6.0, 12, dtype=np.float32)
-    sample = {"states": values[:6], "actions": values.reshape(2, 6)}
+    values = np.linspace(-4.0, 6.0, 12).reshape(2, 6)
+    values[:, 0] = still
+    sample = {"states": values[0], "actions": values}
     ours, theirs = (
         Pipeline([read.transforms[-1]])({**sample, "stats": read.statistics["private"]})
         for read in (checkpoint, found)

@@ -178,11 +178,8 @@ def test_a_camera_that_the_robot_lacks(tmp_path, bring, capsys):
 
 def test_a_base_model_without_statistics(tmp_path):
     source = lerobot_folder(tmp_path / "theirs", "pi05")
-    file = source / "policy_preprocessor.json"
-    content = json.loads(file.read_text())
-    for step in content["steps"]:
-        step.pop("state_file", None)
-    file.write_text(json.dumps(content))
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        changed(source / name, lambda c: [step.pop("state_file", None) for step in c["steps"]])
     read = LeRobotPiFormat().read(source)
     assert "it is a base model, to be fine-tuned" in read.notes[0]
     assert read.transforms[2]["norm_type"] == read.transforms[2]["state_norm_type"] == "none"
@@ -199,9 +196,36 @@ def step(content, name):
     return next(s for s in content["steps"] if s["registry_name"] == name)
 
 
+def test_cameras_that_lerobot_renames_have_the_robots_names(tmp_path):
+    """Here each of the two is called as the policy calls the other one."""
+    source = lerobot_folder(tmp_path / "theirs", "pi05")
+    images = [f"observation.images.{name}" for name in ("front", "wrist")]
+    swapped = dict(zip(images, reversed(images), strict=True))
+    changed(
+        source / "policy_preprocessor.json",
+        lambda c: step(c, "rename_observations_processor")["config"].update(rename_map=swapped),
+    )
+    assert LeRobotPiFormat().read(source).img_keys == tuple(reversed(images))
+
+
+def test_what_makes_physical_actions_has_the_last_word(tmp_path):
+    source = lerobot_folder(tmp_path / "theirs", "pi05")
+    (file,) = source.glob("policy_postprocessor*.safetensors")
+    stats = load_file(file)
+    save_file({name: row + 1 for name, row in stats.items()}, file)
+    read = LeRobotPiFormat().read(source).statistics["private"]
+    assert read["action"]["q01"] == pytest.approx((stats["action.q01"] + 1).tolist())
+    assert read["proprio"]["q01"] == pytest.approx(stats["observation.state.q01"].tolist())
+
+
 @pytest.mark.parametrize(
     ("file", "change", "words"),
     [
+        (
+            "policy_postprocessor.json",
+            lambda c: step(c, "absolute_actions_processor")["config"].update(enabled=True),
+            "enabled of absolute_actions_processor is True, of relative_actions_processor False",
+        ),
         ("config.json", lambda c: c.update(use_peft=True), "use_peft is True; False is read"),
         ("config.json", lambda c: c.update(max_period=2.0), "max_period is 2.0; 4.0 is read"),
         ("config.json", lambda c: c.update(chunk_size="x"), "chunk_size is 'x', not a number"),

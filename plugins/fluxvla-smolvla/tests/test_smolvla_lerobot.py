@@ -256,7 +256,10 @@ def processors(source, change):
     ("change", "words"),
     [
         (lambda steps: steps.append({"registry_name": "relative"}), "the step 'relative' of"),
-        (lambda steps: steps[5]["config"].update(eps=1e-5), "1e-05; 1e-08 is known"),
+        (
+            lambda steps: steps[5]["config"].update(eps=1e-5),
+            "eps is 1e-05; .* with 1e-08",
+        ),
         (lambda steps: steps[5].update(state_file="../x"), r"'../x' is not a file next to it"),
         (
             lambda steps: steps[5]["config"]["norm_map"].update(VISUAL="MEAN_STD"),
@@ -309,6 +312,25 @@ def test_a_base_model_without_statistics_can_be_trained_on_and_drives_nothing(so
     prepare = PrivateInferenceDataset(tuple(CAMERAS), found.transforms, found.statistics)
     with pytest.raises(ConfigError, match="the statistics have no entry 'proprio'"):
         prepare(raw_observation(0))
+
+
+def test_where_nothing_is_normalised_no_statistics_are_needed(source, tmp_path, tokenizer):
+    nothing = {"VISUAL": "IDENTITY", "STATE": "IDENTITY", "ACTION": "IDENTITY"}
+    for name in (BEFORE, "policy_postprocessor"):
+        file = source / f"{name}.json"
+        content = json.loads(file.read_text())
+        for step in content["steps"]:
+            if step.pop("state_file", None):
+                step["config"]["norm_map"] = nothing
+        file.write_text(json.dumps(content))
+    found = LeRobotSmolVLA().read(source, str(tokenizer))
+    assert found.notes == ()
+    prepare = PrivateInferenceDataset(tuple(CAMERAS), found.transforms, found.statistics)
+    observation = raw_observation(0)
+    states = prepare(observation)["states"][0, :STATE]
+    assert np.array_equal(states.numpy(), observation["qpos"])
+    policy = load_policy(imported(source, tmp_path / "ours", tokenizer))
+    assert policy.predict_action(raw_observation(0)).shape == (HORIZON, ACTION)
 
 
 def leaves(tree, path=()):

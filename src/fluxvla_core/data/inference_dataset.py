@@ -106,7 +106,7 @@ class PrivateInferenceDataset(InferenceDataset):
 
 def _chw(name: str, image: Any) -> npt.NDArray[np.uint8]:
     array = np.asarray(image)
-    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or not array.size:
         raise DataError(
             f"camera {name!r} gives {array.dtype} of shape {array.shape}; "
             "uint8 of shape (height, width, 3) is expected"

@@ -312,7 +312,9 @@ class LocalPolicy(Policy):
         images = dict(observation["images"])
         for camera in self.embodiment.cameras:
             image = images.get(camera.name)
-            if image is not None and image.shape[:2] != (camera.height, camera.width):
+            if image is None or not image.size:  # refused where images are read
+                continue
+            if image.shape[:2] != (camera.height, camera.width):
                 import cv2
 
                 size = (camera.width, camera.height)

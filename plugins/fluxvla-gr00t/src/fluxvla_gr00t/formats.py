@@ -132,12 +132,11 @@ class GR00TN17Format(CheckpointFormat):
         }
         model = model_table("n1.7", head, chosen, settings.count("select_layer"))
         both = {**settings.values, **kwargs}
-        _Settings(both, str(processing)).square("image_target_size")
         transforms = n17_transforms(
             model,
             chosen,
             tokenizer,
-            resize_table(both),
+            resize_table(both, str(processing)),
             bool(kwargs.get("formalize_language", True)),
             bool(kwargs.get("clip_outliers", True)),
         )
@@ -166,11 +165,6 @@ class _Settings:
 
     def table(self, name: str) -> _Settings:
         return _Settings(self.values.get(name), self.where)
-
-    def square(self, name: str) -> None:
-        value = self.values.get(name)
-        if value is not None and (len(value) != 2 or value[0] != value[1]):
-            raise CheckpointError(f"{name} {value} is not square", where=self.where)
 
     def require(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():

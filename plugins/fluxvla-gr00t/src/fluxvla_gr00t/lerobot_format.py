@@ -118,7 +118,7 @@ class LeRobotGR00TFormat(CheckpointFormat):
                 model,
                 chosen,
                 tokenizer,
-                resize_table(encode),
+                resize_table(encode, str(folder / _PRE)),
                 bool(pack.get("formalize_language", True)),
                 bool(pack.get("clip_outliers", True)),
             )
@@ -166,9 +166,18 @@ def _robot(
             "here",
             where=where,
         )
+    for name in ("state_horizon", "video_horizon"):
+        if pack.get(name) not in (None, 1):
+            raise CheckpointError(f"{name} is {pack[name]!r}, 1 is known here", where=where)
     post = {step.name: step.config for step in read_steps(folder, POSTPROCESSOR, _AFTER)}
     grouped = "groot_n1_7_action_decode_v1"
     if grouped in post and pack.get("raw_stats") and pack.get("modality_config"):
+        before, after = (bool(c.get("use_percentiles")) for c in (pack, post[grouped]))
+        if before != after:
+            raise CheckpointError(
+                f"use_percentiles of the preprocessor is {before}, of the postprocessor {after}",
+                where=where,
+            )
         settings = {
             "use_percentiles": pack.get("use_percentiles"),
             "use_relative_action": post[grouped].get("use_relative_action"),

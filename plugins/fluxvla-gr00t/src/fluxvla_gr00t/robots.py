@@ -159,10 +159,11 @@ def grouped_robot(
         else ("quantile" if settings.get("use_percentiles") else "min_max"),
         horizon=len(action.get("delta_indices") or []) or None,
     )
-    refusal = _refusal(tag, video, action, settings)
+    state = _table(config, "state", where)
+    refusal = _refusal(tag, video, state, action, settings)
     if refusal:
         return replace(robot, notes=(refusal,))
-    states = _names(_table(config, "state", where), where)
+    states = _names(state, where)
     relative = _relative(action, settings)
     entries = {
         "proprio": _joined(
@@ -228,6 +229,10 @@ GRIPPER = (
 _NO_STATISTICS = "it has no statistics of a robot: it can be trained on, and drives none"
 
 
+_SINES, _MEANS = "apply_sincos_state_encoding", "mean_std_embedding_keys"
+"""Settings by which NVIDIA's processor encodes or normalises some groups by themselves."""
+
+
 def _several(tags: Mapping[str, Any]) -> str:
     return (
         f"it knows several robots ({', '.join(sorted(tags))}): choose one by --robot NAME; as it "
@@ -242,13 +247,26 @@ def _chosen(tags: Mapping[str, Any], wanted: str | None, where: str) -> str | No
 
 
 def _refusal(
-    tag: str, video: Mapping[str, Any], action: Mapping[str, Any], settings: Mapping[str, Any]
+    tag: str,
+    video: Mapping[str, Any],
+    state: Mapping[str, Any],
+    action: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> str | None:
     """Why the robot cannot be driven, if so."""
     if tag == "libero_sim":
         return GRIPPER
     if len(video.get("delta_indices") or [0]) != 1:
         return "it looks at several frames at once: it can be trained on, and drives no robot"
+    if len(state.get("delta_indices") or [0]) != 1:
+        return "it is given several states at once: it can be trained on, and drives no robot"
+    encoded = state.get("sin_cos_embedding_keys") if settings.get(_SINES) else None
+    apart = [*(encoded or ()), *(k for t in (state, action) for k in t.get(_MEANS) or ())]
+    if apart and not settings.get("use_mean_std"):
+        return (
+            f"its groups {', '.join(map(str, apart))} are normalised in another way than the "
+            "others, which is not done here: it can be trained on, and drives no robot"
+        )
     poses = [
         name
         for name, config in _relative(action, settings).items()

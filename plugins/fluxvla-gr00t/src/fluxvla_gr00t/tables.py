@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from fluxvla_core import build_vla_from_cfg
+from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint, Stored, renamed
 from fluxvla_gr00t.names import is_unread, published_name
 from fluxvla_gr00t.robots import Robot
@@ -90,9 +91,19 @@ def n17_transforms(
     ]
 
 
-def resize_table(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The transform of images, by N1.7's settings; their sizes are square."""
-    target, crop = settings.get("image_target_size"), settings.get("image_crop_size")
+def resize_table(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The transform of images, by N1.7's settings, which ``where`` has.
+
+    Raises:
+        CheckpointError: images are not square.
+    """
+    sizes = []
+    for name in ("image_target_size", "image_crop_size"):
+        value = settings.get(name)
+        if value is not None and (len(value) != 2 or value[0] != value[1]):
+            raise CheckpointError(f"{name} {value} is not square", where=where)
+        sizes.append(value)
+    target, crop = sizes
     size = 256 if target is None else int(target[0])
     fraction = settings.get("crop_fraction")
     if fraction is None:

@@ -26,6 +26,8 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
 STATE, ACTION = "observation.state", "action"
 BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 """How statistics are called that are among the weights, as before LeRobot 0.4."""
+EPS = 1e-8
+"""What LeRobot adds to a standard deviation, and puts in place of a range of 0."""
 _SUFFIX = ".safetensors"
 
 
@@ -65,7 +67,8 @@ def read_steps(folder: Path, stem: str, known: Collection[str] | None = None) ->
             them changes observations or actions in a way that would be lost. None admits all.
 
     Raises:
-        CheckpointError: the file is missing or damaged, or has a step that is not known.
+        CheckpointError: the file is missing or damaged, or has a step that is not known, or a
+            normalizer with settings that are not.
     """
     file = folder / f"{stem}.json"
     where = str(file)
@@ -83,6 +86,8 @@ def read_steps(folder: Path, stem: str, known: Collection[str] | None = None) ->
             )
         if not isinstance(config, dict):
             raise CheckpointError(f"{name}: config is no table", where=where)
+        if name.endswith("normalizer_processor"):
+            _check_normalizer(config, where)
         steps.append(Step(name, config, _state(folder, step.get("state_file"), where)))
     return steps
 
@@ -109,6 +114,16 @@ def whole(stored: Stored | Tensor) -> Tensor:
     if isinstance(stored, Tensor):
         return stored
     return stored[tuple(slice(0, length) for length in stored.shape)]
+
+
+def _check_normalizer(config: Mapping[str, Any], where: str) -> None:
+    """Refuse what LeRobot's own policies never set, and what would give other numbers."""
+    for name, known in (("eps", EPS), ("normalize_observation_keys", None)):
+        value = config.get(name, known)
+        if value != known:
+            raise CheckpointError(
+                f"{name} is {value!r}; a normalizer with {known!r} is read", where=where
+            )
 
 
 def _state(folder: Path, name: Any, where: str) -> Mapping[str, Stored]:

@@ -21,6 +21,7 @@ from fluxvla_models.lerobot_files import (
     ACTION,
     BUFFERS,
     CONFIG,
+    EPS,
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
@@ -29,8 +30,6 @@ from fluxvla_models.lerobot_files import (
 )
 
 Floats = npt.NDArray[np.float64]
-_ADDED = 1e-6
-"""What ``NormalizeStatesAndActions`` adds to a standard deviation."""
 _KNOWN = {
     "rename_observations_processor",
     "to_batch_processor",
@@ -38,6 +37,8 @@ _KNOWN = {
     "normalizer_processor",
     "unnormalizer_processor",
 }
+_NORM_TYPES = {"MEAN_STD": "mean_std", "MIN_MAX": "min_max", "QUANTILES": "quantile"}
+"""LeRobot's modes -> those of ``NormalizeStatesAndActions``."""
 _RANGES = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 
 
@@ -48,13 +49,11 @@ class Normalization:
     Args:
         modes: ``VISUAL``, ``STATE``, ``ACTION`` -> ``MEAN_STD``, ``MIN_MAX``, ``IDENTITY``, …
         statistics: feature -> statistic -> numbers. A feature that has none stays as it is.
-        eps: what LeRobot adds to a standard deviation.
         renamed: the robot's name of a feature -> the policy's.
     """
 
     modes: Mapping[str, str]
     statistics: Mapping[str, Mapping[str, Floats]]
-    eps: float = 1e-8
     renamed: Mapping[str, str] | None = None
 
     def affine(self, feature: str, kind: str, width: int) -> tuple[Floats, Floats]:
@@ -69,12 +68,39 @@ class Normalization:
             return np.zeros(width), np.ones(width)
         if mode == "MEAN_STD":
             mean, std = self._numbers(feature, mode, ("mean", "std"), width)
-            return mean, std + self.eps
+            return mean, std + EPS
         if mode not in _RANGES:
             raise CheckpointError(f"{feature} is normalised by {mode}, which is not known here")
         low, high = self._numbers(feature, mode, _RANGES[mode], width)
-        wide = np.where(high == low, self.eps, high - low)
+        wide = np.where(high == low, EPS, high - low)
         return low + wide / 2, wide / 2
+
+    def entry(self, feature: str, kind: str, width: int) -> tuple[dict[str, list[float]], str]:
+        """A feature's statistics, and the ``norm_type`` that makes LeRobot's numbers of them.
+
+        Raises:
+            CheckpointError: the mode is unknown, or a statistic of it is missing.
+        """
+        mode = self.modes.get(kind, "IDENTITY")
+        offset, scale = self.affine(feature, kind, width)
+        have = self.statistics.get(feature, {})
+        kept = {name: have[name].reshape(-1).tolist() for name in ("min", "max") if name in have}
+        if feature not in self.statistics:
+            mode = "IDENTITY"
+        if mode == "MEAN_STD":
+            kept |= {name: have[name].reshape(-1).tolist() for name in ("mean", "std")}
+        elif mode in _NORM_TYPES:
+            kept |= {name: have[name].reshape(-1).tolist() for name in _RANGES[mode]}
+            kept |= {"mean": offset.tolist(), "std": scale.tolist()}
+        elif mode in _RANGES:  # by mean and std: no range of that name is known
+            # What never moves becomes -1, as there, although 1e-8 is added to a std of 0.
+            scale = np.maximum(scale, EPS)
+            offset = np.asarray(have[_RANGES[mode][0]], np.float64).reshape(-1) + scale
+            kept |= {"mean": offset.tolist(), "std": (scale - EPS).tolist()}
+        else:
+            kept |= {"mean": offset.tolist(), "std": scale.tolist()}
+            return kept, "none"
+        return kept, _NORM_TYPES.get(mode, "mean_std")
 
     def _numbers(
         self, feature: str, mode: str, names: Sequence[str], width: int
@@ -135,10 +161,8 @@ def tables(
         joints, dim: widths of state and action.
     """
     scales = [normalization.affine(name, "VISUAL", 3) for name in cameras]
-    entries = {
-        "proprio": _entry(normalization, STATE, "STATE", joints),
-        "action": _entry(normalization, ACTION, "ACTION", dim),
-    }
+    proprio, state_norm = normalization.entry(STATE, "STATE", joints)
+    action, action_norm = normalization.entry(ACTION, "ACTION", dim)
     transforms: list[dict[str, Any]] = [
         {"type": "ResizeImages", "height": size[0], "width": size[1]},
         {
@@ -152,27 +176,20 @@ def tables(
             "type": "NormalizeStatesAndActions",
             "state_key": "proprio",
             "action_key": "action",
-            "norm_type": "mean_std",
+            "norm_type": action_norm,
+            "state_norm_type": state_norm,
+            "epsilon": EPS,
+            "epsilon_if_zero": True,
         },
     ]
-    return transforms, {"private": entries}
-
-
-def _entry(
-    normalization: Normalization, feature: str, kind: str, width: int
-) -> dict[str, list[float]]:
-    """An entry of which ``mean_std`` makes exactly LeRobot's numbers, whatever its mode is."""
-    offset, scale = normalization.affine(feature, kind, width)
-    have = normalization.statistics.get(feature, {})
-    kept = {name: have[name].reshape(-1).tolist() for name in ("min", "max") if name in have}
-    std = np.maximum(scale - _ADDED, 0.0)
-    return {**kept, "mean": offset.tolist(), "std": std.tolist()}
+    return transforms, {"private": {"proprio": proprio, "action": action}}
 
 
 def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
     statistics: dict[str, dict[str, Floats]] = {}
-    modes, eps, names = _modes(config), 1e-8, {}
-    # What makes physical actions of the model's comes after it: its statistics go last.
+    modes, names = _modes(config), {}
+    # What makes physical actions of the model's comes after it: it has the last word on actions,
+    # and none on what is observed.
     stems = [stem for stem in (PREPROCESSOR, POSTPROCESSOR) if (folder / f"{stem}.json").is_file()]
     for stem in stems:
         file = folder / f"{stem}.json"
@@ -181,14 +198,13 @@ def _of_processors(folder: Path, config: Mapping[str, Any]) -> Normalization:
                 names = dict(_table(step.config, "rename_map", file))
             if not step.name.endswith("normalizer_processor"):
                 continue
-            modes = {**modes, **_table(step.config, "norm_map", file)}
-            eps = step.config.get("eps", eps)
-            if not isinstance(eps, float):
-                raise CheckpointError(f"eps is {eps!r}, no number", where=str(file))
+            after, norms = stem == POSTPROCESSOR, _table(step.config, "norm_map", file)
+            modes |= {kind: mode for kind, mode in norms.items() if kind == "ACTION" or not after}
             for name, stored in step.tensors.items():
                 feature, _, statistic = name.rpartition(".")
-                statistics.setdefault(feature, {})[statistic] = _array(stored)
-    return Normalization(modes, statistics, eps, names)
+                if feature == ACTION or not after:
+                    statistics.setdefault(feature, {})[statistic] = _array(stored)
+    return Normalization(modes, statistics, names)
 
 
 def _modes(config: Mapping[str, Any]) -> dict[str, str]:

@@ -29,6 +29,7 @@ from fluxvla_models.keypoint_encoder import position_grid
 from fluxvla_models.lerobot_files import (
     ACTION,
     CONFIG,
+    EPS,
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
@@ -39,13 +40,10 @@ from fluxvla_models.lerobot_names import published_act_name, published_diffusion
 from fluxvla_models.transformer import positions_1d
 
 Floats = npt.NDArray[np.float64]
-EPS = 1e-8
-"""What LeRobot adds to a standard deviation."""
 _STRIDE = 32
 """Stride of a ResNet: pixels of the image for one of its last feature map."""
-_MINUTE = 2e-6
-"""A command this far off is the same: what never moved is scaled by one number here, by another in
-LeRobot."""
+_RANGES = {"min_max": ("MIN_MAX", "min", "max"), "quantile": ("QUANTILES", "q01", "q99")}
+"""``norm_type`` of a range -> LeRobot's mode and the names of its ends."""
 _DEVICE = ("device_processor", {"device": "cpu", "float_dtype": None}, {})
 
 
@@ -291,9 +289,10 @@ def _numbers(
     """Statistics that LeRobot normalises a feature by, and its mode."""
     who = "NormalizeStatesAndActions"
     action = feature == ACTION
+    norm = norm_type or table.get("norm_type", "mean_std")
     affine = make_affine(
         entry,
-        norm_type or table.get("norm_type", "mean_std"),
+        norm,
         who,
         table.get("std_floor", 0.0),
         table.get("action_norm_mask") if action else None,
@@ -309,19 +308,16 @@ def _numbers(
             f"the statistics of {feature} have shape {affine.offset.shape}; LeRobot's policy takes "
             f"{width} numbers, the model's"
         )
+    mask = table.get("action_norm_mask") if action else None
+    plain = not table.get("std_floor", 0.0) and (mask is None or all(mask))
+    mode, low, high = _RANGES.get(norm, ("", "", ""))
+    if mode and plain:
+        # What never moves stays at -1, which a mean of 32 bits and a minute std would not give.
+        added = 0.0 if table.get("epsilon_if_zero") else table.get("epsilon", 1e-6)
+        ends = {name: np.asarray(entry[name], np.float64) for name in (low, high)}
+        return {low: ends[low], high: ends[high] + added}, mode
     ranges = {name: np.asarray(entry[name], np.float64) for name in ("min", "max") if name in entry}
-    if len(ranges) == 2 and _is_range(affine.offset, affine.scale, **ranges):
-        return ranges, "MIN_MAX"
     return {"mean": affine.offset, "std": affine.scale - EPS, **ranges}, "MEAN_STD"
-
-
-def _is_range(offset: Floats, scale: Floats, min: Floats, max: Floats) -> bool:
-    """Whether ``min`` becomes -1 and ``max`` 1, as LeRobot's ``MIN_MAX`` has it."""
-    half = (max - min) / 2
-    moves = half > 0
-    close = np.isclose(scale, half, rtol=1e-9, atol=0) & np.isclose(offset, min + half, rtol=1e-9)
-    still = (np.abs(offset - min) < _MINUTE) & (scale < _MINUTE)
-    return bool(moves.any() and np.where(moves, close, still).all())
 
 
 def _crop(resize: Sequence[int] | None, crop: Sequence[int] | None) -> dict[str, Any]:

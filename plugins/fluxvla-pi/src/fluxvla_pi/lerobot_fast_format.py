@@ -82,6 +82,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
         skipped = config.get("fast_skip_tokens", ActionWords.skipped)
         words = _words(weights.model["vocab_size"], skipped, tokenizer, where)
         named = {} if words == ActionWords() else {"words": _table(words)}
+        cameras = cameras_in(inputs, where, preparation.renamed)
         horizon = count_of(config, "chunk_size", 50, where)
         model = {
             **weights.model,
@@ -102,7 +103,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=without_cameras(cameras_in(inputs, where), absent, where),
+            img_keys=without_cameras(cameras, absent, where),
             transforms=[
                 *of_images(resolution_of(config, where)),
                 normalization(preparation),

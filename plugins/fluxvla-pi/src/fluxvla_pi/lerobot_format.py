@@ -88,6 +88,7 @@ class LeRobotPiFormat(CheckpointFormat):
             preparation = from_files(folder, widths)
         else:
             preparation = from_buffers(folder, config, widths, max_length)
+        cameras = cameras_in(inputs, where, preparation.renamed)
         horizon = count_of(config, "chunk_size", 50, where)
         model = {
             **weights.model,
@@ -99,7 +100,7 @@ class LeRobotPiFormat(CheckpointFormat):
         return ForeignCheckpoint(
             model=model,
             tensors=weights.tensors,
-            img_keys=without_cameras(cameras_in(inputs, where), absent, where),
+            img_keys=without_cameras(cameras, absent, where),
             transforms=_transforms(model, preparation, size, tokenizer),
             statistics={"private": statistics_of(preparation, widths)},
             horizon=horizon,
@@ -159,10 +160,17 @@ def width_of(features: Mapping[str, Mapping[str, Any]], key: str, where: str) ->
     return shape[0]
 
 
-def cameras_in(features: Mapping[str, Mapping[str, Any]], where: str) -> list[str]:
-    """Cameras in the model's order, without those that are never there: they are masked."""
+def cameras_in(
+    features: Mapping[str, Mapping[str, Any]], where: str, renamed: Mapping[str, str]
+) -> list[str]:
+    """Cameras in the model's order, without those that are never there: they are masked.
+
+    Args:
+        renamed: the robot's name of an observation -> the policy's; the robot's is returned.
+    """
+    robots = {theirs: ours for ours, theirs in renamed.items()}
     found = [
-        key
+        robots.get(key, key)
         for key, feature in features.items()
         if feature.get("type") == "VISUAL" and not key.startswith(_EMPTY)
     ]
@@ -242,9 +250,6 @@ def notes_of(preparation: Preparation, tokenizer: str | None) -> list[str]:
         notes.append(
             f"its tokenizer is {preparation.tokenizer}; --tokenizer names the folder that has it"
         )
-    if preparation.renamed:
-        pairs = ", ".join(f"{theirs} -> {ours}" for theirs, ours in preparation.renamed.items())
-        notes.append(f"LeRobot renamed observations before: {pairs}")
     return notes
 
 

@@ -18,6 +18,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
+    Step,
     read_steps,
     whole,
     write_steps,
@@ -55,7 +56,8 @@ _KNOWN = {
     "normalizer_processor",
 }
 _KNOWN_AFTER = {"unnormalizer_processor", "absolute_actions_processor", "device_processor"}
-_NORMALIZER = "normalizer_processor"
+_NORMALIZER, _UNNORMALIZER = "normalizer_processor", "unnormalizer_processor"
+_ABSOLUTE = "absolute_actions_processor"
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Preparation:
         relative: which actions are counted from the state; None if none is.
         tokenizer: its name.
         max_length: tokens of a prompt.
-        renamed: names of observations that are changed first.
+        renamed: the robot's name of an observation -> the policy's.
     """
 
     modes: Mapping[str, str]
@@ -94,8 +96,9 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
     """
     where = str(folder / f"{PREPROCESSOR}.json")
     steps = {step.name: step for step in read_steps(folder, PREPROCESSOR, _KNOWN)}
+    after: dict[str, Step] = {}
     if (folder / f"{POSTPROCESSOR}.json").is_file():
-        read_steps(folder, POSTPROCESSOR, _KNOWN_AFTER)
+        after = {step.name: step for step in read_steps(folder, POSTPROCESSOR, _KNOWN_AFTER)}
     missing = sorted({_NORMALIZER, "tokenizer_processor"} - set(steps))
     if missing:
         raise CheckpointError(f"there is no step {', '.join(missing)}", where=where)
@@ -105,9 +108,21 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
     tensors = steps[_NORMALIZER].tensors
     if tensors:
         found = {key: _rows(tensors, f"{key}.", widths[key], where) for key in KEYS}
+    if _UNNORMALIZER in after:  # what makes physical actions has the last word on them
+        last = after[_UNNORMALIZER]
+        modes[ACTION] = _modes(last.config.get("norm_map", {}), where)[ACTION]
+        if last.tensors:
+            found[ACTION] = _rows(last.tensors, f"{ACTION}.", widths[ACTION], where)
     _check(found, modes, where)
     settings = {name: step.config for name, step in steps.items()}
     relative = settings.get("relative_actions_processor", {})
+    absolute = after[_ABSOLUTE].config.get("enabled", False) if _ABSOLUTE in after else None
+    if absolute not in (None, relative.get("enabled", False)):
+        raise CheckpointError(
+            f"enabled of {_ABSOLUTE} is {absolute!r}, of relative_actions_processor "
+            f"{relative.get('enabled', False)!r}",
+            where=where,
+        )
     for key in ("exclude_joints", "action_names"):
         _setting(relative, key, [], (list, type(None)), where)
     names = settings.get("rename_observations_processor", {})

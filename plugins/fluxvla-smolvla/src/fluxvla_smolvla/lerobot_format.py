@@ -23,7 +23,6 @@ from fluxvla_core.results import read_json
 from fluxvla_smolvla.keys import published, published_names
 from fluxvla_smolvla.lerobot_processors import (
     Processors,
-    Statistics,
     buffered_statistics,
     norms_of,
     read_processors,
@@ -89,7 +88,8 @@ class LeRobotSmolVLA(CheckpointFormat):
             statistics = buffered_statistics(stored)
             norms = norms_of(config.table("normalization_mapping"), where)
             processors = Processors(norms, statistics)
-        if not processors.statistics:
+        bare = {kind for kind, norm in processors.norms.items() if norm == "none"}
+        if not processors.statistics and bare != {"STATE", "ACTION"}:
             notes.append("it has no statistics: it can be trained on, and drives no robot")
         steps, executed = config.count("chunk_size", 50), config.count("n_action_steps", 50)
         if executed < steps:
@@ -105,7 +105,7 @@ class LeRobotSmolVLA(CheckpointFormat):
             transforms=config.transforms(
                 processors, vision["image_size"], len(cameras), empty, _tokenizer(folder, tokenizer)
             ),
-            statistics={"private": _ours(processors.statistics)},
+            statistics={"private": config.statistics(processors)},
             horizon=steps,
             notes=tuple(notes),
         )
@@ -249,13 +249,32 @@ class Settings:
             },
         )
 
+    def statistics(self, processors: Processors) -> dict[str, Any]:
+        """Our entries; where nothing is normalised, zeros and ones tell the width."""
+        found: dict[str, Any] = {}
+        for feature, kind, entry, section in (
+            (STATE, "STATE", "proprio", "input_features"),
+            (ACTION, "ACTION", "action", "output_features"),
+        ):
+            rows = dict(processors.statistics.get(feature, {}))
+            if processors.norms.get(kind, "none") == "none" and not rows:
+                width = self._width(section, feature)
+                if width is not None:
+                    rows = {"mean": [0.0] * width, "std": [1.0] * width}
+            if rows:
+                found[entry] = rows
+        return found
+
     def _action_dim(self) -> int | None:
-        feature = self.table("output_features").get(ACTION, {})
+        return self._width("output_features", ACTION)
+
+    def _width(self, section: str, name: str) -> int | None:
+        feature = self.table(section).get(name, {})
         shape = feature.get("shape") if isinstance(feature, dict) else feature
         if shape is None:
             return None
         if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
-            raise self._wrong("output_features.action.shape", shape, "one whole number")
+            raise self._wrong(f"{section}.{name}.shape", shape, "one whole number")
         return shape[0]
 
     def _wrong(self, name: str, value: Any, expected: str) -> CheckpointError:
@@ -316,11 +335,6 @@ def _names(model: Mapping[str, Any]) -> list[str]:
 
     with torch.device("meta"):
         return list(SmolVLA(**{k: v for k, v in model.items() if k != "type"}).state_dict())
-
-
-def _ours(statistics: Statistics) -> dict[str, Any]:
-    names = {STATE: "proprio", ACTION: "action"}
-    return {names[feature]: dict(values) for feature, values in statistics.items()}
 
 
 def _tokenizer(folder: Path, given: str | None) -> str | None:

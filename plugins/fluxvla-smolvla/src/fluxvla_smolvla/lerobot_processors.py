@@ -26,7 +26,6 @@ from fluxvla_models.lerobot_files import (
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import Stored
 
-EPS = 1e-8
 NORMS = {
     "MEAN_STD": "mean_std",
     "MIN_MAX": "min_max",
@@ -89,13 +88,13 @@ def read_processors(folder: Path) -> Processors | None:
         for step in read_steps(folder, stem, _KNOWN):
             name, settings = step.name, step.config
             if name in ("normalizer_processor", "unnormalizer_processor"):
-                norms |= norms_of(settings.get("norm_map", {}), where)
-                if settings.get("eps", EPS) != EPS:
-                    raise CheckpointError(
-                        f"{name} divides by a std plus {settings['eps']}; {EPS} is known",
-                        where=where,
-                    )
-                statistics |= _statistics(step.tensors)
+                found = norms_of(settings.get("norm_map", {}), where)
+                rows = _statistics(step.tensors)
+                if stem == POSTPROCESSOR:  # it has a say on actions alone
+                    found = {kind: norm for kind, norm in found.items() if kind == "ACTION"}
+                    rows = {feature: row for feature, row in rows.items() if feature == ACTION}
+                norms |= found
+                statistics |= rows
             elif name == "rename_observations_processor":
                 renamed |= _texts(settings.get("rename_map", {}), "rename_map", where)
             elif name == "tokenizer_processor":

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fluxvla_models.lerobot_files import ACTION, POSTPROCESSOR, PREPROCESSOR, STATE, whole
+from fluxvla_models.lerobot_files import ACTION, EPS, POSTPROCESSOR, PREPROCESSOR, STATE, whole
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint
 from fluxvla_smolvla.keys import published_names
-from fluxvla_smolvla.lerobot_processors import EPS, NORMS, Statistics
+from fluxvla_smolvla.lerobot_processors import NORMS, Statistics
 from fluxvla_smolvla.model import SMOLVLM2
 from fluxvla_smolvla.sizes import TextSize, VisionSize, size_of
 

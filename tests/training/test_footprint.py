@@ -12,7 +12,7 @@ from fluxvla_core.training.optimizers import SGD, AdamW
 torch = pytest.importorskip("torch")
 from torch import nn  # noqa: E402
 
-from fluxvla_core.training import footprint, layout  # noqa: E402
+from fluxvla_core.training import footprint, parameters  # noqa: E402
 from fluxvla_core.training.model import checkpoint_activations  # noqa: E402
 
 BATCH = {"x": torch.zeros(4, 8, 32), "y": torch.zeros(4, 8, 32)}
@@ -82,7 +82,9 @@ def test_what_autograd_keeps_is_counted_without_memory(dtype: Any) -> None:
     assert told.batch == kept.batch == 2 * 4 * 8 * 32 * 4
     # In bf16 autocast copies the trained matrices and their biases, but not the norms.
     copied = [p for n, p in real.named_parameters() if p.requires_grad and "norm" not in n]
-    assert told.weight_copies == kept.weight_copies == (layout.nbytes(copied) // 2 if dtype else 0)
+    assert (
+        told.weight_copies == kept.weight_copies == (parameters.nbytes(copied) // 2 if dtype else 0)
+    )
 
 
 def test_what_is_kept_is_counted_by_hand() -> None:
@@ -103,7 +105,7 @@ def test_what_is_kept_is_counted_by_hand() -> None:
 
 def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> None:
     kept = footprint.kept_by_fake(footprint.fake(on_meta()), BATCH, None)
-    found = layout.replicated_layout(on_meta())
+    found = parameters.replicated_layout(on_meta())
     plain, again = (footprint.footprint(found, kept, 0, False, r) for r in (False, True))
     assert (plain.activations, plain.recomputed) == (kept.activations, 0)
     assert (again.activations, again.recomputed) == (kept.recomputed, kept.largest_unit)
@@ -121,7 +123,7 @@ def test_a_model_that_decides_by_numbers_cannot_be_counted() -> None:
 @pytest.mark.parametrize("settings", [AdamW(), AdamW(fused=False), SGD(), SGD(momentum=0.0)])
 def test_the_state_of_an_optimizer(settings: Any) -> None:
     model = Stack()
-    found = layout.replicated_layout(on_meta())
+    found = parameters.replicated_layout(on_meta())
     groups = [{"params": [p], "weight_decay": 0.0} for p in model.parameters() if p.requires_grad]
     optimizer = settings.build(groups, 1e-3)
     model(**BATCH)["loss"].backward()
@@ -134,7 +136,7 @@ def test_the_state_of_an_optimizer(settings: Any) -> None:
 def test_what_one_process_alone_keeps() -> None:
     model = Stack()
     model(**BATCH)["loss"].backward()
-    found = layout.replicated_layout(on_meta())
+    found = parameters.replicated_layout(on_meta())
     own: Mapping[str, Any] = dict(model.named_parameters())
     assert found.parameters == sum(t.nbytes for t in [*own.values(), model.scale])
     assert found.gradients == sum(p.grad.nbytes for p in own.values() if p.grad is not None)
@@ -142,7 +144,7 @@ def test_what_one_process_alone_keeps() -> None:
 
 
 def test_the_sum_and_the_averages() -> None:
-    found = layout.replicated_layout(on_meta())
+    found = parameters.replicated_layout(on_meta())
     kept = footprint.Kept(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
     whole = footprint.footprint(found, kept, 13, True, False)
     assert whole.averages == found.gradients

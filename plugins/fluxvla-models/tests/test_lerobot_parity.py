@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core import EmbodimentSpec
 from fluxvla_core.models import load_policy
 from fluxvla_core.spec.embodiment import Camera, Joint
-from fluxvla_core.training.foreign import import_checkpoint
+from fluxvla_core.training.export import import_checkpoint
 from tests.oracles import fill
 from tests.policies.benched import DIVIDED, WHOLE, stages_of
 

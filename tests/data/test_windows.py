@@ -17,11 +17,12 @@ def test_a_window_holds_its_last_action_and_masks_what_is_not_there(rows, data, 
     actions = np.arange(2 * rows, dtype=np.float32).reshape(rows, 2)
     actions.flags.writeable = False
     end = data.draw(st.integers(1, rows))
-    first = data.draw(st.integers(0, end - 1))
-    chunk, mask = window(actions, first, end, size)
+    begin = data.draw(st.integers(0, end - 1))
+    first = data.draw(st.integers(begin - 3, end - 1))
+    chunk, mask = window(actions, first, (begin, end), size)
     for j in range(size):
-        assert mask[j] == (first + j < end)
-        np.testing.assert_array_equal(chunk[j], actions[min(first + j, end - 1)])
+        assert mask[j] == (begin <= first + j < end)
+        np.testing.assert_array_equal(chunk[j], actions[min(max(first + j, begin), end - 1)])
     assert chunk.dtype == mask.dtype == np.float32
     chunk[:] = -1
     assert (actions >= 0).all()
@@ -36,6 +37,7 @@ def test_statistics_of_windows_do_not_hold_a_copy_for_each_step(per_step):
         actions=rng.standard_normal((frames, dims)).astype(np.float32),
         states=rng.standard_normal((frames, dims)).astype(np.float32),
         rows=np.arange(frames),
+        start=np.zeros(frames, np.int64),
         end=np.full(frames, frames),
     )
     tracemalloc.start()

@@ -21,7 +21,7 @@ class Batched:
     """What the server uses of a local policy; answers tell seed, call and what was seen."""
 
     embodiment, cameras, action_rate_hz, horizon = ARM, ("eye",), 10.0, 2
-    device, continues = "cpu", True
+    device, continues, n_obs_steps = "cpu", True, 1
 
     def __init__(self, batch_size=3, leaks=False):
         self.batch_size, self.leaks, self.sizes, self.started = batch_size, leaks, [], None

@@ -63,7 +63,7 @@ def reacher(**arguments):
 class TestGymnasiumEnvironment(EnvironmentConformance):
     entry_point = "GymnasiumEnvironment"
     arguments = {key: value for key, value in reacher().items() if key != "type"}  # noqa: RUF012
-    picture = None
+    image_size = None
 
 
 @needs_mujoco

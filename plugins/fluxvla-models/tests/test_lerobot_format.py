@@ -171,11 +171,12 @@ def test_what_is_not_built_here_is_refused_in_words(
     assert not (tmp_path / "ours").exists()
 
 
-def test_earlier_observations_are_refused_in_words(tmp_path: Path) -> None:
+@pytest.mark.parametrize("steps", [0, 9, "2", None])
+def test_numbers_of_observations_that_make_no_sense(tmp_path: Path, steps: object) -> None:
     made = tmp_path / "theirs"
     shutil.copytree(TESTS / "golden" / "lerobot_diffusion_history", made)
-    assert LeRobotDiffusion().recognizes(made)
-    with pytest.raises(CheckpointError, match=r"acts on 2 observations.*\(n_obs_steps\)"):
+    change(made / "config.json", n_obs_steps=steps)
+    with pytest.raises(CheckpointError, match=rf"n_obs_steps is {steps!r}, not .* to horizon 8"):
         LeRobotDiffusion().read(made)
 
 

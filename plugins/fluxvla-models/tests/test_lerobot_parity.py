@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,6 +23,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from fluxvla_core import EmbodimentSpec
+from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
+from fluxvla_core.errors import ConfigError
+from fluxvla_core.evaluation.policy_server import PolicyServer, ServedPolicy
+from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.models import load_policy
 from fluxvla_core.spec.embodiment import Camera, Joint
 from fluxvla_core.training.export import import_checkpoint
@@ -159,11 +165,13 @@ def published(case: str, folder: Path) -> Path:
     return folder
 
 
-def observation(cameras: tuple[str, ...]) -> dict[str, object]:
+def observation(cameras: tuple[str, ...], at: str = "raw") -> dict[str, object]:
     return {
-        "qpos": fill.normal("raw state", (JOINTS,)),
+        "qpos": fill.normal(f"{at} state", (JOINTS,)),
         "images": {
-            name: fill.integers(f"raw observation.images.{name}", (72, 96, 3), 256).astype(np.uint8)
+            name: fill.integers(f"{at} observation.images.{name}", (72, 96, 3), 256).astype(
+                np.uint8
+            )
             for name in cameras
         },
         "task_description": "lift",
@@ -191,6 +199,71 @@ def test_raw_pictures_and_joints_to_commands(case: str, tmp_path: Path, monkeypa
     divided = isinstance(model, DiffusionPolicy)
     stages = stages_of(tmp_path / "ours", tmp_path / "measured")
     assert stages == (DIVIDED if divided else WHOLE)
+
+
+class Filmed(Environment):
+    """Shows the same film whatever is done, and keeps the actions."""
+
+    spec = EnvironmentSpec("film", ARM, (TaskSpec("watch", "lift", max_steps=10),))
+    state = np.zeros(JOINTS)
+
+    def reset(self, seed: int, task: str) -> None:
+        self.actions: list[np.ndarray] = []
+        self.shown: list[int] = []
+
+    def observe(self, cameras):
+        step = len(self.actions)
+        self.shown.append(step)
+        return observation(tuple(camera.name for camera in cameras), f"raw {step}")
+
+    def step(self, action: np.ndarray) -> Step:
+        self.actions.append(action)
+        return Step(0.0, False, False)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("execution", ["here", "served"])
+def test_an_episode_with_earlier_observations(execution: str, tmp_path: Path, monkeypatch) -> None:
+    """LeRobot is shown every step and keeps a queue; here the runner keeps what it needs."""
+    case = "lerobot_diffusion_history"
+    golden = load_file(GOLDEN / f"{case}.safetensors")
+    source = published(case, tmp_path / "theirs")
+    found, imported = import_checkpoint(
+        source, tmp_path / "ours", format="lerobot", embodiment=ARM, action_rate_hz=50.0
+    )
+    assert imported.notes == ("LeRobot executes 5 of 7 actions: execute_horizon=5",)
+    policy = load_policy(found)
+    assert (policy.n_obs_steps, policy.horizon) == (2, 7)
+    start = fill.normal("noise", (BATCH, *policy.model.action_shape))[:1]
+    monkeypatch.setattr(policy, "_noise", lambda seed, call: start)
+    monkeypatch.setattr(
+        "fluxvla_models.diffusion_policy.following",
+        lambda noise, count: step_noise(policy.model, len(noise)),
+    )
+    film = Filmed()
+    settings = RolloutSettings(ARM.cameras[:1], replan_every=5)
+    with ExitStack() as stack:
+        actor = policy
+        if execution == "served":
+            server = stack.enter_context(PolicyServer({"p": lambda: policy}))
+            actor = ServedPolicy(server.link(), "p", server.facts["p"])
+        run_episode(film, actor, film.spec.tasks[0], 3, settings)
+    assert film.shown == [0, 4, 5, 9]
+    close(torch.from_numpy(np.stack(film.actions)).float(), golden["commands"])
+
+
+def test_a_question_without_its_history_is_refused(tmp_path: Path) -> None:
+    source = published("lerobot_diffusion_history", tmp_path / "theirs")
+    found, _ = import_checkpoint(
+        source, tmp_path / "ours", format="lerobot", embodiment=ARM, action_rate_hz=50.0
+    )
+    policy = load_policy(found)
+    with pytest.raises(ConfigError, match=r"acts on 2 observations \(n_obs_steps\).*with 1"):
+        policy.predict_action(observation(policy.cameras))
+    trained_on = Checkpoint.open(found).config()["train_dataloader"]["dataset"]
+    assert (trained_on["n_obs_steps"], trained_on["past_actions"]) == (2, 1)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -45,9 +45,11 @@ TABLES: dict[str, dict[str, Any]] = {
         "num_train_timesteps": 20,
     },
 }
+TABLES["diffusion_of_two"] = {**TABLES["diffusion"], "n_obs_steps": 2}
 KEYS = {
     "act": ("latent_noise",),
     "diffusion": ("noise", "timesteps", "crops"),
+    "diffusion_of_two": ("noise", "timesteps", "crops"),
     "llava": ("lang_tokens", "lang_masks", "img_masks"),
 }
 ALWAYS = ("images", "states", "actions", "action_masks", "sample_ids")
@@ -66,6 +68,8 @@ class Samples:
 
     def __init__(self, name: str) -> None:
         self.keys = {*ALWAYS, *KEYS[name]}
+        self.n_obs_steps = 2 if name.endswith("of_two") else 1
+        self.past_actions = self.n_obs_steps - 1
 
     def __len__(self) -> int:
         return 12
@@ -75,9 +79,10 @@ class Samples:
         masks = np.ones(HORIZON, np.float32)
         masks[HORIZON - index % 3 :] = 0
         words = np.arange(5) < 3 + index % 3
+        steps = () if self.n_obs_steps == 1 else (self.n_obs_steps,)
         sample = {
-            "images": rng.standard_normal((6, 32, 32)).astype(np.float32),
-            "states": rng.standard_normal(JOINTS).astype(np.float32),
+            "images": rng.standard_normal((*steps, 6, 32, 32)).astype(np.float32),
+            "states": rng.standard_normal((*steps, JOINTS)).astype(np.float32),
             "actions": rng.standard_normal((HORIZON, JOINTS)).astype(np.float32),
             "action_masks": masks,
             "latent_noise": rng.standard_normal(4).astype(np.float32),

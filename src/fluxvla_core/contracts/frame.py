@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -42,16 +42,24 @@ class RobotFrame(Frame):
     base: npt.NDArray[np.float64] | None = None
 
 
-class Observation(TypedDict):
+class _Present(TypedDict):
+    qpos: npt.NDArray[np.float32]
+    images: dict[str, npt.NDArray[np.uint8]]
+    task_description: str
+
+
+class Observation(_Present, total=False):
     """Input of a policy.
 
     ``qpos`` is ``(state_dim,)`` float32 in physical units, ``images`` maps camera name to
     ``(height, width, 3)`` uint8 RGB, ``task_description`` is the instruction in plain words.
+
+    A policy with ``n_obs_steps`` above 1 also gets ``history``: the ``n_obs_steps - 1``
+    observations before, the oldest first, each one of the policy's actions after the other. At the
+    beginning of an episode its first observation is repeated.
     """
 
-    qpos: npt.NDArray[np.float32]
-    images: dict[str, npt.NDArray[np.uint8]]
-    task_description: str
+    history: Sequence[Observation]
 
 
 Sample = dict[str, Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.contracts.contract import Contract, attribute, implements, required
 from fluxvla_core.contracts.environment import Environment
@@ -71,6 +71,12 @@ class Actor(Contract):
         return None
 
     @attribute
+    def n_obs_steps(self) -> int:
+        """Observations that it acts on, the present one last; the others are the ``history`` of
+        the observation that it is asked with."""
+        return 1
+
+    @attribute
     def executed(self) -> npt.NDArray[np.float64] | None:
         """``(N, dim)`` commands that lead to the last chunk's first action; None: a straight line.
 
@@ -94,6 +100,27 @@ class Actor(Contract):
     ) -> npt.NDArray[np.float64]:
         """Real-time chunking: ``(horizon, dim)`` actions in physical units that fit ``rest``."""
         raise NotImplementedError(f"{type(self).__name__} cannot continue a chunk")
+
+
+def with_history(
+    observation: Observation, n_obs_steps: int, before: Sequence[Observation] = ()
+) -> Observation:
+    """``observation`` with the ``history`` that a policy of ``n_obs_steps`` is asked with.
+
+    Args:
+        before: what was observed before in the episode, one action apart, the oldest first. Its
+            first is repeated where there are too few; the present one where there is none.
+    """
+    if n_obs_steps == 1:
+        return observation
+    seen = [{**each} for each in (*before[1 - n_obs_steps :], observation)]
+    for each in seen:
+        each.pop("history", None)
+    missing = n_obs_steps - len(seen)
+    history: Any = (*[seen[0]] * missing, *seen[:-1])
+    present: Any = {**observation, "history": history}
+    found: Observation = present
+    return found
 
 
 class Policy(Actor):

@@ -151,7 +151,7 @@ class Operator(Contract):
         """JSON values that go into the results of an evaluation, after each episode."""
         return {}
 
-    def pictures_after(
+    def images_after(
         self, camera: str, after: float
     ) -> tuple[Sequence[tuple[float, npt.NDArray[np.uint8]]], int]:
         """Images that are kept for recordings, which then have all that arrive.
@@ -170,7 +170,7 @@ class Operator(Contract):
         None (the default) says that this robot cannot be divided. Called before ``connect``, on an
         operator that is not used itself afterwards: it may return itself. Another process has the
         other part, at the same time. ``embodiment`` is still that of the whole robot, with its
-        cameras. Everything is asked but ``pictures_after`` and ``get_frame``, which raises
+        cameras. Everything is asked but ``images_after`` and ``get_frame``, which raises
         NotReady; ``get_state`` and ``state_stamp`` are needed then.
         """
         return None
@@ -180,7 +180,7 @@ class Operator(Contract):
 
         None (the default) says that this robot cannot be divided. Called as ``without_cameras`` is.
         The part has a connection of its own, and is asked ``connect``, ``get_frame``,
-        ``get_state``, ``state_stamp``, ``pictures_after``, ``close``, ``domain_id``, ``clock`` and
+        ``get_state``, ``state_stamp``, ``images_after``, ``close``, ``domain_id``, ``clock`` and
         ``embodiment`` only. It sends the robot nothing, also not in ``close``; it neither holds the
         arm nor looks for others who command it. ``send_action`` raises Rejected, ``stop`` does
         nothing.

@@ -64,6 +64,21 @@ class VLA(Contract):
         return None
 
     @attribute
+    def n_obs_steps(self) -> int:
+        """Observations that it takes, one action apart, the present one last.
+
+        With more than one, ``images`` are ``(B, n_obs_steps, 3N, H, W)`` and ``states``
+        ``(B, n_obs_steps, S)``, in training and when it acts; all else is the present one's.
+        """
+        return 1
+
+    @attribute
+    def past_actions(self) -> int:
+        """Actions of a chunk that come before the present one's: they are trained on, and left out
+        of what a policy answers."""
+        return 0
+
+    @attribute
     def static_graph(self) -> bool:
         """Whether every step uses the same parameters in the same order, as DDP may rely on."""
         return False
@@ -222,6 +237,16 @@ class Dataset(Contract):
     def action_window_size(self) -> int | None:
         """Actions in a sample's chunk."""
         return None
+
+    @attribute
+    def n_obs_steps(self) -> int:
+        """Observations of a sample, as ``VLA.n_obs_steps`` says."""
+        return 1
+
+    @attribute
+    def past_actions(self) -> int:
+        """Actions of a sample's chunk before the present one's, as ``VLA.past_actions`` says."""
+        return 0
 
     @attribute
     def tasks(self) -> Sequence[str]:

@@ -22,10 +22,10 @@ from fluxvla_core.data.columns import (
     load_dataset,
     naming_warnings,
 )
-from fluxvla_core.data.frames import Frames
+from fluxvla_core.data.frames import Frames, Place
 from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, sample_rng
 from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joined_statistics
-from fluxvla_core.data.transforms.images import join_planes, split_images
+from fluxvla_core.data.transforms.images import join_planes, split_images, stack_steps
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
@@ -55,6 +55,13 @@ class ParquetDataset(Dataset):
         action_key, state_key: features; ``action_key`` may be the state, see
             ``window_start_idx``.
         window_start_idx: frames from the present one to the window's first action.
+        n_obs_steps: observations of a sample, the present one last, for a model that takes several.
+            ``images`` are then ``(n_obs_steps, 3N, H, W)`` and ``states`` ``(n_obs_steps, D)``.
+            Transforms see one observation at a time, and draw the same for all of a sample. Before
+            an episode's beginning its first frame is repeated.
+        past_actions: actions of the window before the one that ``window_start_idx`` says, as the
+            model's ``past_actions``. Before an episode's beginning the first one is repeated, with
+            ``action_masks`` 0.
         use_delta: actions are differences to the frame before.
         relative_actions: normalisation counts actions from the present state: True for every
             joint that is not a gripper, or one truth value a joint. The statistics then say so
@@ -78,6 +85,8 @@ class ParquetDataset(Dataset):
     """
 
     action_window_size: int
+    n_obs_steps: int
+    past_actions: int
     pipeline: Pipeline
     statistic_name: str
 
@@ -100,11 +109,18 @@ class ParquetDataset(Dataset):
         episodes: Sequence[Any] | None = None,
         processors: str | None = None,
         embodiment: Mapping[str, Any] | str | None = None,
+        n_obs_steps: int = 1,
+        past_actions: int = 0,
     ) -> None:
         if action_window_size < 1 or window_start_idx < 0:
             raise ConfigError(
                 f"ParquetDataset: action_window_size {action_window_size} must be at least 1, "
                 f"window_start_idx {window_start_idx} at least 0"
+            )
+        if n_obs_steps < 1 or not 0 <= past_actions < action_window_size:
+            raise ConfigError(
+                f"ParquetDataset: n_obs_steps {n_obs_steps} must be at least 1, past_actions "
+                f"{past_actions} from 0 to {action_window_size - 1}, below action_window_size"
             )
         roots = _roots(data_root_path)
         chosen = _episode_lists(episodes, len(roots))
@@ -120,6 +136,7 @@ class ParquetDataset(Dataset):
         self.state_key, self.action_key = state_key, action_key
         self.action_window_size = action_window_size
         self.window_start_idx = window_start_idx
+        self.n_obs_steps, self.past_actions = n_obs_steps, past_actions
         self.use_delta = use_delta
         self.per_step_statistics = per_step_statistics
         self.statistic_name = statistic_name
@@ -213,27 +230,41 @@ class ParquetDataset(Dataset):
         """Several samples at once; their images are read in the order of the files."""
         self.prepare()
         places = [self._place(key.index) for key in keys]
-        pictures = self._frames.read(places)
+        steps = [step for place in places for step in self._steps(place)]
+        pictures = iter(self._frames.read(steps))
         return [
-            self._finish(self._raw(key.index, place, images), key)
-            for key, place, images in zip(keys, places, pictures, strict=True)
+            stack_steps([self._prepared(key, place, step, next(pictures)) for step in steps])
+            for key, place, steps in zip(keys, places, map(self._steps, places), strict=True)
         ]
 
-    def _place(self, index: int) -> tuple[int, int]:
+    def _place(self, index: int) -> Place:
         if not 0 <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
         part = int(np.searchsorted(self._ends, index, side="right"))
         before = int(self._ends[part - 1]) if part else 0
         return part, int(self.loaded[part].rows[index - before])
 
+    def _steps(self, place: Place) -> list[Place]:
+        """The frames that a sample shows, the present one last."""
+        part, row = place
+        first = int(self.loaded[part].start[row])
+        return [(part, max(row - back, first)) for back in reversed(range(self.n_obs_steps))]
+
+    def _prepared(
+        self, key: SampleKey, place: Place, step: Place, images: list[npt.NDArray[np.uint8]]
+    ) -> Sample:
+        """What the transforms make of the sample at ``place`` as it looks at ``step``."""
+        return self._finish(self._raw(key.index, place, step[1], images), key)
+
     def _raw(
-        self, index: int, place: tuple[int, int], images: list[npt.NDArray[np.uint8]]
+        self, index: int, place: Place, seen: int, images: list[npt.NDArray[np.uint8]]
     ) -> Sample:
         loaded, row = self.loaded[place[0]], place[1]
-        first, end = row + self.window_start_idx, int(loaded.end[row])
-        actions, masks = window(loaded.actions, first, end, self.action_window_size)
+        first = row + self.window_start_idx - self.past_actions
+        bounds = int(loaded.start[row]), int(loaded.end[row])
+        actions, masks = window(loaded.actions, first, bounds, self.action_window_size)
         sample: Sample = {
-            "states": loaded.states[row].copy(),
+            "states": loaded.states[seen].copy(),
             "actions": actions,
             "action_masks": masks,
             "task_description": loaded.meta.tasks[loaded.task[row]],
@@ -274,7 +305,7 @@ def pooled_statistics(datasets: Sequence[ParquetDataset]) -> dict[str, Any]:
     action = action_statistics(
         loaded,
         first.action_window_size,
-        first.window_start_idx,
+        first.window_start_idx - first.past_actions,
         first.relative,
         first.per_step_statistics,
     )
@@ -306,6 +337,8 @@ def action_statistics(
         each: list[Stats] = []
         for j in range(size):
             rows = _step(datasets, first_action + j, relative, slice(None))
+            if not len(rows):
+                rows = _step(datasets, 0, relative, slice(None)) if not each else rows
             each.append(column_statistics(rows) if len(rows) else each[0])
         stats = {name: np.stack([s[name] for s in each]) for name in each[0]}
     else:
@@ -327,7 +360,8 @@ def _step(
     """Actions ``ahead`` rows after each usable one, where they are within the episode."""
     parts = []
     for one in datasets:
-        rows = one.rows[one.rows + ahead < one.end[one.rows]]
+        there = one.rows + ahead
+        rows = one.rows[(one.start[one.rows] <= there) & (there < one.end[one.rows])]
         actions = one.actions[:, dims][rows + ahead]
         if relative is not None:
             actions = actions - one.states[:, : len(relative)][:, dims][rows] * relative[dims]
@@ -335,21 +369,21 @@ def _step(
     return np.concatenate(parts)
 
 
-def window(actions: Floats, first: int, end: int, size: int) -> tuple[Floats, Floats]:
+def window(
+    actions: Floats, first: int, episode: tuple[int, int], size: int
+) -> tuple[Floats, Floats]:
     """``size`` rows of ``actions`` ``(N, D)`` from ``first`` on, and which of them are there.
 
-    Rows from ``end`` on are beyond the episode: the last one is repeated, its mask is 0.
+    ``episode`` is the first row of an episode and the one behind its last. Rows before and after it
+    repeat its first and its last, with the mask 0.
 
     Returns:
-        ``(size, D)`` and ``(size,)`` float32, both fresh; ``first`` is below ``end``.
+        ``(size, D)`` and ``(size,)`` float32, both fresh.
     """
-    there = min(size, end - first)
-    chunk = np.empty((size, actions.shape[1]), np.float32)
-    chunk[:there] = actions[first : first + there]
-    chunk[there:] = actions[first + there - 1]
-    mask = np.zeros(size, np.float32)
-    mask[:there] = 1
-    return chunk, mask
+    begin, end = episode
+    rows = np.arange(first, first + size)
+    chunk = np.asarray(actions[rows.clip(begin, end - 1)], np.float32)
+    return chunk, ((begin <= rows) & (rows < end)).astype(np.float32)
 
 
 def differences(loaded: LoadedDataset) -> LoadedDataset:

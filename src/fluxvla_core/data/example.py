@@ -15,7 +15,7 @@ from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import Dataset, Tokenizer
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
-from fluxvla_core.data.transforms.images import join_planes, split_images
+from fluxvla_core.data.transforms.images import join_planes, split_images, stack_steps
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -111,6 +111,7 @@ def assumed_example(
     images = sample.get("images")
     if isinstance(images, list) and len({image.shape for image in images}) == 1:
         sample["images"] = join_planes(split_images(images))
+    sample = stack_steps([sample] * max(int(table.get("n_obs_steps", 1)), 1))
     return Example(sample, states, actions, sizes, None, tuple(assumed))
 
 

@@ -96,6 +96,16 @@ class DistributedRepeatingDataset(Dataset):
         return self.datasets[0].action_window_size
 
     @property
+    def n_obs_steps(self) -> int:
+        """The first dataset's."""
+        return self.datasets[0].n_obs_steps
+
+    @property
+    def past_actions(self) -> int:
+        """The first dataset's."""
+        return self.datasets[0].past_actions
+
+    @property
     def pipeline(self) -> Any:
         """The first dataset's."""
         return self.datasets[0].pipeline
@@ -311,6 +321,7 @@ def _check_group(name: str, group: Sequence[Any]) -> None:
 _MEANING: Mapping[str, Callable[[ParquetDataset], Any]] = {
     "action_window_size": lambda d: d.action_window_size,
     "window_start_idx": lambda d: d.window_start_idx,
+    "past_actions": lambda d: d.past_actions,
     "use_delta": lambda d: d.use_delta,
     "per_step_statistics": lambda d: d.per_step_statistics,
     "relative_actions": lambda d: None if d.relative is None else d.relative.tolist(),

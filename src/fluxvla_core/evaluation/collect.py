@@ -181,6 +181,12 @@ def demonstrate(
     commands.start(environment.state)
     images: dict[str, list[npt.NDArray[np.uint8]]] = {camera.name: [] for camera in cameras}
     states, actions = [], []
+    if actor.n_obs_steps > 1:
+        raise ConfigError(
+            f"{type(actor).__name__} acts on {actor.n_obs_steps} observations (n_obs_steps); a "
+            "collection asks with the present one alone",
+            next="demonstrate with an expert; evaluate such a policy: fluxvla run --section eval",
+        )
     recorded = task.max_steps if task.record_steps is None else task.record_steps
     steps, success, ended, instruction = 0, False, False, task.instruction
     while not ended and steps < task.max_steps:

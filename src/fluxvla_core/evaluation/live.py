@@ -205,6 +205,7 @@ class _TimedPolicy(Policy):
     action_rate_hz: float
     horizon: int
     continues: bool
+    n_obs_steps: int
 
     def __init__(self, actor: Actor, environment: Environment, cameras: tuple[Camera, ...]) -> None:
         spec, actor = environment.spec.embodiment, Actor.adapt(actor)
@@ -216,6 +217,7 @@ class _TimedPolicy(Policy):
         )
         self.horizon = int(1 if actor.horizon is None else actor.horizon)
         self.continues = self._actor.continues
+        self.n_obs_steps = actor.n_obs_steps
         self.seconds = 0.0
 
     def reset(self, seed: int) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.contracts.policy import Continuation, Policy
+from fluxvla_core.contracts.policy import Continuation, Policy, with_history
 from fluxvla_core.errors import EXIT_BAD_INPUT, ConfigError, FluxError, RunFailed
 from fluxvla_core.policies.local import LocalPolicy, Question
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -43,6 +43,7 @@ class PolicyFacts:
     action_rate_hz: float
     horizon: int
     continues: bool = False
+    n_obs_steps: int = 1
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,7 @@ class PolicyServer:
                     policy.action_rate_hz,
                     policy.horizon,
                     policy.continues,
+                    policy.n_obs_steps,
                 )
         except BaseException as error:  # noqa: BLE001 - it is raised where the server is made
             self._started.put(error)
@@ -220,6 +222,7 @@ class ServedPolicy(Policy):
     action_rate_hz: float
     horizon: int
     continues: bool
+    n_obs_steps: int
 
     def __init__(self, connection: Connection, name: str, facts: PolicyFacts) -> None:
         self.embodiment = facts.embodiment
@@ -227,6 +230,7 @@ class ServedPolicy(Policy):
         self.action_rate_hz = facts.action_rate_hz
         self.horizon = facts.horizon
         self.continues = facts.continues
+        self.n_obs_steps = facts.n_obs_steps
         self._connection = connection
         self._name = name
         self._seed = self._calls = 0
@@ -298,4 +302,4 @@ def _probe(policy: LocalPolicy, share: float) -> Question:
         },
         "task_description": "do the task",
     }
-    return Question(observation, int(1000 * share), 3)
+    return Question(with_history(observation, policy.n_obs_steps), int(1000 * share), 3)

@@ -7,6 +7,9 @@ takes.
 Time stands still while the policy thinks. In an environment whose actions are joint targets the
 commands are formed by the same path as on a robot: a chunk's actions are joined linearly from the
 last command on and kept within the same limits. Other actions pass the limits unchanged.
+
+A policy that acts on several observations also gets those of the action steps before: of every
+action that is executed, as far back as it looks.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -26,7 +30,8 @@ import numpy.typing as npt
 from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, TaskSpec
-from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.contracts.policy import Actor, with_history
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluation.live import LiveSettings, run_live
@@ -36,6 +41,7 @@ from fluxvla_core.evaluation.stepping import (
     ChunkCommands,
     check_state,
     check_step,
+    history_stride,
     shaped,
 )
 from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
@@ -244,6 +250,8 @@ def run_episode(
     problem: str | None = None
     # The environment may have another instruction for each episode.
     instruction = (instruction_of or task).instruction
+    stride = history_stride(actor, spec.embodiment.rate_hz)
+    before: deque[Observation] = deque(maxlen=max(actor.n_obs_steps - 1, 0))
     if on_step is not None:
         on_step(environment, 0)
     while not ended and steps < limit:
@@ -253,9 +261,11 @@ def run_episode(
         # Before the policy is queried: what it makes of such a state is not its fault.
         check_state(observation["qpos"], steps)
         observed_at = time.perf_counter()
-        chunk = shaped(actor.predict_action(observation), spec.embodiment.dim)
+        asked = with_history(observation, actor.n_obs_steps, tuple(before))
+        chunk = shaped(actor.predict_action(asked), spec.embodiment.dim)
         answered = time.perf_counter()
-        del observation  # so that the next images can have its memory: fresh pages cost more
+        before.append(observation)
+        del observation, asked  # so that the next images can have its memory: fresh pages cost more
         spent["observe"] += observed_at - at
         spent["policy"] += answered - observed_at
         calls += 1
@@ -263,7 +273,8 @@ def run_episode(
         if problem is not None:
             success = False
             break
-        for target in commands.targets(chunk[: settings.replan_every]):
+        targets = commands.targets(chunk[: settings.replan_every])
+        for left, target in zip(reversed(range(len(targets))), targets, strict=True):
             at = time.perf_counter()
             outcome = environment.step(commands.command(target))
             spent["step"] += time.perf_counter() - at
@@ -279,6 +290,10 @@ def run_episode(
                 on_step(environment, steps)
             if ended or steps >= limit:
                 break
+            if left and left % stride == 0 and left // stride < actor.n_obs_steps:
+                at = time.perf_counter()
+                before.append(environment.observe(settings.cameras))
+                spent["observe"] += time.perf_counter() - at
     return {
         "success": success,
         "problem": problem,

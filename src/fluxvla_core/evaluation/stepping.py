@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
-from fluxvla_core.errors import RunFailed, SpecMismatch
+from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate
 from fluxvla_core.robot.control.clamps import PassThrough
 from fluxvla_core.robot.control.limits import CommandLimiter
@@ -55,6 +56,25 @@ class ChunkCommands:
         commands, clamps = self._pipeline.form(target[None])
         self.clamped += bool(clamps[0])
         return np.asarray(commands[0])
+
+
+def history_stride(actor: Actor, rate_hz: float) -> int:
+    """Control steps between two observations of a policy's history: those of one of its actions.
+
+    Raises:
+        ConfigError: the policy needs a history, and its actions are no whole number of steps.
+    """
+    own = actor.action_rate_hz
+    if actor.n_obs_steps == 1 or own is None:
+        return 1
+    stride = round(rate_hz / own)
+    if stride < 1 or abs(stride * own - rate_hz) > 1e-9 * rate_hz:
+        raise ConfigError(
+            f"the policy acts on {actor.n_obs_steps} observations (n_obs_steps) 1/{own:g} s apart, "
+            f"the environment takes steps of 1/{rate_hz:g} s: it cannot be observed in between",
+            next="train on data whose frame rate divides the environment's rate",
+        )
+    return stride
 
 
 def shaped(chunk: Any, dim: int) -> Array:

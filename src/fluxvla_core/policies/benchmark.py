@@ -23,6 +23,7 @@ import numpy.typing as npt
 from fluxvla_core.build import build_operator_from_cfg, build_vla_from_cfg
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Observation
+from fluxvla_core.contracts.policy import with_history
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import Transform
 from fluxvla_core.data.example import unit_statistics
@@ -108,7 +109,7 @@ def random_observations(
     robot = policy.embodiment
     joints = robot.state_joints or robot.joints
     lower, upper = (np.array([getattr(j, end) for j in joints]) for end in ("lower", "upper"))
-    return [
+    observations: list[Observation] = [
         {
             "images": {
                 camera.name: rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8)
@@ -120,6 +121,8 @@ def random_observations(
         }
         for _ in range(count)
     ]
+    steps = policy.n_obs_steps
+    return [with_history(seen, steps, observations[:i]) for i, seen in enumerate(observations)]
 
 
 def untrained_policy(

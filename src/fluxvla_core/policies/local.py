@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
@@ -52,7 +53,8 @@ class LocalPolicy(Policy):
         denormalize: ``{"action": (1, T, D), "states": (S,)}`` -> ``(T, dim)`` physical units.
         embodiment: the robot that it was trained for.
         cameras: names of the images that ``prepare`` looks at.
-        action_rate_hz, horizon: rate and length of a chunk.
+        action_rate_hz, horizon: rate and length of the model's chunks; a model's ``past_actions``
+            are left out of the policy's, whose ``horizon`` is shorter by them.
         device: the torch device of the model.
         precision: ``float32`` or ``bf16`` (autocast).
         source: where it came from, for records.
@@ -60,12 +62,16 @@ class LocalPolicy(Policy):
 
     Raises:
         ConfigError: a precision or an execution is unknown, or cannot be had here.
+
+    A model's ``n_obs_steps`` is the policy's: with more than one, what it is asked with has to have
+    a ``history``, whose observations are prepared one by one as the present one is.
     """
 
     embodiment: EmbodimentSpec
     cameras: tuple[str, ...]
     action_rate_hz: float
     horizon: int
+    n_obs_steps: int
     source: str
     stages: dict[str, float]
     parts: dict[str, float]
@@ -92,7 +98,9 @@ class LocalPolicy(Policy):
         self.embodiment = embodiment
         self.cameras = cameras
         self.action_rate_hz = action_rate_hz
-        self.horizon = horizon
+        described = VLA.adapt(model)
+        self.n_obs_steps, self._past = described.n_obs_steps, described.past_actions
+        self.horizon = horizon - self._past
         self.source = source
         self.batch_size = 1
         self.stages, self.parts = {}, {}
@@ -149,7 +157,7 @@ class LocalPolicy(Policy):
     @property
     def continues(self) -> bool:
         """Whether its model takes the rest of a chunk, and what it makes can be scaled back."""
-        if "prev_actions" not in self._takes:
+        if "prev_actions" not in self._takes or self._past:
             return False
         zeros = np.zeros(self.embodiment.state_dim)
         return scaling_of(self._denormalize, self.model.action_shape, zeros) is not None
@@ -216,7 +224,7 @@ class LocalPolicy(Policy):
                     "action": actions[place : place + 1],
                     "states": np.asarray(question.observation["qpos"]),
                 }
-            )
+            )[self._past :]
             for place, question in enumerate(questions)
         ]
         self.stages = {
@@ -243,7 +251,7 @@ class LocalPolicy(Policy):
         """A batch of one, with what the model takes."""
         import torch
 
-        row = self._prepare(self._sized(question.observation))
+        row = self._prepared(question.observation)
         if "noise" in self._takes:
             row["noise"] = torch.from_numpy(self._noise(question.seed, question.call))
         if question.rest is not None:
@@ -251,6 +259,31 @@ class LocalPolicy(Policy):
         if not self._takes_all:
             row = {key: value for key, value in row.items() if key in self._takes}
         return row
+
+    def _prepared(self, observation: Observation) -> dict[str, Any]:
+        """A batch of one; of several observations, with their images and states stacked.
+
+        Raises:
+            ConfigError: the observation has not the history that the model needs.
+        """
+        import torch
+
+        history = tuple(observation.get("history", ()))
+        if len(history) != self.n_obs_steps - 1:
+            raise ConfigError(
+                f"the policy of {self.source or 'this model'} acts on {self.n_obs_steps} "
+                f"observations (n_obs_steps), it was asked with {1 + len(history)}",
+                cause="what asks it keeps no earlier observations"
+                if not history
+                else "they were kept for another policy",
+                next="observation['history'] has the n_obs_steps - 1 before, the oldest first",
+            )
+        rows = [self._prepare(self._sized(seen)) for seen in (*history, observation)]
+        present: dict[str, Any] = rows[-1]
+        several = [key for key in ("images", "states") if history and key in present]
+        for key in several:
+            present[key] = torch.stack([row[key] for row in rows], dim=1)
+        return present
 
     def _rest(self, rest: Continuation, observation: Observation) -> dict[str, Any]:
         """The rest of a chunk as the model takes it, a batch of one."""

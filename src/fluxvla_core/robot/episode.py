@@ -305,6 +305,8 @@ class Episode:
 
     def _after_tick(self, sent: SentCommand | None) -> None:
         self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
+        if self._supervisor.phase is Phase.RUN:
+            self._client.ticked()
 
     def _emit(self, event: Event) -> None:
         for observer in self._observers:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import check_chunk
@@ -21,6 +22,7 @@ from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, Polic
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
 from fluxvla_core.robot.events import ChunkAccepted, Event, Refused, RobotReading
 from fluxvla_core.robot.observation import ObservationReader
+from fluxvla_core.robot.observation_history import ObservationHistory
 from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -84,8 +86,13 @@ class PolicyCaller:
                 f"the policy raised {type(error).__name__} in reset(): {error}"
             ) from error
 
-    def ask(self, reading: RobotReading, rest: Continuation | None) -> PolicyAnswer:
+    def ask(
+        self, reading: RobotReading, seen: Observation, rest: Continuation | None
+    ) -> PolicyAnswer:
         """The policy's answer; ``rest`` of a chunk is what it has to continue.
+
+        Args:
+            seen: the observation of ``reading``, with the history that the policy needs.
 
         Raises:
             PolicyFailed: the policy raised something that is no error of this project's.
@@ -96,9 +103,9 @@ class PolicyCaller:
         try:
             with self._delays.of(POLICY):
                 if rest is None:
-                    chunk = policy.predict_action(reading.observation)
+                    chunk = policy.predict_action(seen)
                 else:
-                    chunk = policy.continue_action(reading.observation, rest)
+                    chunk = policy.continue_action(seen, rest)
         except FluxError:
             raise
         except (Exception, SystemExit) as error:
@@ -135,6 +142,7 @@ class LocalPolicyClient(PolicyClient):
     Args:
         robot: the connected robot.
         reader: reads the robot's observations.
+        history: keeps those of before, for a policy that acts on several.
         policy: answers them with chunks.
         thread: the thread in which the policy computes.
         emit: takes the events ``ChunkAccepted`` and ``Refused``.
@@ -144,12 +152,14 @@ class LocalPolicyClient(PolicyClient):
         self,
         robot: Robot,
         reader: ObservationReader,
+        history: ObservationHistory,
         policy: PolicyCaller,
         thread: PolicyThread,
         emit: Callable[[Event], None],
     ) -> None:
         self._robot = robot
         self._reader = reader
+        self._history = history
         self._policy = policy
         self._thread = thread
         self._emit = emit
@@ -159,12 +169,22 @@ class LocalPolicyClient(PolicyClient):
 
     def reset(self) -> None:
         self._policy.reset()
+        self._history.reset()
 
     def ask(self, ahead: Ahead | None) -> Future[Answer]:
         if self._robot.lockstep:
-            reading = self._reader.read()
-            return self._thread.submit(lambda: self._think(reading, ahead))
-        return self._thread.submit(lambda: self._think(self._reader.read(), ahead))
+            reading, seen = self._history.read()
+            return self._thread.submit(lambda: self._think(reading, seen, ahead))
+        return self._thread.submit(lambda: self._think(*self._history.read(), ahead))
+
+    def ticked(self) -> None:
+        if not self._history.due():
+            return
+        if self._robot.lockstep:
+            self._history.sample()
+        elif self._thread.idle_within(0.0):
+            # What goes wrong is raised by the next question's own reading.
+            self._thread.submit(self._history.sample)
 
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
@@ -178,6 +198,6 @@ class LocalPolicyClient(PolicyClient):
     def slowest_since(self, since: float) -> tuple[DelaySource, float]:
         return self._robot.delays.longest(since)
 
-    def _think(self, reading: RobotReading, ahead: Ahead | None) -> Answer:
+    def _think(self, reading: RobotReading, seen: Observation, ahead: Ahead | None) -> Answer:
         rest = None if ahead is None else ahead.seen_at(reading.at, self._policy.policy.horizon)
-        return self._policy.ask(reading, rest)
+        return self._policy.ask(reading, seen, rest)

@@ -112,6 +112,11 @@ class ObservationReader:
         self._emit(Observed(self._robot.clock.now(), reading))
         return reading
 
+    def sample(self) -> RobotReading:
+        """One between two questions, for a policy's history; checked as ``read`` checks it, but
+        for the arm, and no event."""
+        return self._read()
+
     def _read(self) -> RobotReading:
         began = time.perf_counter()
         observation, frame = self._frame()

@@ -28,6 +28,7 @@ from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event
 from fluxvla_core.robot.local_policy_client import LocalPolicyClient, PolicyCaller
 from fluxvla_core.robot.observation import ObservationReader, Observe
+from fluxvla_core.robot.observation_history import ObservationHistory
 from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.process.remote_engine import RemoteEngine
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
@@ -263,7 +264,8 @@ def make_engine(
             tracking, thread, interrupts, emit,
         )  # fmt: skip
         caller = PolicyCaller(policy, robot.embodiment, safety, robot.delays, seed)
-        return LocalPolicyClient(robot, reader, caller, thread, emit)
+        seen = ObservationHistory(reader, robot, policy, safety.max_age_s)
+        return LocalPolicyClient(robot, reader, seen, caller, thread, emit)
 
     reporter, latch, history = parts.context.reporter, parts.latch, parts.history
     tables, frames = layout.tables, layout.frames

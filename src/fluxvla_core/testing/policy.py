@@ -21,7 +21,7 @@ from fluxvla_core.contracts.check import ON_A_ROBOT, check_policy
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.contracts.policy import Actor, Continuation
+from fluxvla_core.contracts.policy import Actor, Continuation, with_history
 from fluxvla_core.errors import FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.testing._conformance import Conformance, calling, capability, equal
@@ -74,7 +74,15 @@ class PolicyConformance(Conformance):
         return spec
 
     def observation(self, policy: Actor, number: int = 0) -> Observation:
-        """Observation ``number``: a state near the middle of the limits, and images of noise."""
+        """Observation ``number``: a state near the middle of the limits, and images of noise.
+
+        With the observations before it as its history, for a policy that needs one.
+        """
+        steps = policy.n_obs_steps
+        before = [self._observation(policy, i) for i in range(max(0, number + 1 - steps), number)]
+        return with_history(self._observation(policy, number), steps, before)
+
+    def _observation(self, policy: Actor, number: int) -> Observation:
         spec = self.embodiment(policy)
         rng = np.random.default_rng(number)
         joints = {joint.name: joint for joint in spec.joints}

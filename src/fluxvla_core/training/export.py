@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
@@ -33,6 +33,7 @@ from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
@@ -114,6 +115,7 @@ def _verified(checkpoint: Checkpoint, name: str) -> bytes:
 
 
 _ORIGIN = "import-checkpoint"
+_PRESENT_ONLY = {"n_obs_steps": 1, "past_actions": 0}
 
 
 def import_checkpoint(
@@ -156,7 +158,9 @@ def import_checkpoint(
         embodiment=embodiment or found.embodiment,
     )
     _check_robot(found, str(source))
-    tensors = _as_model_has_them(found, str(source))
+    with torch.device("meta"):  # its weights may be larger than memory
+        model = build_vla_from_cfg(found.model)
+    tensors = _as_model_has_them(model, found, str(source))
     prepare_folder(target.parent, "folder to import to", "name another place for the import")
     if target.exists():
         target.rmdir()
@@ -170,7 +174,7 @@ def import_checkpoint(
     ) as writer:
         TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
         writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
-        writer.write_json(ckpt.CONFIG, _config(found))
+        writer.write_json(ckpt.CONFIG, _config(found, VLA.adapt(model)))
         writer.write_json(ckpt.ENVIRONMENT, environment())
         writer.write_json(ckpt.STATISTICS, dict(found.statistics))
         rate = found.action_rate_hz
@@ -218,13 +222,8 @@ def export_foreign(source: str | Path, target: str | Path, format: str) -> Path:
     return target
 
 
-def _as_model_has_them(found: ForeignCheckpoint, where: str) -> dict[str, Tensor]:
-    """Every tensor of the model, of the sizes that it has; tied ones are one object.
-
-    The model is built without memory for its weights, which may be larger than there is.
-    """
-    with torch.device("meta"):
-        model = build_vla_from_cfg(found.model)
+def _as_model_has_them(model: nn.Module, found: ForeignCheckpoint, where: str) -> dict[str, Tensor]:
+    """Every tensor of the model, of the sizes that it has; tied ones are one object."""
     wanted = weights_by_name(model)
     check_names(found.tensors, wanted, "the weights", where)
     owner: dict[int, Tensor] = {}
@@ -268,7 +267,8 @@ def _as_foreign(checkpoint: Checkpoint) -> ForeignCheckpoint:
     )
 
 
-def _config(found: ForeignCheckpoint) -> dict[str, Any]:
+def _config(found: ForeignCheckpoint, model: VLA) -> dict[str, Any]:
+    history = {"n_obs_steps": model.n_obs_steps, "past_actions": model.past_actions}
     tree = {
         "model": dict(found.model),
         "train_dataloader": {
@@ -276,6 +276,7 @@ def _config(found: ForeignCheckpoint) -> dict[str, Any]:
                 "type": "ParquetDataset",
                 "img_keys": list(found.img_keys),
                 "action_window_size": found.horizon,
+                **(history if history != _PRESENT_ONLY else {}),
                 "transforms": [dict(table) for table in found.transforms],
             }
         },

@@ -19,7 +19,7 @@ from fluxvla_core.hooks import HookCaller
 from fluxvla_core.training import memory
 from fluxvla_core.training.batches import IDS, StepSampler, episode_shards, loader_source, to_device
 from fluxvla_core.training.ema import Ema
-from fluxvla_core.training.model import ForwardArguments
+from fluxvla_core.training.model import ForwardArguments, check_observations
 from fluxvla_core.training.parameters import trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
 from fluxvla_core.training.rng import take_seed
@@ -74,6 +74,7 @@ class Trainer:
         runner.saver = Saver(world, options.async_save, runner.optimizer)
         where = context.where(f"{context.section}.collator")
         runner.forward_arguments = ForwardArguments(runner.model, where)
+        check_observations(runner.model, dataset, context, "train_dataloader")
         if runner.left_out is None:
             runner.left_out = left_out(runner.model)
         if options.ema_decay is not None:
@@ -91,8 +92,10 @@ class Trainer:
         if runner.val_options is None:
             return None
         seed = runner.options.seed
+        held_out = validation_dataset(runner.context, dataset, seed)
+        check_observations(runner.model, held_out, runner.context, "val_dataloader")
         return Validation(
-            validation_dataset(runner.context, dataset, seed),
+            held_out,
             runner.collator,
             runner.val_options,
             runner.world,

@@ -270,6 +270,35 @@ class Run:
         assert np.abs(speed[-1]).max() < 1e-9
 
 
+class LookingBack(Looking):
+    """Notes the frames that each question shows."""
+
+    n_obs_steps = 3
+
+    def __init__(self):
+        super().__init__()
+        self.frames = []
+
+    def predict_action(self, observation):
+        shown = [*observation["history"], observation]
+        self.frames.append([int(each["images"]["front"][0, 0, 0]) for each in shown])
+        return super().predict_action(observation)
+
+
+def test_a_policy_of_several_observations_sees_what_was_between_two_questions(tmp_path, module):
+    run = Run(tmp_path, async_execution=False)
+    run.runner.policy = run.policy = LookingBack()
+    run.runner.run_setup()
+    run.runner.run()
+
+    assert run.runner.divided
+    asked = run.policy.frames
+    assert len(set(asked[0])) == 1
+    later = asked[-1]
+    assert len(asked) >= 3
+    assert asked[-2][-1] < later[0] < later[1] < later[2]
+
+
 def test_an_episode_with_pictures_of_the_process_that_commands(tmp_path, module):
     run = Run(tmp_path)
 

@@ -31,9 +31,10 @@ class DiffusionPolicy(VLA, nn.Module):
         state_dim, action_dim: joints; horizon: actions in a chunk, a multiple of
             ``2 ** len(down_dims)``.
         num_cameras: images per sample.
-        n_obs_steps: observations that a chunk is made from, the present one last. With more than
-            one, images and states have a dimension for them behind the batch's; neither datasets
-            nor runners of FluxVLA give a model observations of earlier moments.
+        n_obs_steps: observations that a chunk is made from, the present one last; the paper has 2.
+            Those before come from the dataset's ``n_obs_steps``, and in acting from the runner. A
+            chunk begins with the action of the first of them, so that the dataset's
+            ``past_actions`` is one less, and as many of its actions are not executed.
         backbone, backbone_norm, backbone_width: see ``ResNet``. ``batch`` is for checkpoints that
             were trained so; their statistics stay as they are.
         backbone_weights: a file with torchvision's weights of ``backbone``, that every encoder of a
@@ -92,6 +93,12 @@ class DiffusionPolicy(VLA, nn.Module):
                 f"halved {len(down_dims)} times by down_dims {tuple(down_dims)}",
                 next=f"horizon {-(-max(horizon, 1) // factor) * factor}, or fewer down_dims",
             )
+        if not 1 <= n_obs_steps <= horizon:
+            raise ConfigError(
+                f"DiffusionPolicy: n_obs_steps {n_obs_steps} is not between 1 and horizon "
+                f"{horizon}: a chunk begins at the first observation and goes beyond the last",
+                next="n_obs_steps=2, as in the paper",
+            )
         self.schedule = DiffusionSchedule(
             noise_scheduler_type,
             num_train_timesteps,
@@ -142,8 +149,9 @@ class DiffusionPolicy(VLA, nn.Module):
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``, a squared error.
 
         Args:
-            images: ``(B, 3N, H, W)``, states: ``(B, S)``, actions: ``(B, T, D)``, normalised.
-            action_masks: ``(B, T)``, 0 beyond the end of an episode.
+            images: ``(B, 3N, H, W)``, states: ``(B, S)``, actions: ``(B, T, D)``, normalised. With
+                several observations ``(B, n_obs_steps, 3N, H, W)``, ``(B, n_obs_steps, S)``.
+            action_masks: ``(B, T)``, 0 before the beginning and beyond the end of an episode.
             noise: ``(B, K, T, D)`` standard normal, timesteps: ``(B, K)`` int64, crops: ``(B, 2)``
                 in 0..1: K draws for each sample, of ``SampleDiffusionNoise``.
 
@@ -180,7 +188,9 @@ class DiffusionPolicy(VLA, nn.Module):
         noise: Tensor,
         step_noise: Tensor | None = None,
     ) -> Tensor:
-        """Observation and ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+        """Observations and ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
+
+        The first ``past_actions`` belong to the earlier observations.
 
         Args:
             step_noise: ``(B, steps - 1, T, D)``, what DDPM adds on its way; by default it follows
@@ -233,6 +243,11 @@ class DiffusionPolicy(VLA, nn.Module):
         """``(T, D)`` of a chunk, and of the noise that one starts from."""
         return self.horizon, self.action_dim
 
+    @property
+    def past_actions(self) -> int:
+        """A chunk begins with the action of the first observation."""
+        return self.n_obs_steps - 1
+
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         stages = [stage for encoder in self.rgb_encoders for stage in encoder.backbone.stages]
@@ -246,8 +261,7 @@ class DiffusionPolicy(VLA, nn.Module):
         if states.ndim != 3 or states.shape[1] != steps:
             raise ConfigError(
                 f"DiffusionPolicy: n_obs_steps is {steps}, states are {tuple(states.shape)}",
-                cause="datasets and runners give a model the present observation only",
-                next="n_obs_steps=1",
+                next="the dataset's n_obs_steps is the model's",
             )
         batch, _, planes = images.shape[:3]
         if planes != 3 * self.num_cameras:

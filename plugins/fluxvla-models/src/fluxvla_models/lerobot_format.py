@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from fluxvla_models.lerobot_statistics import read_normalization, tables
 from fluxvla_models.lerobot_write import write_act, write_diffusion
@@ -29,26 +29,24 @@ class _LeRobotFormat(CheckpointFormat):
 
     def notes(self, config: Mapping[str, Any]) -> Sequence[str]:
         """Notes that are printed when the checkpoint is imported."""
-        horizon, used = self.horizon(config), config.get("n_action_steps")
-        if not isinstance(used, int) or used >= horizon:
+        used = config.get("n_action_steps")
+        # A chunk begins with the actions of earlier observations.
+        answered = self.horizon(config) - int(config.get("n_obs_steps", 1)) + 1
+        if not isinstance(used, int) or used >= answered:
             return ()
-        return (f"LeRobot executes {used} of {horizon} actions: execute_horizon={used}",)
+        return (f"LeRobot executes {used} of {answered} actions: execute_horizon={used}",)
 
     @abstractmethod
     def horizon(self, config: Mapping[str, Any]) -> int:
         """Actions in a chunk."""
 
     def recognizes(self, folder: Path) -> bool:
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") == self.kind and "input_features" in config
+        return policy_type(folder) == self.kind
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        cameras, size = pictures(config, where)
+        cameras, size = image_features(config, where)
         joints, dim = width(config, "input_features", STATE, where), action_dim(config, where)
         model = self.model(config, where)
         normalization = read_normalization(folder, config)
@@ -122,7 +120,7 @@ class LeRobotACT(_LeRobotFormat):
 
 
 class LeRobotDiffusion(_LeRobotFormat):
-    """LeRobot's ``diffusion``; observations of earlier moments are refused."""
+    """LeRobot's ``diffusion``."""
 
     kind = "diffusion"
     model_types = ("DiffusionPolicy",)
@@ -138,21 +136,6 @@ class LeRobotDiffusion(_LeRobotFormat):
 
     def horizon(self, config: Mapping[str, Any]) -> int:
         return _count(config, "horizon")
-
-    def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
-        where = str(folder / CONFIG)
-        steps = read_json(folder / CONFIG, dict[str, Any], CheckpointError).get("n_obs_steps")
-        if steps != 1:
-            raise CheckpointError(
-                f"the policy acts on {steps} observations, the present and earlier ones "
-                "(n_obs_steps)",
-                where=where,
-                cause="a policy here is asked with the present observation alone, and so are "
-                "models trained",
-                next="train one with n_obs_steps=1, or let it act in LeRobot's own code: "
-                "policy = dict(type='LeRobotPolicy', path=FOLDER), of fluxvla-lerobot",
-            )
-        return super().read(folder, tokenizer)
 
     def model(self, config: Mapping[str, Any], where: str) -> dict[str, Any]:
         same = (
@@ -172,6 +155,11 @@ class LeRobotDiffusion(_LeRobotFormat):
             "beta_end",
             "prediction_type",
         )
+        steps, horizon = _value(config, "n_obs_steps", where), self.horizon(config)
+        if not isinstance(steps, int) or not 1 <= steps <= horizon:
+            raise CheckpointError(
+                f"n_obs_steps is {steps!r}, not a number from 1 to horizon {horizon}", where=where
+            )
         clip = _value(config, "clip_sample_range", where)
         return {
             "type": "DiffusionPolicy",
@@ -207,7 +195,7 @@ def features_of(
     return features
 
 
-def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
+def image_features(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
     """The policy's cameras, by feature, and the height and width of their images.
 
     Raises:
@@ -254,7 +242,7 @@ def _common(config: Mapping[str, Any], where: str) -> dict[str, Any]:
     return {
         "state_dim": width(config, "input_features", STATE, where),
         "action_dim": action_dim(config, where),
-        "num_cameras": len(pictures(config, where)[0]),
+        "num_cameras": len(image_features(config, where)[0]),
         "backbone": _value(config, "vision_backbone", where),
     }
 

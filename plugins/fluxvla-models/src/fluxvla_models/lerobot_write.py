@@ -115,13 +115,14 @@ def write_diffusion(checkpoint: ForeignCheckpoint, folder: Path) -> None:
         CheckpointError: LeRobot's diffusion policy or its processors cannot do what it does.
     """
     model = _settings(DiffusionPolicy, checkpoint.model)
-    _only(model, "LeRobot's diffusion policy", n_obs_steps=1, backbone_width=64)
+    _only(model, "LeRobot's diffusion policy", backbone_width=64)
     if model["backbone_norm"] == "frozen_batch":
         raise CheckpointError("backbone_norm is 'frozen_batch'; LeRobot's are 'batch' and 'group'")
     prepared = _preparation(checkpoint, model)
     clip = model["clip_sample_range"]
     config = {
-        "n_action_steps": model["horizon"],
+        "n_obs_steps": model["n_obs_steps"],
+        "n_action_steps": model["horizon"] - model["n_obs_steps"] + 1,
         **_crop(model["resize_shape"], model["crop_shape"]),
         "use_group_norm": model["backbone_norm"] == "group",
         "spatial_softmax_num_keypoints": model["keypoints"],

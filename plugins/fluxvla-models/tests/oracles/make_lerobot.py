@@ -165,6 +165,16 @@ def spread(values: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(flat[:: -(-len(flat) // SHOWN)])
 
 
+def seen(config: ACTConfig | DiffusionConfig, step: int | None = None) -> dict[str, torch.Tensor]:
+    """A raw observation, of a step of an episode if it is given."""
+    at = "raw" if step is None else f"raw {step}"
+    found = {"observation.state": torch.from_numpy(fill.normal(f"{at} state", (JOINTS,)))}
+    for name, feature in config.image_features.items():
+        pixels = fill.integers(f"{at} {name}", (*feature.shape[1:], 3), 256).astype(np.uint8)
+        found[name] = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
+    return found
+
+
 def made(case: str, config: ACTConfig | DiffusionConfig, folder: Path) -> None:
     act = isinstance(config, ACTConfig)
     policy = (ACTPolicy if act else DiffusionPolicy)(config)
@@ -220,11 +230,7 @@ def made(case: str, config: ACTConfig | DiffusionConfig, folder: Path) -> None:
             arrays["actions"] = policy.predict_action_chunk(asked, noise=eps).numpy()
 
         before, after = make_pre_post_processors(config, dataset_stats=statistics(config))
-        raw = {"observation.state": torch.from_numpy(fill.normal("raw state", (JOINTS,)))}
-        for name, feature in config.image_features.items():
-            pixels = fill.integers(f"raw {name}", (*feature.shape[1:], 3), 256).astype(np.uint8)
-            raw[name] = torch.from_numpy(pixels).permute(2, 0, 1).float() / 255
-        ready = before(raw)
+        ready = before(seen(config))
         if act:
             chunk = policy.predict_action_chunk(ready)
             arrays["commands"] = after(chunk)[0].numpy()
@@ -233,6 +239,14 @@ def made(case: str, config: ACTConfig | DiffusionConfig, folder: Path) -> None:
             ready = {k: v[:, None] if k in config.input_features else v for k, v in ready.items()}
             chunk = policy.predict_action_chunk(ready, noise=eps[:1])
             arrays["commands"] = after(chunk)[0].numpy()
+        else:
+            # An episode of two chunks, asked at every step as LeRobot's evaluation does.
+            used = config.n_action_steps
+            added, rows = iter([*noises(1), *noises(1)]), []
+            for step in range(2 * used):
+                chosen = policy.select_action(before(seen(config, step)), noise=eps[:1])
+                rows.append(after(chosen)[0].numpy())
+            arrays["commands"] = np.stack(rows)
 
     saved = folder / case
     saved.mkdir(parents=True, exist_ok=True)

@@ -89,7 +89,11 @@ def denoised(policy: DiffusionPolicy, ready: dict[str, torch.Tensor]) -> torch.T
     steps = fill.normal("step_noise", (3, config.num_inference_steps - 1, *shape[1:]))
     added = iter([torch.from_numpy(steps[:1, i].copy()) for i in range(steps.shape[1])])
     start = torch.from_numpy(fill.normal("noise", shape))[:1]
-    seen = {k: v[:, None] if k in config.input_features else v for k, v in ready.items()}
+    # As at an episode's beginning, whose first observation is repeated.
+    seen = {
+        k: torch.stack([v] * config.n_obs_steps, dim=1) if k in config.input_features else v
+        for k, v in ready.items()
+    }
     with mock.patch(
         "diffusers.schedulers.scheduling_ddpm.randn_tensor",
         side_effect=lambda *_, **__: next(added),

@@ -260,13 +260,32 @@ def join_planes(images: Sequence[Image]) -> Image:
     return out
 
 
+def stack_steps(steps: Sequence[Sample]) -> Sample:
+    """The samples of one moment's observations as one, the present one last.
+
+    ``images`` become ``(n, 3N, H, W)`` and ``states`` ``(n, D)``; a single one stays as it is.
+
+    Raises:
+        DataError: the cameras' sizes differ.
+    """
+    present = steps[-1]
+    if len(steps) == 1:
+        return present
+    stacked = {
+        key: np.stack([s[key] for s in steps]) for key in ("states", SCALE) if key in present
+    }
+    if "images" in present:
+        stacked["images"] = np.stack([stack_images(s["images"]) for s in steps])
+    return {**present, **stacked}
+
+
 def normalized(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Apply a batch's ``image_scale``: the batch without it, with normalised float32 images."""
     rest = dict(batch)
     scale = rest.pop(SCALE, None)
     if scale is not None:
         images = rest["images"].to(scale.dtype, copy=True)
-        rest["images"] = scale_(images, scale.unbind(1))
+        rest["images"] = scale_(images, scale.unbind(-2))
     return rest
 
 

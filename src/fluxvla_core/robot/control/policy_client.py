@@ -100,6 +100,10 @@ class PolicyClient(ABC):
         """
 
     @abstractmethod
+    def ticked(self) -> None:
+        """Called after each command of a policy's motion: time to look at the robot once more."""
+
+    @abstractmethod
     def accepted(self, answer: Answer) -> None:
         """Called with an answer whose chunk is going to be played."""
 

@@ -294,6 +294,9 @@ class RemoteEngine(Engine):
             case CommandSent(sent=sent, phase=phase):
                 self._process.server.phase, self._history.commanded = phase, sent.command
                 if phase is Phase.RUN:
+                    client = self._process.server.client
+                    if client is not None:
+                        client.ticked()
                     self._steps += 1
                     most = self._settings.max_steps
                     self._reporter.progress("commands", self._steps, most)

@@ -59,6 +59,9 @@ class RemotePolicyClient(PolicyClient):
         assert isinstance(answer, RemoteAnswer)
         self._link.send(Kind.ACCEPTED, number=answer.number)
 
+    def ticked(self) -> None:
+        """Nothing: the main process hears of the command, and looks."""
+
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, RemoteAnswer)
         self._link.send(Kind.REFUSED, number=answer.number)

@@ -1,0 +1,145 @@
+"""A policy that acts on several observations gets those of the actions before, on a robot too."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fluxvla_core.robot.control.joiners import METHODS
+from fluxvla_core.robot.control.safety import BadTiming
+from fluxvla_core.robot.observation_history import ObservationHistory
+
+STRIDE = 5  # control steps of the arm, at 50 Hz, for an action of the policy, at 10 Hz
+
+
+class Looking:
+    """Waver's way, as a policy of three observations; notes when each was made, and waits."""
+
+    n_obs_steps = 3
+
+    def __init__(self, waver: Any, slow_s: float = 0.0) -> None:
+        self.waver, self.slow_s = waver, slow_s
+        self.embodiment, self.horizon = waver.embodiment, waver.horizon
+        self.action_rate_hz = waver.action_rate_hz
+        self.seen: list[list[int]] = []
+        self.states: list[list[float]] = []
+        self.names: set[str] = set()
+
+    def reset(self, seed: int) -> None:
+        self.seen.clear()
+
+    def predict_action(self, observation: Any) -> np.ndarray:
+        time.sleep(self.slow_s)
+        shown = [*observation["history"], observation]
+        self.seen.append([int(each["images"]["front"][0, 0, 0]) for each in shown])
+        self.names |= {each["task_description"] for each in shown}
+        assert not any("history" in each for each in observation["history"])
+        return self.waver.predict_action(observation)
+
+
+@pytest.fixture
+def looking(bench):
+    bench.policy = Looking(bench.policy)
+    return bench.policy
+
+
+def queued(asked: list[int]) -> list[list[int]]:
+    """What a queue of three holds at control steps ``asked``, filled once an action."""
+    queue: deque[int] = deque(maxlen=3)
+    held = {}
+    for step in range(0, asked[-1] + 1, STRIDE):
+        while len(queue) < 2:
+            queue.append(step)
+        queue.append(step)
+        held[step] = list(queue)
+    return [held[step] for step in asked]
+
+
+@pytest.mark.parametrize("method", [method for method in METHODS if method != "rtc"])
+@pytest.mark.parametrize("horizon", [1, 2, 5])
+def test_in_lockstep_it_is_a_queue_that_is_filled_at_every_action(bench, looking, method, horizon):
+    bench.run(chunk_joining=method, execute_horizon=horizon, max_publish_step=60)
+
+    asked = [steps[-1] for steps in looking.seen]
+    assert len(asked) >= 60 / STRIDE / horizon - 1
+    assert all(step % STRIDE == 0 for step in asked)
+    assert looking.seen == queued(asked)
+    assert looking.names == {"wave at the camera"}
+
+
+@pytest.mark.parametrize("method", ["synchronous", "latest_only"])
+def test_an_arm_in_real_time_is_looked_at_between_two_questions(bench, make_arm, method):
+    bench.arm = make_arm(realtime=True)
+    bench.policy = looking = Looking(bench.policy)
+    bench.run(chunk_joining=method, execute_horizon=3, max_publish_step=60, control_process=False)
+
+    assert looking.seen[0] == [0, 0, 0]
+    assert len(looking.seen) >= 3
+    for *before, last in looking.seen[1:]:
+        for back, step in zip((2, 1), before, strict=True):
+            # 0.6 of an action away at most, and one command for what the machine adds
+            assert abs(step - max(last - back * STRIDE, 0)) <= 4
+
+
+def test_a_policy_that_thinks_all_the_time_waits_for_what_it_needs(bench, make_arm):
+    """Asked again as soon as it has answered, it has seen nothing of the time in between."""
+    bench.arm = make_arm(realtime=True)
+    bench.policy = looking = Looking(bench.policy, slow_s=0.3)
+    bench.run(chunk_joining="latest_only", max_publish_step=100, control_process=False)
+
+    assert len(looking.seen) >= 3
+    for *before, last in looking.seen[2:]:
+        assert [last - step for step in before] == pytest.approx([10, 5], abs=4)
+
+
+def test_a_robot_that_cannot_be_read_that_often_is_refused(bench, make_arm):
+    bench.arm = make_arm(realtime=True)
+    bench.arm.faults |= {"get_frame": lambda: time.sleep(0.4), "after": 5}
+    bench.policy = Looking(bench.policy)
+    with pytest.raises(BadTiming, match=r"acts on 3 observations 0.1 s apart \(n_obs_steps\), and"):
+        bench.run(max_publish_step=200, control_process=False)
+    assert "stop" in bench.arm.calls
+
+
+def reader_of(clock: Any, took: float = 0.0) -> Any:
+    def read() -> Any:
+        made = clock.time
+        clock.time += took
+        return SimpleNamespace(observation={"qpos": made})
+
+    return SimpleNamespace(read=read, sample=read)
+
+
+@pytest.mark.parametrize("took", [0.0, 0.03])
+def test_what_is_missing_is_waited_for(took):
+    clock = SimpleNamespace(time=1.0)
+    clock.now = lambda: clock.time
+    robot: Any = SimpleNamespace(clock=clock, lockstep=False, reading=SimpleNamespace(name="eye"))
+    policy: Any = SimpleNamespace(n_obs_steps=3, action_rate_hz=10.0)
+
+    def sleep(seconds: float) -> None:
+        clock.time += seconds
+
+    history = ObservationHistory(reader_of(clock, took), robot, policy, 0.5, sleep)
+
+    def times(seen: Any) -> list[float]:
+        return [each["qpos"] for each in (*seen["history"], seen)]
+
+    assert times(history.read()[1]) == [1.0, 1.0, 1.0]
+    clock.time = 5.0
+    assert times(history.read()[1]) == pytest.approx([5.0, 5.1, 5.2])
+    history.reset()
+    assert not history.due()
+    clock.time = 9.0
+    assert times(history.read()[1]) == [9.0, 9.0, 9.0]
+    clock.time = 9.1
+    assert history.due()
+    assert not history.due()
+    history.sample()
+    clock.time = 9.17
+    assert times(history.read()[1]) == pytest.approx([9.0, 9.1, 9.17])

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path
     from fluxvla_core.policies.loading import load_policy as load_policy
-    from fluxvla_core.training.foreign import embodiment_in as embodiment_in
+    from fluxvla_core.training.export import embodiment_in as embodiment_in
     from fluxvla_core.training.model import built_without_memory as built_without_memory
     from fluxvla_core.training.model import has_values as has_values
 
@@ -59,6 +59,6 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
         "fluxvla_core.policies.loading": ["load_policy"],
         "fluxvla_core.training.model": ["built_without_memory", "has_values"],
-        "fluxvla_core.training.foreign": ["embodiment_in"],
+        "fluxvla_core.training.export": ["embodiment_in"],
     },
 )

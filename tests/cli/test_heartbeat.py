@@ -21,12 +21,12 @@ def slowly(*args: object, **kwargs: object) -> None:
         (["export", "a", "b"], "fluxvla_core.training.export.export", "exporting a"),
         (
             ["export", "a", "b", "--format", "x"],
-            "fluxvla_core.training.foreign.export_foreign",
+            "fluxvla_core.training.export.export_foreign",
             "exporting a",
         ),
         (
             ["import-checkpoint", "a", "b"],
-            "fluxvla_core.training.foreign.import_checkpoint",
+            "fluxvla_core.training.export.import_checkpoint",
             "importing a",
         ),
         (

@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from fluxvla_core.cli import scaffold
+from fluxvla_core.cli import new_plugin
 from fluxvla_core.cli.main import main
-from fluxvla_core.cli.scaffold import KINDS
+from fluxvla_core.cli.new_plugin import KINDS
 
 from .conftest import Fluxvla
 
@@ -380,18 +380,18 @@ def test_a_place_that_cannot_be_written_is_told(fluxvla: Fluxvla, tmp_path: Path
 
 
 def test_names_follow_from_one_another() -> None:
-    plugin = scaffold.plugin_of("My_own.Arm")
-    assert plugin == scaffold.Plugin(
+    plugin = new_plugin.plugin_of("My_own.Arm")
+    assert plugin == new_plugin.Plugin(
         "fluxvla-my-own-arm", "fluxvla_my_own_arm", "my_own_arm", "MyOwnArm"
     )
     part = KINDS["operator"].parts[0]
-    assert scaffold.class_name(plugin, part) == "MyOwnArmOperator"
-    assert scaffold.class_name(scaffold.plugin_of("arm-operator"), part) == "ArmOperator"
+    assert new_plugin.class_name(plugin, part) == "MyOwnArmOperator"
+    assert new_plugin.class_name(new_plugin.plugin_of("arm-operator"), part) == "ArmOperator"
 
 
 def test_every_template_is_of_a_kind() -> None:
-    kinds = (*KINDS.values(), scaffold.ROS2)
-    used = {scaffold.COMMON, *(folder for kind in kinds for folder in kind.folders)}
-    assert {path.name for path in scaffold.TEMPLATES.iterdir()} == used
-    files = [path for path in scaffold.TEMPLATES.rglob("*") if path.is_file()]
-    assert {path.suffix for path in files} == {scaffold.SUFFIX}
+    kinds = (*KINDS.values(), new_plugin.ROS2)
+    used = {new_plugin.COMMON, *(folder for kind in kinds for folder in kind.folders)}
+    assert {path.name for path in new_plugin.TEMPLATES.iterdir()} == used
+    files = [path for path in new_plugin.TEMPLATES.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {new_plugin.SUFFIX}

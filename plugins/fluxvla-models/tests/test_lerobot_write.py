@@ -21,7 +21,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.contracts.policy import with_history
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint, load_policy
-from fluxvla_core.training.foreign import import_checkpoint
+from fluxvla_core.training.export import import_checkpoint
 
 from .test_lerobot_parity import (
     ACTING,

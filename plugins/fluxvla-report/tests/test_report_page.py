@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 from fluxvla_report import build_report
 from fluxvla_report.command import Report
-from fluxvla_report.curves import curves, running_mean
 from fluxvla_report.facts import Training, Video
-from fluxvla_report.page import VideoSources
+from fluxvla_report.page import VideoSources, curves, running_mean
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import RunFailed, UsageError

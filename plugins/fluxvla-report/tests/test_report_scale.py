@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from fluxvla_report.scale import Axis, axis, duration, round_step, short
+from fluxvla_report.svg import Axis, axis, duration, round_step, short
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -122,7 +122,7 @@ def _policy(args: argparse.Namespace) -> tuple[LocalPolicy, Mapping[str, Any]]:
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.policies.benchmark import untrained_policy
     from fluxvla_core.policies.loading import load_policy
-    from fluxvla_core.training.foreign import embodiment_in
+    from fluxvla_core.training.export import embodiment_in
 
     if args.threads is not None:
         torch.set_num_threads(args.threads)

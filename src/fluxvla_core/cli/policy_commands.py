@@ -61,7 +61,7 @@ class Export:
 
     def run(self, args: argparse.Namespace) -> int:
         if args.format is not None:
-            from fluxvla_core.training.foreign import export_foreign
+            from fluxvla_core.training.export import export_foreign
 
             with heartbeat(f"exporting {args.checkpoint}"):
                 path = export_foreign(args.checkpoint, args.folder, args.format)
@@ -119,7 +119,7 @@ class ImportCheckpoint:
         )
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.training.foreign import embodiment_in, import_checkpoint
+        from fluxvla_core.training.export import embodiment_in, import_checkpoint
 
         rate_hz, cameras = _rate(args.rate), _cameras(args.camera)
         embodiment = None if args.embodiment is None else embodiment_in(args.embodiment)

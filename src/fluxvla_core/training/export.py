@@ -1,29 +1,54 @@
-"""A checkpoint without what only training needs: for evaluation, servers and robots.
+"""Export a checkpoint for inference, and convert checkpoints of other projects and back.
 
-The result is a checkpoint folder in every respect (manifest, hashes, ``load_policy``), with all
-weights in one plain safetensors file: the averaged ones in their place if they were kept, adapters
-merged, frozen parts that the model would bring itself included. Optimizer, random states and the
-config's ``runner`` are left out, so that no training plugin is needed where it is used.
+An exported one lacks what only training needs, for evaluation, servers and robots. It is a
+checkpoint folder in every respect (manifest, hashes, ``load_policy``), with all weights in one
+plain safetensors file: the averaged ones in their place if they were kept, adapters merged, frozen
+parts that the model would bring itself included. Optimizer, random states and the config's
+``runner`` are left out, so that no training plugin is needed where it is used.
+
+Other projects' checkpoints are converted by the formats that plugins have.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
 
 from fluxvla_core.atomic import prepare_folder, refuse_content
+from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.tensors import TensorFile
-from fluxvla_core.checkpoints.writer import CheckpointWriter
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.checkpoints.shards import Stored
+from fluxvla_core.checkpoints.tensors import TensorFile, check_names
+from fluxvla_core.checkpoints.writer import PARTIAL, CheckpointWriter
+from fluxvla_core.config.load import FORMAT
+from fluxvla_core.config.snapshot import environment
+from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import VLA
+from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
+from fluxvla_core.data.lerobot import camera_name
+from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
+from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
+from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.training.formats import formats, read_foreign, unknown_format
+from fluxvla_core.training.lora import CONFIG as ADAPTER
 from fluxvla_core.training.weights import (
     LeftOut,
     load_for_inference,
     model_of,
     weights_by_name,
 )
-from fluxvla_core.untrusted import read_bytes
+from fluxvla_core.untrusted import read_bytes, read_json
 
 TRAINING_ONLY = ("runner", "val_dataloader")
 """Sections of the config that are not exported."""
@@ -87,3 +112,240 @@ def _verified(checkpoint: Checkpoint, name: str) -> bytes:
     if hashlib.sha256(content).hexdigest() != checkpoint.manifest.files[name].sha256:
         raise CheckpointError(f"{name} was changed since it was saved", where=str(checkpoint.path))
     return content
+
+
+_ORIGIN = "import-checkpoint"
+_PRESENT_ONLY = {"n_obs_steps": 1, "past_actions": 0}
+
+
+def import_checkpoint(
+    source: str | Path,
+    target: str | Path,
+    format: str | None = None,
+    tokenizer: str | None = None,
+    embodiment: EmbodimentSpec | None = None,
+    action_rate_hz: float | None = None,
+    cameras: Mapping[str, str | None] | None = None,
+    robot: str | None = None,
+) -> tuple[Path, ForeignCheckpoint]:
+    """Make a checkpoint of this project from another project's; weights keep their dtype.
+
+    Args:
+        source: its folder, or ``hf:<id>``.
+        target: the folder to make; does not exist yet, or is empty.
+        format: the project that it is of; by default that is found out.
+        tokenizer: ``model_path`` of the tokenizer, for formats that bring none.
+        embodiment: the robot, where the checkpoint describes none; without one the result can be
+            trained on, and drives nothing.
+        action_rate_hz: actions a second, where the checkpoint does not say it.
+        cameras: the checkpoint's camera -> the robot's; None: the robot does not have it.
+        robot: which one, where the checkpoint knows several, by its name there.
+
+    Raises:
+        CheckpointError: no installed format reads it; or it is damaged, or not as its format says.
+        SpecMismatch: the robot is not the one that it was trained for.
+        UsageError: there is something at ``target``, or an option does not fit.
+    """
+    target = Path(target)
+    refuse_content(target)
+    named = {theirs: ours for theirs, ours in (cameras or {}).items() if ours is not None}
+    absent = tuple(theirs for theirs in cameras or {} if theirs not in named)
+    found = read_foreign(source, format, tokenizer, robot, absent)
+    found = replace(
+        found,
+        img_keys=_renamed_cameras(found.img_keys, named),
+        action_rate_hz=action_rate_hz or found.action_rate_hz,
+        embodiment=embodiment or found.embodiment,
+    )
+    _check_robot(found, str(source))
+    with torch.device("meta"):  # its weights may be larger than memory
+        model = build_vla_from_cfg(found.model)
+    tensors = _as_model_has_them(model, found, str(source))
+    prepare_folder(target.parent, "folder to import to", "name another place for the import")
+    if target.exists():
+        target.rmdir()
+    with CheckpointWriter(
+        target.parent,
+        0,
+        0,
+        final=target,
+        what="the import",
+        go_on="import again, or name a folder on another disk; the source is as it was",
+    ) as writer:
+        TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
+        writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
+        writer.write_json(ckpt.CONFIG, _config(found, VLA.adapt(model)))
+        writer.write_json(ckpt.ENVIRONMENT, environment())
+        writer.write_json(ckpt.STATISTICS, dict(found.statistics))
+        rate = found.action_rate_hz
+        writer.write_json(ckpt.POLICY, {"action_rate_hz": rate, "horizon": found.horizon})
+        if found.embodiment is not None:
+            writer.write_json(ckpt.EMBODIMENT, found.embodiment.to_dict())
+        pipeline = Pipeline(found.transforms)
+        writer.write_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
+        writer.add_folder(ckpt.PROCESSORS)
+        return writer.commit(), found
+
+
+def export_foreign(source: str | Path, target: str | Path, format: str) -> Path:
+    """Write the checkpoint ``source`` into the new folder ``target`` as another project saves one.
+
+    Raises:
+        CheckpointError: ``source`` is missing or damaged, or that format cannot hold it.
+        UsageError: no installed format of that name writes its model, or ``target`` is there.
+    """
+    target = Path(target)
+    refuse_content(target)
+    checkpoint = Checkpoint.open(source)
+    checkpoint.verify()
+    found = _as_foreign(checkpoint)
+    kind = str(found.model.get("type")).rpartition(":")[2]
+    known = formats()[0]
+    able = [f for f in known if f.name == format and implements(f, CheckpointFormat, "write")]
+    writers = [f for f in able if kind in f.model_types]
+    if not able:
+        raise UsageError(unknown_format(format, known))
+    if not writers:
+        types = ", ".join(sorted({t for f in able for t in f.model_types}))
+        raise UsageError(f"format {format!r} holds no {kind}; it holds {types}")
+    prepare_folder(target.parent, "folder to export to", "name another place for the export")
+    aside = target.with_name(target.name + PARTIAL)
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir()
+    try:
+        writers[0].write(found, aside)
+        if target.exists():
+            target.rmdir()
+        os.replace(aside, target)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    return target
+
+
+def _as_model_has_them(model: nn.Module, found: ForeignCheckpoint, where: str) -> dict[str, Tensor]:
+    """Every tensor of the model, of the sizes that it has; tied ones are one object."""
+    wanted = weights_by_name(model)
+    check_names(found.tensors, wanted, "the weights", where)
+    owner: dict[int, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
+    for name, own in wanted.items():
+        if id(own) not in owner:
+            stored = found.tensors[name]
+            owner[id(own)] = stored[_all(stored)] if isinstance(stored, Stored) else stored
+        tensors[name] = owner[id(own)]
+    return tensors
+
+
+def _all(stored: Stored) -> tuple[slice, ...]:
+    return tuple(slice(0, length) for length in stored.shape)
+
+
+def _as_foreign(checkpoint: Checkpoint) -> ForeignCheckpoint:
+    """One of this project's checkpoints, with the weights that act: averaged, adapters merged."""
+    config = checkpoint.config()
+    if "model" not in config:
+        raise CheckpointError(
+            "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
+        )
+    dataset = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
+    facts = checkpoint.policy()
+    if checkpoint.has(ckpt.EMA) or checkpoint.has(ADAPTER):
+        model = model_of(checkpoint)
+        load_for_inference(model, checkpoint)
+        tensors: dict[str, Tensor] = {n: t.detach() for n, t in weights_by_name(model).items()}
+    else:  # as they were saved, in the dtype that they have there
+        tensors = checkpoint.tensors(ckpt.MODEL)
+    return ForeignCheckpoint(
+        model=redirected([config["model"]], checkpoint.processors)[0],
+        tensors=tensors,
+        img_keys=tuple(camera_name(key) for key in dataset.get("img_keys", ())),
+        transforms=redirected(dataset.get("transforms", ()), checkpoint.processors),
+        statistics=checkpoint.statistics(),
+        horizon=int(facts.get("horizon") or 0),
+        action_rate_hz=facts.get("action_rate_hz"),
+        embodiment=checkpoint.embodiment(),
+    )
+
+
+def _config(found: ForeignCheckpoint, model: VLA) -> dict[str, Any]:
+    history = {"n_obs_steps": model.n_obs_steps, "past_actions": model.past_actions}
+    tree = {
+        "model": dict(found.model),
+        "train_dataloader": {
+            "dataset": {
+                "type": "ParquetDataset",
+                "img_keys": list(found.img_keys),
+                "action_window_size": found.horizon,
+                **(history if history != _PRESENT_ONLY else {}),
+                "transforms": [dict(table) for table in found.transforms],
+            }
+        },
+    }
+    return {"format": FORMAT, "config": tree, "origins": dict.fromkeys(tree, _ORIGIN)}
+
+
+def _renamed_cameras(keys: Sequence[str], cameras: Mapping[str, str]) -> tuple[str, ...]:
+    have = [camera_name(key) for key in keys]
+    unknown = [name for name in cameras if name not in have]
+    if unknown:
+        raise UsageError(
+            f"--camera {unknown[0]}=…: the checkpoint has no such camera; it has {', '.join(have)}"
+        )
+    names = tuple(cameras.get(name, name) for name in have)
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        of = [theirs for theirs, ours in zip(have, names, strict=True) if ours == twice]
+        raise UsageError(
+            f"{' and '.join(of)} would both be the robot's camera {twice!r}",
+            next="--camera THEIRS=OURS with a name of its own for each, or THEIRS=none",
+        )
+    return names
+
+
+def _check_robot(found: ForeignCheckpoint, where: str) -> None:
+    robot = found.embodiment
+    if robot is None:
+        return
+    lacking = [key for key in found.img_keys if camera_name(key) not in robot.camera_names]
+    if lacking:
+        raise SpecMismatch(
+            f"the checkpoint looks at {', '.join(found.img_keys)}; {robot.name} has "
+            f"{', '.join(robot.camera_names)}",
+            where=where,
+            next=f"--camera {lacking[0]}=NAME, with the robot's name for it, or "
+            f"{lacking[0]}=none if it has no such camera",
+        )
+    for key, joints in (("action", robot.dim), ("proprio", robot.state_dim)):
+        width = _width(found.statistics.get("private", {}).get(key, {}))
+        if width is not None and width != joints:
+            raise SpecMismatch(
+                f"the checkpoint's statistics of {key!r} have {width} dimensions, "
+                f"{robot.name} has {joints}",
+                where=where,
+                cause="it was trained for another robot",
+            )
+
+
+def _width(statistics: Mapping[str, Any]) -> int | None:
+    rows = [values for values in statistics.values() if isinstance(values, list | tuple)]
+    return len(rows[0]) if rows else None
+
+
+def embodiment_in(place: str | Path) -> EmbodimentSpec:
+    """The robot that a file describes, or a checkpoint or dataset with such a file.
+
+    Raises:
+        UsageError: there is none, or it is not an embodiment.
+    """
+    path = Path(place)
+    files = [path] if path.is_file() else [path / ckpt.EMBODIMENT, path / DATASET_EMBODIMENT]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        raise UsageError(
+            f"there is no {ckpt.EMBODIMENT} at {path}",
+            next="name the file, or a dataset or checkpoint that was made on the robot",
+        )
+    try:
+        return EmbodimentSpec.from_dict(read_json(file, dict[str, Any], UsageError))
+    except SpecMismatch as error:
+        raise UsageError(error.what, where=str(file)) from error

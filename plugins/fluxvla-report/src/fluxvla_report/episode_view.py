@@ -10,8 +10,19 @@ from typing import Any
 
 from fluxvla_report.facts import Episode, JointTrace, Moment, Span, Video
 from fluxvla_report.files import number, text_rows
-from fluxvla_report.scale import Axis, axis, short
-from fluxvla_report.svg import ROW_HEIGHT, Mark, Row, Series, Shade, line_chart, percent, rows_chart
+from fluxvla_report.svg import (
+    ROW_HEIGHT,
+    Axis,
+    Mark,
+    Row,
+    Series,
+    Shade,
+    axis,
+    line_chart,
+    percent,
+    rows_chart,
+    short,
+)
 
 # Joint plots show at least this much (rad, m or gripper units).
 LEAST_RANGE = 0.1

@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
 
 # Before torch and MuJoCo are imported: sums must not depend on a number of threads where results
 # of several processes are compared bit for bit, and there is no display to render to. A machine
@@ -31,19 +32,50 @@ from pathlib import Path  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from tools import skipped  # noqa: E402
+from tools import skipped, stages  # noqa: E402
 
 # How long an example takes says something about the machine, not about the project.
 settings.register_profile("fluxvla", deadline=None)
 settings.load_profile("fluxvla")
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> Generator[None]:
     """What opens a ROS network waits for other processes, which a busy machine keeps waiting."""
     for item in items:
         if "ros_domain" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.network)
+    yield  # others leave tests out here, by their marks
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        begin_with_what_takes_long(items)
+
+
+def begin_with_what_takes_long(items: list[pytest.Item]) -> None:
+    """Sort the tests, so that several processes end at about the same time.
+
+    What is marked 'early' comes first, then files as xdist sorts them: those of many tests first.
+    """
+    units = [unit_of(item) for item in items]
+    count = Counter(units)
+    first = {
+        unit for unit, item in zip(units, items, strict=True) if item.get_closest_marker("early")
+    }
+    order = {unit: (unit not in first, -count[unit], place) for place, unit in enumerate(count)}
+    items.sort(key=lambda item: order[unit_of(item)])
+
+
+def unit_of(item: pytest.Item) -> str:
+    """What one process runs as a whole: a group of ``xdist_group``, else the test's file."""
+    group = item.get_closest_marker("xdist_group")
+    return str(group.args[0]) if group is not None and group.args else str(item.path)
+
+
+def pytest_deselected(items: Sequence[pytest.Item]) -> None:
+    """Where the tests of the other stages are: these need not look through all files again."""
+    place = os.environ.get(stages.FILE)
+    if place and os.environ.get("PYTEST_XDIST_WORKER") == "gw0":  # each process sees them all
+        marks = [(item.path, {mark.name for mark in item.iter_markers()}) for item in items]
+        stages.note(Path(place), [(file, names) for file, names in marks if "slow" not in names])
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -38,6 +38,7 @@ from tools import (  # noqa: E402
     shell,
     skew_check,
     skipped,
+    stages,
     torch_build,
     unseen,
     wheels,
@@ -61,14 +62,25 @@ OPTIONAL = {
 # Counts as released until there is a tag v...: the state at which the contracts were 1.0.
 RELEASED = "bac7408"
 SKIPPED = ROOT / ".nox" / "skipped.jsonl"
-PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "2")
+LATER = ROOT / ".nox" / "later.json"
+# One more than the cores of a small machine: a test that starts processes waits for them.
+PROCESSES = os.environ.get("FLUXVLA_TEST_PROCESSES", "3")
 SLOWEST = "--durations=15"
 # Files share what is slow to make; what waits for networks is in few files, of unequal length.
-FILES, TURNS = ["--dist", "loadfile", SLOWEST], ["--dist", "loadgroup", SLOWEST]
+# The order is that of the root conftest: what is marked 'early', then the files of many tests.
+ORDER = ["--no-loadscope-reorder", SLOWEST]
+FILES, TURNS = ["--dist", "loadfile", *ORDER], ["--dist", "loadgroup", *ORDER]
 STAGES = {
     "pytest": ["-n", PROCESSES, *FILES, "-m", "not network and not realtime and not slow"],
     "pytest, over networks": ["-n", "3", *TURNS, "-m", "network and not realtime and not slow"],
-    "pytest, in real time": [SLOWEST, "-m", "realtime and not slow"],
+    "pytest, in real time": ["-n", "2", *FILES, "-m", "realtime and not alone and not slow"],
+    "pytest, alone": [SLOWEST, "-m", "alone and not slow"],
+}
+# Stage -> the mark of its tests, by which the first stage notes the files they are in.
+MARKS = {
+    "pytest, over networks": "network",
+    "pytest, in real time": "realtime",
+    "pytest, alone": "alone",
 }
 
 
@@ -82,7 +94,8 @@ def tests(session: nox.Session) -> None:
             step("pytest", lambda: dev.run("pytest", *session.posargs, env=rendering.VARIABLES))
             return
         ensure_needs(session)
-        SKIPPED.unlink(missing_ok=True)
+        for noted in (SKIPPED, LATER):
+            noted.unlink(missing_ok=True)
         # pip and mypy use one core each.
         with shell.alongside([sys.executable, "-m", "nox", "-s", "environments"], cwd=ROOT):
             dev = dev_env(session)
@@ -90,9 +103,8 @@ def tests(session: nox.Session) -> None:
             step("types", lambda: dev.run("mypy", cwd=ROOT))
             step("layers", lambda: dev.run("lint-imports", cwd=ROOT))
         make_renderable(session, dev)
-        variables = {**rendering.VARIABLES, skipped.FILE: str(SKIPPED)}
-        for name, words in STAGES.items():
-            step(name, lambda w=words: dev.run("pytest", *w, cwd=ROOT, env=variables))
+        for name in STAGES:
+            step(name, lambda n=name: run_stage(dev, n))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
         step("what the demo names", lambda: check_next_steps(session))
         step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))
@@ -234,6 +246,17 @@ def bench(session: nox.Session) -> None:
         for name in named:
             words = ["-m", f"benchmarks.{name}"]
             step(name, lambda w=words: dev.run("python", *w, cwd=ROOT, env=rendering.VARIABLES))
+
+
+def run_stage(dev: envs.Env, name: str) -> None:
+    """One call of pytest; the first stage notes which files the others have to look through."""
+    variables = {**rendering.VARIABLES, skipped.FILE: str(SKIPPED)}
+    files: list[str] = []
+    if name in MARKS:
+        files = stages.files(LATER, MARKS[name])
+    else:
+        variables[stages.FILE] = str(LATER)
+    dev.run("pytest", *STAGES[name], *files, cwd=ROOT, env=variables)
 
 
 def check_lint(dev: envs.Env) -> None:

@@ -26,7 +26,7 @@ _TINY_PI05 = {
 _TINY_EAGLE = {
     "image_size": 28, "patch_size": 14, "vision_dim": 16, "vision_layers": 2, "vision_heads": 2,
     "vision_mlp": 24, "text_dim": 16, "text_layers": 2, "text_heads": 2, "text_kv_heads": 1,
-    "text_head_dim": 8, "text_mlp": 24, "vocabulary": 100, "picture_token": 90,
+    "text_head_dim": 8, "text_mlp": 24, "vocabulary": 100, "image_token": 90,
 }  # fmt: skip
 _TINY_HEAD = {
     "embodiments": 2, "layers": 4, "heads": 2, "head_dim": 8, "hidden_dim": 12,
@@ -84,7 +84,7 @@ class Case:
             side, words = backbone.image_size, GR00T_PROMPT
             text = torch.randint(0, 90, (1, words), generator=drawn)
             count = self.cameras * backbone.tokens_per_image
-            image = torch.full((1, count), backbone.picture_token)
+            image = torch.full((1, count), backbone.image_token)
             tokens = torch.cat([text[:, :8], image, text[:, 8:]], dim=1)
             found["states"] = torch.randn(1, model.vla_head.state_dim, generator=drawn)
         seen = torch.ones(tokens.shape, dtype=torch.bool)

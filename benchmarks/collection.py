@@ -43,8 +43,8 @@ from fluxvla_core.evaluation.episodes import EpisodeKey
 from fluxvla_core.evaluation.eval_log import open_eval_log
 from fluxvla_core.evaluation.policies import PolicySource
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
-from fluxvla_core.evaluation.worker import EpisodeWorker, Settings, run_in_pool
+from fluxvla_core.evaluation.rollout import EpisodeWorker, RolloutSettings, Settings, run_episode
+from fluxvla_core.evaluation.runner import run_in_pool
 from fluxvla_core.spec.embodiment import Camera
 
 CAMERA = Camera("top", 144, 192)

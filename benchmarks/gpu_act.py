@@ -33,12 +33,17 @@ from benchmarks import _results
 from benchmarks._gpu_act_models import CASES, SIZES, Case
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.policies import benchmark
-from fluxvla_core.policies.clocks import clock_of
-from fluxvla_core.policies.execution import EXECUTIONS, Eager, Execution, execution_of
+from fluxvla_core.policies.execution import (
+    EXECUTIONS,
+    Eager,
+    Execution,
+    Transfer,
+    clock_of,
+    execution_of,
+)
 from fluxvla_core.policies.inference_weights import QUANTIZATIONS, check_quantization, ready
 from fluxvla_core.policies.local import PRECISIONS
 from fluxvla_core.policies.roofline import BANDWIDTHS_GB_S, Work, work_of
-from fluxvla_core.policies.transfer import Transfer
 from fluxvla_core.training.flops import PEAK_TFLOPS
 
 PUBLISHED = (

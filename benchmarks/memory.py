@@ -46,6 +46,7 @@ class Family:
 
 FAMILIES = {
     "PI0": Family("pi0_libero", "pi0_libero_lora", "pi0_libero_frozen", 3_501_372_176),
+    "PI0-FAST": Family("pi0_fast_libero", "pi0_fast_libero_lora", "pi0_fast_libero_frozen"),
     "PI0.5": Family("pi05_aloha", "pi05_aloha_lora", "pi05_aloha_frozen", 3_616_757_520),
     "GR00T N1.5": Family(
         "gr00t_n15_aloha_full", "gr00t_n15_aloha_lora", "gr00t_n15_aloha", 2_724_163_520

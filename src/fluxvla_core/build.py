@@ -62,6 +62,10 @@ class RunContext:
         place = self.origins.get(key)
         return f"{place}: {key}" if place else None
 
+    def error(self, key: str, problem: str) -> ConfigError:
+        """The error about ``key`` of the section that runs, whose value has ``problem``."""
+        return ConfigError(f"{key} {problem}", where=self.where(f"{self.section}.{key}"))
+
 
 def build_from_cfg(
     cfg: Any, registry: Registry, context: RunContext | None = None, **defaults: Any

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.frame import STATE as STATE
     from fluxvla_core.contracts.frame import Frame as Frame
     from fluxvla_core.contracts.frame import Observation as Observation
-    from fluxvla_core.contracts.part import Part as Part
     from fluxvla_core.contracts.policy import Continuation as Continuation
     from fluxvla_core.contracts.policy import Policy as Policy
     from fluxvla_core.contracts.robot import ActionFilter as ActionFilter
     from fluxvla_core.contracts.robot import Clock as Clock
     from fluxvla_core.contracts.robot import Operator as Operator
+    from fluxvla_core.contracts.robot import Part as Part
     from fluxvla_core.robot.control.clock import MonotonicClock as MonotonicClock
     from fluxvla_core.robot.control.clock import SimulatedClock as SimulatedClock
     from fluxvla_core.robot.control.filters import LowPass as LowPass
@@ -44,9 +44,8 @@ __getattr__, __dir__, __all__ = _lazy.attach(
     {
         "fluxvla_core.build": ["RunContext"],
         "fluxvla_core.contracts.frame": ["Frame", "Observation", "STATE"],
-        "fluxvla_core.contracts.part": ["Part"],
         "fluxvla_core.contracts.policy": ["Continuation", "Policy"],
-        "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator"],
+        "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator", "Part"],
         "fluxvla_core.robot.control.clock": ["MonotonicClock", "SimulatedClock"],
         "fluxvla_core.robot.control.filters": ["LowPass", "SnapGripper", "WorkspaceBox"],
         "fluxvla_core.robot.control.safety": ["SafetySettings"],

@@ -92,6 +92,7 @@ def outcomes(rendered: Rendered) -> dict[str, list[ElementTree.Element]]:
     return found
 
 
+@pytest.mark.early
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_own_tests_pass_and_run_it(outcomes, kind: str) -> None:
     cases = outcomes[kind]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fluxvla_core.config.difference import differences
+from fluxvla_core.cli.config_commands import differences
 from fluxvla_core.config.tree import Config
 
 

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import ast
-import dataclasses
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from fluxvla_core.build import parameters
-from fluxvla_core.config.docstrings import argument_texts
-from fluxvla_core.config.runtime_signature import inspect_signature, misfits
 from fluxvla_core.config.signature import Signature, read_signature
-from fluxvla_core.config.source import Opaque, Source, find, linearize
+from fluxvla_core.config.source import argument_texts
 from fluxvla_core.plugins._metadata import Plugin
 from tests.conftest import Install
 
@@ -340,88 +334,6 @@ class More(Base):
         assert "steps" not in required(signature(name))
 
 
-def test_re_exports_aliases_stars_and_lazy_tables(install: Install) -> None:
-    install(
-        "fluxvla-toy",
-        files={
-            "toy_pkg/__init__.py": (
-                "from __future__ import annotations\n"
-                "import importlib\n"
-                "from .sub import *\n"
-                "from . import deep as d\n"
-                "_EXPORTS: dict[str, str] = {'Lazy': 'toy_pkg.lazy', 'Other': 'toy_pkg.lazy'}\n"
-                "Alias = d.Deep\n"
-                "if True:\n    from .tried import Tried\n"
-                "else:\n    Tried = None\n"
-                "try:\n    from .tried import Again\nexcept ImportError:\n    class Again: pass\n"
-            ),
-            "toy_pkg/sub.py": "class Star:\n    class Inner: ...\n",
-            "toy_pkg/deep.py": "class Deep: ...\n",
-            "toy_pkg/lazy.py": "class Lazy: ...\n",
-            "toy_pkg/tried.py": "class Tried: ...\nclass Again: ...\n",
-            "toy_user.py": (
-                "import toy_pkg\nimport toy_pkg.deep\nfrom toy_pkg import deep\n"
-                "class A(toy_pkg.Lazy): ...\n"
-                "class B(toy_pkg.deep.Deep): ...\n"
-                "class C(deep.Deep): ...\n"
-            ),
-        },
-    )
-    for dotted in ("Star", "Star.Inner", "Lazy", "Alias", "Tried", "Again", "sub.Star"):
-        found = find("toy_pkg", dotted)
-        assert isinstance(found, Source), dotted
-    assert find("toy_pkg", "Gone") == Opaque("toy_pkg.Gone")
-    assert find("toy_pkg", "Star.Gone") == Opaque("toy_pkg.Star.Gone")
-    assert find("toy_gone", "X") == Opaque("toy_gone.X")
-    for name in "ABC":
-        cls = find("toy_user", name)
-        assert isinstance(cls, Source)
-        assert len(linearize(cls)) == 2
-        assert isinstance(linearize(cls)[1], Source)
-    assert not [m for m in sys.modules if m.startswith("toy_")]
-
-
-def test_the_cores_own_lazy_names_are_followed() -> None:
-    found = find("fluxvla_core", "RunContext")
-    assert isinstance(found, Source)
-    assert found.place.startswith("fluxvla_core/build.py:")
-
-
-def test_relative_imports_over_several_levels(install: Install) -> None:
-    install(
-        "fluxvla-toy",
-        files={
-            "toy_deep/__init__.py": "from ._base import Base\n",
-            "toy_deep/_base.py": "class Base: ...\n",
-            "toy_deep/a/__init__.py": "",
-            "toy_deep/a/b.py": (
-                "from ... import toy_none\nfrom .. import _base\nfrom .._base import Base\n"
-                "class A(Base): ...\nclass B(_base.Base): ...\n"
-            ),
-        },
-    )
-    for name in "AB":
-        cls = find("toy_deep.a.b", name)
-        assert isinstance(cls, Source)
-        assert isinstance(linearize(cls)[1], Source)
-
-
-def test_bases_that_python_would_refuse_are_still_listed(install: Install) -> None:
-    text = "class A: ...\nclass B(A): ...\nclass C(A, B): ...\n"
-    install("fluxvla-toy", files={"toy_bad.py": text})
-    cls = find("toy_bad", "C")
-    assert isinstance(cls, Source)
-    assert len(linearize(cls)) == 3
-
-
-def test_circular_imports_end(install: Install) -> None:
-    install(
-        "fluxvla-toy",
-        files={"toy_a.py": "from toy_b import X\n", "toy_b.py": "from toy_a import X\n"},
-    )
-    assert isinstance(find("toy_a", "X"), Opaque)
-
-
 def test_a_source_that_does_not_parse_gives_no_signature(read: Read) -> None:
     assert read("R", a="class R(:\n") is None
 
@@ -431,142 +343,6 @@ def test_a_function_behind_an_entry_point(read: Read) -> None:
     assert required(signature) == {"a": True, "b": False}
     assert signature is not None
     assert (signature.open, signature.doc) == (True, "Makes.")
-
-
-def test_linearize_matches_python(install: Install) -> None:
-    text = (
-        "class O: ...\nclass A(O): ...\nclass B(O): ...\nclass C(O): ...\n"
-        "class D(A, B): ...\nclass E(B, C): ...\nclass F(D, E): ...\n"
-    )
-    install("fluxvla-toy", files={"toy_mro.py": text})
-    space: dict[str, Any] = {}
-    exec(text, space)
-    cls = find("toy_mro", "F")
-    assert isinstance(cls, Source)
-    names = [s.node.name for s in linearize(cls) if isinstance(s, Source)]
-    assert names == [c.__name__ for c in space["F"].__mro__[:-1]]
-
-
-# -- classes that this process registered ----------------------------------------------------
-
-
-class Base:
-    """Registered here.
-
-    Second line.
-    """
-
-    api = "1.0"
-
-    def __init__(self, cfg: dict[str, int], rate: int = 30) -> None: ...
-
-    def run_setup(self, n_train_examples: int) -> None: ...
-
-
-class Sub(Base):
-    def __init__(self, mine: int, *args: Any, **kwargs: Any) -> None:
-        kwargs.setdefault("cfg", {})
-        super().__init__(*args, **kwargs)
-
-
-class Swallows(Base):
-    def __init__(self, mine: int, **kwargs: Any) -> None:
-        self.kwargs = kwargs
-
-
-@dataclasses.dataclass
-class Data:
-    a: int
-    b: int = 2
-
-
-def test_a_class_of_this_process() -> None:
-    signature = inspect_signature(Sub)
-    assert required(signature) == {"mine": True, "cfg": False, "rate": False}
-    assert not signature.open
-    assert signature.trains
-    assert signature.api == "1.0"
-    assert signature.place.endswith(f"test_signature.py:{_line('class Sub')}")
-    assert inspect_signature(Base).doc == "Registered here."
-    assert inspect_signature(Swallows).open
-    assert required(inspect_signature(Data)) == {"a": True, "b": False}
-    assert required(inspect_signature(type("Made", (), {}))) == {}
-    assert inspect_signature(type("Made", (ValueError,), {})).open
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Settings.
-
-    Args:
-        rate: commands a second
-    """
-
-    must: int
-    rate: float = 30.0
-    steps: int = 1
-    """Steps."""
-    left_out: int = dataclasses.field(default=0, init=False)
-
-
-class Configured:
-    Options = Settings
-
-    def __init__(self, cfg: dict[str, int], **options: Any) -> None:
-        self.options = self.Options(**options)
-
-
-def test_options_of_a_class_of_this_process() -> None:
-    signature = inspect_signature(Configured)
-    assert required(signature) == {"cfg": True, "must": True, "rate": False, "steps": False}
-    assert not signature.open
-    assert signature.meanings == {"rate": "commands a second", "steps": "Steps."}
-    assert signature.parameters[2].text == ": 'float' = 30.0"
-    place = signature.parameters[1].place
-    assert place.endswith(f"test_signature.py:{_line('class Settings') - 1}")
-    assert parameters(Configured) == {"cfg", "must", "rate", "steps"}
-    assert [str(one) for one in misfits(Configured, {"rate": "fast"})] == [
-        "'rate' must be float, got 'fast'"
-    ]
-
-
-def test_a_class_without_readable_source_is_taken_to_pass_its_kwargs_on() -> None:
-    space: dict[str, Any] = {"Base": Base}
-    exec(
-        "class Cell(Base):\n  def __init__(self, x, **kw): super().__init__(**kw)\n",
-        space,
-    )
-    signature = inspect_signature(space["Cell"])
-    assert required(signature) == {"x": True, "cfg": True, "rate": False}
-
-
-def test_a_torch_module_takes_no_parameters_of_its_own() -> None:
-    nn = pytest.importorskip("torch.nn")
-
-    class Net(nn.Module):  # type: ignore[misc, name-defined]
-        def __init__(self, width: int, **kwargs: Any) -> None:
-            super().__init__(**kwargs)
-
-    signature = inspect_signature(Net)
-    assert required(signature) == {"width": True}
-    assert not signature.open
-
-
-def test_what_is_no_class() -> None:
-    with pytest.raises(TypeError, match="is not a class"):
-        inspect_signature(print)
-
-
-def _line(text: str) -> int:
-    import inspect
-
-    source = inspect.getsource(sys.modules[__name__])
-    node = next(
-        n
-        for n in ast.parse(source).body
-        if isinstance(n, ast.ClassDef) and text == f"class {n.name}"
-    )
-    return node.lineno
 
 
 # -- docstrings -----------------------------------------------------------------------------

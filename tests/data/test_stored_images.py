@@ -15,7 +15,7 @@ from fluxvla_core.data.convert import convert
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.data.video_decode import picture_size
+from fluxvla_core.data.video_decode import image_size
 from fluxvla_core.errors import DataError
 
 from .version2 import write_v2
@@ -142,6 +142,6 @@ def test_a_picture_is_looked_at_before_it_is_decoded(old):
 @pytest.mark.parametrize("size", [(1, 1), (480, 640), (33, 7)])
 def test_the_size_in_a_pictures_head(suffix, size):
     data = cv2.imencode(suffix, np.zeros((*size, 3), np.uint8))[1].tobytes()
-    assert picture_size(data) == size
-    assert picture_size(data[:10]) is None
-    assert picture_size(b"BM" + data) is None
+    assert image_size(data) == size
+    assert image_size(data[:10]) is None
+    assert image_size(b"BM" + data) is None

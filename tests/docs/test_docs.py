@@ -282,6 +282,7 @@ def of_page(page: Path) -> Any:
     return pytest.param(page, id=name, marks=[pytest.mark.realtime] if name in REAL_TIME else [])
 
 
+@pytest.mark.early
 @pytest.mark.parametrize("page", [of_page(page) for page in PAGES])
 def test_what_a_page_tells_to_do_works(page: Path, env: Env, tmp_path: Path) -> None:
     (tmp_path / "configs").symlink_to(ROOT / "configs")

@@ -12,7 +12,7 @@ from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import CheckpointError, RunFailed
 from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.policies import chosen_checkpoint
-from fluxvla_core.evaluation.success_rates import problems, summarise
+from fluxvla_core.evaluation.results_file import problems, summarise
 
 
 def record(task, seed, success, group="policy", **more):

@@ -240,9 +240,9 @@ class TestRealRobot:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"section": "other"}, "section: 'other' is not in the config"),
-        ({"tasks": ["9"]}, "tasks: '9' is not a task of inference; there are 1, 2"),
-        ({"episodes": 0}, "episodes: must be at least 1, got 0"),
+        ({"section": "other"}, "section 'other' is not in the config"),
+        ({"tasks": ["9"]}, "tasks '9' is not a task of inference; there are 1, 2"),
+        ({"episodes": 0}, "episodes must be at least 1, got 0"),
     ],
 )
 def test_impossible_values_are_refused(section, arguments, message):

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fluxvla_core.errors import UsageError
+from fluxvla_core.evaluation.results_file import all_of
 from fluxvla_core.evaluation.success_rates import (
     Comparison,
-    all_of,
     mcnemar_test,
     one_sided_p,
     smallest_difference,

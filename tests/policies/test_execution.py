@@ -15,8 +15,13 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 torch = pytest.importorskip("torch")
 
 from fluxvla_core.policies import cuda_graph, execution  # noqa: E402
-from fluxvla_core.policies.clocks import HostClock  # noqa: E402
-from fluxvla_core.policies.execution import KEPT_SHAPES, Eager, Graphed  # noqa: E402
+from fluxvla_core.policies.execution import (  # noqa: E402
+    KEPT_SHAPES,
+    Eager,
+    Graphed,
+    HostClock,
+    Transfer,
+)
 from fluxvla_core.policies.inference_weights import (  # noqa: E402
     check_quantization,
     quantize,
@@ -24,7 +29,6 @@ from fluxvla_core.policies.inference_weights import (  # noqa: E402
     store_in_bf16,
 )
 from fluxvla_core.policies.local import LocalPolicy  # noqa: E402
-from fluxvla_core.policies.transfer import Transfer  # noqa: E402
 from fluxvla_core.testing.capture import Refused, Tape, check_capturable  # noqa: E402
 
 ARM = EmbodimentSpec("arm", tuple(Joint(n, "rad", -1.0, 1.0, 1.0, 1.0) for n in "ab"), (), 50.0)

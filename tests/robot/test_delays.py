@@ -63,6 +63,7 @@ def test_a_call_that_raises_is_over():
     assert delays.under_way() == []
 
 
+@pytest.mark.alone  # a second busy process may take its core
 @pytest.mark.realtime
 def test_a_process_that_is_busy_does_not_stand_still():
     """Neither gives up the interpreter; the second computes."""

@@ -133,7 +133,8 @@ def test_what_a_command_is_made_of_gives_the_interpreter_to_nobody(counted):
 
 
 @on_linux
-@pytest.mark.realtime  # another process on every core may stand in its place
+@pytest.mark.alone  # another process on every core may stand in its place
+@pytest.mark.realtime
 def test_from_waking_to_its_command_a_thread_keeps_the_interpreter_and_then_shares_it(counted):
     with realtime.real_time():
         rate, kept, given = Rate(50, lead_s=0.004), [], []

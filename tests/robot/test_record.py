@@ -20,6 +20,7 @@ from fluxvla_core.robot.recording.recorded import (
     finish_recording,
     open_recording,
 )
+from fluxvla_core.robot.robot import Robot
 
 rosbags = pytest.importorskip("rosbags")
 
@@ -223,11 +224,11 @@ def test_what_is_not_written_in_time_is_dropped_and_said(bench, monkeypatch):
 
 
 class Tapped:
-    """``pictures_after`` of a robot whose camera sends 30 images a second and keeps 2."""
+    """``images_after`` of a robot whose camera sends 30 images a second and keeps 2."""
 
-    def __init__(self, arm, hz=30.0):
+    def __init__(self, arm, hz=30.0, name="images_after"):
         self.arm, self.hz, self.began = arm, hz, time.monotonic()
-        arm.pictures_after = self
+        setattr(arm, name, self)
 
     def __call__(self, camera, after):
         arrived = int((time.monotonic() - self.began) * self.hz)
@@ -249,6 +250,15 @@ def test_pictures_that_nobody_looked_at_are_recorded_where_the_robot_keeps_them(
     assert found.native
     assert arrived + lost > 20
     assert (found.path / "front.mp4").stat().st_size > 0
+
+
+def test_the_old_name_of_images_after_still_works(make_arm):
+    arm = make_arm()
+    robot = Robot(arm)
+    assert robot.images_after is None
+    tapped = Tapped(arm, name="pictures_after")
+    with pytest.warns(DeprecationWarning, match="pictures_after is deprecated, name it images_a"):
+        assert robot.images_after is tapped
 
 
 KILLED = """

@@ -85,17 +85,17 @@ def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
 
 
 def test_pictures_that_nobody_looked_at_can_be_had(arm):
-    images, received = arm.pictures_after("cam", 0.0)
+    images, received = arm.images_after("cam", 0.0)
     assert received >= len(images) > 0
     assert all(image.shape == (48, 64, 3) for _, image in images)
     newest = max(stamp for stamp, _ in images)
 
-    wait_for(lambda: arm.pictures_after("cam", newest)[0])
+    wait_for(lambda: arm.images_after("cam", newest)[0])
 
-    assert min(stamp for stamp, _ in arm.pictures_after("cam", newest)[0]) > newest
-    assert arm.pictures_after("elsewhere", 0.0) == ([], 0)
+    assert min(stamp for stamp, _ in arm.images_after("cam", newest)[0]) > newest
+    assert arm.images_after("elsewhere", 0.0) == ([], 0)
     arm.close()
-    assert arm.pictures_after("cam", 0.0) == ([], 0)
+    assert arm.images_after("cam", 0.0) == ([], 0)
 
 
 def test_the_state_alone(arm):

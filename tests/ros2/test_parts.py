@@ -84,11 +84,11 @@ def test_both_parts_read_the_same_state_and_one_of_them_the_pictures(both):
     np.testing.assert_array_equal(frame.state, [0.1, 0.2, 0.5])
     assert frame.images["cam"].shape == (48, 64, 3)
     np.testing.assert_array_equal(control.get_state(), cameras.get_state())
-    assert cameras.pictures_after("cam", 0.0)[1] > 0
+    assert cameras.images_after("cam", 0.0)[1] > 0
     assert time.monotonic() - control.state_stamp() < 2.0
 
     assert set(control._connection.streams) == {"arm"}
-    assert control.pictures_after("cam", 0.0) == ([], 0)
+    assert control.images_after("cam", 0.0) == ([], 0)
     assert control.newest("cam") is None
     assert control.history("cam") == ()
     with pytest.raises(NotReady, match="this part of arm has no cameras, and so no frames"):
@@ -233,3 +233,13 @@ def test_deprecated_names_still_work():
     assert checked == [TARGET]
     with pytest.warns(DeprecationWarning, match="use history"):
         assert arm.kept("cam") == arm.history("cam") == ()
+    with pytest.warns(DeprecationWarning, match="use images_after"):
+        assert arm.pictures_after("cam", 0.0) == arm.images_after("cam", 0.0) == ([], 0)
+    with pytest.warns(DeprecationWarning, match="Older.pictures_after is deprecated, name it ima"):
+
+        class Older(Wired):
+            def pictures_after(self, camera, after):
+                return super().pictures_after(camera, after)[0], 3
+
+    with pytest.warns(DeprecationWarning, match="use images_after"):
+        assert Older().images_after("cam", 0.0) == ([], 3)

@@ -285,6 +285,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return found
 
 
+@pytest.mark.early
 @pytest.mark.parametrize("specimen", RIGHT)
 def test_a_right_operator_passes_every_check(outcomes, specimen):
     right = {k: v for k, v in outcomes.items() if k.startswith(f"{specimen}::")}

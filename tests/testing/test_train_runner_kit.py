@@ -119,6 +119,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Outcomes:
     return outcomes(tmp_path_factory.mktemp("strategies"), GOOD, FAULTS, "runners")
 
 
+@pytest.mark.early
 def test_a_right_strategy_passes_every_check(found: Outcomes) -> None:
     check_good(found, checks=7)
 

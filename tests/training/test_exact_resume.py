@@ -117,6 +117,7 @@ def test_any_two_settings_meet() -> None:
             assert {(getattr(case, a), getattr(case, b)) for case in PAIRS} == wanted, (a, b)
 
 
+@pytest.mark.early
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_killed_run_goes_on_bit_for_bit(tmp_path: Path, base: Path, ranks: int) -> None:
     """Killed in the middle of a step after a save; the dying of one resumes the one before."""

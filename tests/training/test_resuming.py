@@ -35,11 +35,11 @@ def test_a_fresh_run_refuses_anothers_work_dir(tmp_path):
     with pytest.raises(UsageError) as caught:
         make(tmp_path).run_setup(37)
     assert str(caught.value) == (
-        f"{tmp_path} already has checkpoints, up to step-000000006\n"
-        "  next: resume from there with --resume auto, or name another --work-dir"
+        f"{tmp_path}: the work dir already holds checkpoints, up to step 6\n"
+        "  next: resume from there: --resume auto; or use another folder: --work-dir DIR"
     )
     run(tmp_path / "other")
-    with pytest.raises(UsageError, match="already has checkpoints"):
+    with pytest.raises(UsageError, match="already holds checkpoints"):
         make(tmp_path, resume=str(tmp_path / "other/checkpoints/step-000000006")).run_setup(37)
 
 

@@ -44,7 +44,7 @@ TINY_TEXT = {
     "text_head_dim": 8,
     "text_mlp": 24,
     "vocabulary": 100,
-    "picture_token": PLACE,
+    "image_token": PLACE,
 }
 TINY_N15 = {
     "type": "GR00T",

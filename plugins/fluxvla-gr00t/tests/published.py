@@ -25,11 +25,11 @@ MARKS = {
 PLACE = 260
 SIDES = {"n1.5": 28, "n1.7": 64}
 BACKBONES = {
-    "n1.5": {**TINY_N15["vlm_backbone"], "vocabulary": 261, "picture_token": PLACE},
+    "n1.5": {**TINY_N15["vlm_backbone"], "vocabulary": 261, "image_token": PLACE},
     "n1.7": {
         **TINY_N17["vlm_backbone"],
         "vocabulary": 261,
-        "picture_token": PLACE,
+        "image_token": PLACE,
         "patch_size": 16,
     },
 }

@@ -166,7 +166,9 @@ def test_each_format_knows_its_own_folders(version, tmp_path, monkeypatch):
     assert [v for v, kind in FORMATS.items() if kind().recognizes(source)] == [version]
     config = json.loads((source / "config.json").read_text())
     assert not LeRobotGR00TFormat().recognizes(source)
-    (source / "config.json").write_text(json.dumps({**config, "type": "groot"}))
+    (source / "config.json").write_text(
+        json.dumps({**config, "type": "groot", "input_features": {}})
+    )
     assert not any(kind().recognizes(source) for kind in FORMATS.values())
     assert LeRobotGR00TFormat().recognizes(source)
     (source / "config.json").write_text("[")

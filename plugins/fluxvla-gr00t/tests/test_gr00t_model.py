@@ -8,6 +8,7 @@ import torch
 from fluxvla_gr00t.action_head import GR00TActionHead
 from fluxvla_gr00t.eagle import EagleBackbone
 from fluxvla_gr00t.gr00t import GR00T
+from fluxvla_gr00t.image_tokens import image_token_of
 from fluxvla_gr00t.qwen3_vl import Qwen3VLBackbone
 
 from fluxvla_core.errors import ConfigError
@@ -157,7 +158,7 @@ def test_sizes_of_the_head_that_do_not_fit_are_refused(change, words):
     ("kind", "settings", "words"),
     [
         (EagleBackbone, {"image_size": 30, "patch_size": 14}, "30 is not a multiple of patch_size"),
-        (EagleBackbone, {"vocabulary": 100}, "picture_token 151669 is not one of the 100 tokens"),
+        (EagleBackbone, {"vocabulary": 100}, "image_token 151669 is not one of the 100 tokens"),
         (Qwen3VLBackbone, {"deepstack": [30]}, r"deepstack \[30\] names layers that 24 vision"),
         (Qwen3VLBackbone, {"text_head_dim": 64}, "add up to 64, half of text_head_dim 64"),
     ],
@@ -193,3 +194,10 @@ def test_batches_that_do_not_fit_are_refused(version, change, words):
 def test_an_embodiment_without_layers_is_refused():
     with pytest.raises(ConfigError, match=r"embodiment_id 3 is not in 0\.\.2"):
         GR00T(TINY_N17["vlm_backbone"], TINY_N17["vla_head"], embodiment_id=3)
+
+
+def test_the_old_name_of_image_token_still_works():
+    with pytest.warns(DeprecationWarning, match="picture_token is deprecated, use image_token"):
+        token = image_token_of("EagleBackbone", 7, 9, 10)
+    assert token == 9
+    assert image_token_of("EagleBackbone", 7, None, 10) == 7

@@ -17,7 +17,7 @@ from fluxvla_mujoco import divergence
 from fluxvla_core import build_environment_from_cfg, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
 from fluxvla_core.evaluation import RolloutSettings, run_episode
-from fluxvla_core.evaluation.success_rates import summarise
+from fluxvla_core.evaluation.results_file import summarise
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing import EnvironmentConformance
 
@@ -63,7 +63,7 @@ def reacher(**arguments):
 class TestGymnasiumEnvironment(EnvironmentConformance):
     entry_point = "GymnasiumEnvironment"
     arguments = {key: value for key, value in reacher().items() if key != "type"}  # noqa: RUF012
-    picture = None
+    image_size = None
 
 
 @needs_mujoco

@@ -20,6 +20,7 @@ TESTS = Path(__file__).parent / "with_lerobot"
 ROOT = TESTS.parents[3]
 
 
+@pytest.mark.early
 def test_with_lerobot_044():
     try:
         lerobot = oracle_env.prepare_044(print)

@@ -192,6 +192,7 @@ def runner(work_dir, listener, **arguments):
     return made
 
 
+@pytest.mark.early
 def test_everything_is_evaluated_and_written_down(tmp_path, libero, listener):
     settings = {"instruction_swap": True, "num_trials_per_task": 1, "workers": 1}
     found = runner(tmp_path, listener, record_videos=1, video_fps=1, **settings).run()

@@ -30,6 +30,7 @@ def shake(scene, seed, steps=12):
     return scene.state_hash()
 
 
+@pytest.mark.early
 def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
     """After other episodes in the scene, and from a model that LIBERO built again."""
     init = init_states("libero_object", 2)
@@ -63,7 +64,7 @@ def test_an_episode_goes_as_in_liberos_own_environment(stock, scene):
     scene.model.vis.quality.shadowsize = env.sim.model.vis.quality.shadowsize
     scene.model.vis.quality.offsamples = env.sim.model.vis.quality.offsamples
     for camera in ("agentview", "robot0_eye_in_hand"):
-        image = drawing.picture(scene._shown, camera, 64, 64)[:, ::-1]
+        image = drawing.image(scene._shown, camera, 64, 64)[:, ::-1]
         turned = seen[f"{camera}_image"][::-1, ::-1]
         assert image.std() > 10, "something is seen"
         np.testing.assert_array_equal(image, turned)

@@ -18,7 +18,7 @@ from fluxvla_models.pretrained_backbones import (
 )
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.part_weights import put_parts
+from fluxvla_core.training.weights import put_parts
 
 TEXT = {
     "hidden_size": 16,

@@ -37,8 +37,8 @@ def draw(made, render, size=(48, 64)):
     data = mujoco.MjData(made)
     mujoco.mj_forward(made, data)
     drawn = Drawing(made, render)
-    image = drawn.picture(data, "side", *size)
-    again = drawn.picture(data, "side", *size)
+    image = drawn.image(data, "side", *size)
+    again = drawn.image(data, "side", *size)
     np.testing.assert_array_equal(image, again)
     assert image.base is None, "an image of its own"
     drawn.close()
@@ -136,6 +136,6 @@ def test_what_draws_has_a_name():
     mujoco.mj_forward(model, data)
     drawing.use_egl()
     drawn = drawing.Drawing(model, "cheap")
-    drawn.picture(data, "c", 16, 16)
+    drawn.image(data, "c", 16, 16)
     drawn.close()
     assert drawing.drawn_by().count(": ") == 1

@@ -14,7 +14,7 @@ from fluxvla_core import Camera, EmbodimentSpec, Joint
 from tests.oracles import fill
 
 from .oracles import pi_inputs
-from .tiny import model_of
+from .tiny import fast_model, model_of
 
 GOLDEN = Path(__file__).parent / "golden"
 ROBOT = EmbodimentSpec(
@@ -45,6 +45,27 @@ def lerobot_folder(folder, family):
     for file in GOLDEN.glob(f"{before}*"):
         shutil.copyfile(file, folder / file.name.removeprefix(before))
     save_file(weights(family, LEROBOT), folder / "model.safetensors", {"format": "pt"})
+    return folder
+
+
+def fast_folder(folder):
+    """What LeRobot's ``save_pretrained`` wrote of a tiny PI0-FAST, weights by their names, and the
+    tokenizer of actions."""
+    folder.mkdir(parents=True)
+    before = "lerobot061_pi0_fast-"
+    for file in GOLDEN.glob(f"{before}*"):
+        shutil.copyfile(file, folder / file.name.removeprefix(before))
+    state = {LEROBOT.theirs(name): t for name, t in fast_model().state_dict().items()}
+    save_file(state, folder / "model.safetensors", {"format": "pt"})
+    shutil.copytree(GOLDEN / "fast", folder / "fast-action-tokenizer")
+    return folder
+
+
+def fast_words_folder(folder):
+    """The text tokenizer of PI0-FAST, as a published one is stored."""
+    folder.mkdir(parents=True)
+    pi_inputs.fast_text_tokenizer().save(str(folder / "tokenizer.json"))
+    (folder / "tokenizer_config.json").write_text(json.dumps({"pad_token": "<pad>"}))
     return folder
 
 

@@ -20,8 +20,7 @@ from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.models import load_policy
 
 from .oracles import pi_inputs as tiny
-from .published_folders import GOLDEN, observation, robot_file
-from .tiny import fast_model
+from .published_folders import GOLDEN, fast_folder, fast_words_folder, observation, robot_file
 
 CHANGES = [
     (lambda c: c.update(use_peft=True), "use_peft is True; False is read"),
@@ -36,25 +35,12 @@ CHANGES = [
 
 @pytest.fixture
 def source(tmp_path):
-    """What LeRobot's ``save_pretrained`` wrote, weights by their names, both tokenizers."""
-    folder = tmp_path / "theirs"
-    folder.mkdir()
-    before = "lerobot061_pi0_fast-"
-    for file in GOLDEN.glob(f"{before}*"):
-        shutil.copyfile(file, folder / file.name.removeprefix(before))
-    state = {LEROBOT.theirs(name): t for name, t in fast_model().state_dict().items()}
-    save_file(state, folder / "model.safetensors", {"format": "pt"})
-    shutil.copytree(GOLDEN / "fast", folder / "fast-action-tokenizer")
-    return folder
+    return fast_folder(tmp_path / "theirs")
 
 
 @pytest.fixture
 def words(tmp_path):
-    folder = tmp_path / "words"
-    folder.mkdir()
-    tiny.fast_text_tokenizer().save(str(folder / "tokenizer.json"))
-    (folder / "tokenizer_config.json").write_text(json.dumps({"pad_token": "<pad>"}))
-    return folder
+    return fast_words_folder(tmp_path / "words")
 
 
 @pytest.fixture(scope="module")

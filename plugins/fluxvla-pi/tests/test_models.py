@@ -345,7 +345,7 @@ def test_chunks_and_pictures_of_another_size_are_refused(model):
         model(**{**batch, "actions": batch["actions"][:, :4]})
     with pytest.raises(ConfigError, match=r"noise of \(5, 7\)"):
         model.predict_action(**{**acting_batch(), "noise": torch.zeros(BATCH, 5, 7)})
-    with pytest.raises(DataError, match="pictures of 3 x 28 x 28, got 3 x 28 x 27"):
+    with pytest.raises(DataError, match="images of 3 x 28 x 28, got 3 x 28 x 27"):
         model.predict_action(**{**acting_batch(), "images": batch["images"][..., 1:]})
 
 

@@ -1,4 +1,5 @@
-"""PI0-FAST against what LeRobot 0.6.1 computed (``oracles/make_lerobot061_fast.py``)."""
+"""PI0-FAST against LeRobot 0.6.1 (``oracles/make_lerobot061_fast.py``), and against openpi's own
+model in JAX (``oracles/make_openpi_fast.py``)."""
 
 from __future__ import annotations
 
@@ -72,3 +73,44 @@ def test_what_answers_mean(model, golden):
         assert (torch.from_numpy(found) - expected).abs().max() < 1e-5, name
     assert golden["actions.too_short"].abs().max() > 1
     assert not golden["actions.beyond_the_last"].any()
+
+
+# -- openpi's JAX code: every camera is there, and the head is the embedding ----------------------
+
+
+@pytest.fixture(scope="module")
+def openpi():
+    return load_file(GOLDEN / "openpi_pi0_fast.safetensors")
+
+
+@pytest.fixture(scope="module")
+def tied():
+    return fast_model(tied_head=True)
+
+
+def whole(batch):
+    return {**batch, "img_masks": torch.ones_like(batch["img_masks"])}
+
+
+def test_losses_and_gradients_of_openpi(tied, openpi):
+    from fluxvla_pi.names import LEROBOT
+
+    tied.zero_grad()
+    found = tied(**whole(fast_batch()))
+    assert relative(found["sample_losses"], openpi["losses"]) < 1e-5
+    found["loss"].backward()
+    named = {LEROBOT.theirs(name): p for name, p in tied.named_parameters()}
+    compared = [name for name in openpi if name.startswith("gradient.")]
+    assert len(compared) > 13
+    for name in compared:
+        found = named[name.removeprefix("gradient.")].grad
+        assert relative(found, openpi[name]) < 1e-5, name
+
+
+def test_answers_of_openpi(tied, openpi):
+    with torch.no_grad():
+        found = tied.answer(**whole(seen()))
+    expected = openpi["answers.training"]
+    assert torch.equal(found, expected[:, : found.shape[1]])
+    # Its sampling has the first token where training has it, and the others one place further.
+    assert torch.equal(found[:, 0], openpi["answers.sampled"][:, 0])

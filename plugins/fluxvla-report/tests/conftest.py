@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluxvla_core.evaluation.success_rates import rate, summarise
+from fluxvla_core.evaluation.results_file import summarise
+from fluxvla_core.evaluation.success_rates import rate
 from fluxvla_core.robot.recording.video import VideoWriter
 
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in ("waist", "elbow", "gripper")]

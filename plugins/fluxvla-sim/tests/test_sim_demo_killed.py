@@ -45,6 +45,7 @@ def finish(process: subprocess.Popen[str]) -> str:
     return said
 
 
+@pytest.mark.early
 def test_the_demo_killed_and_resumed_equals_one_that_was_not(tmp_path):
     dataset, whole, cut = (tmp_path / name for name in ("dataset", "whole", "cut"))
     assert main(["collect", "aloha", "--out", str(dataset), "--episodes", "2"]) == 0

@@ -37,7 +37,7 @@ from fluxvla_core.checkpoints.manifest import (
     step_of,
 )
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
-from fluxvla_core.errors import CheckpointError
+from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.untrusted import parse_json, read_bytes
 
 if TYPE_CHECKING:
@@ -254,6 +254,21 @@ def folders(place: str | Path) -> list[Path]:
         return []
     found = sorted((step, path) for path in root.iterdir() if (step := step_of(path)) is not None)
     return [path for _, path in found if _has_manifest(path)]
+
+
+def refuse_existing(work_dir: Path) -> None:
+    """Keep a training that resumes from elsewhere, or from nothing, from another's checkpoints.
+
+    Raises:
+        UsageError: there are checkpoints in the work dir, with both ways on.
+    """
+    found = folders(work_dir)
+    if found:
+        raise UsageError(
+            f"the work dir already holds checkpoints, up to step {step_of(found[-1])}",
+            where=str(work_dir),
+            next="resume from there: --resume auto; or use another folder: --work-dir DIR",
+        )
 
 
 def latest(place: str | Path) -> Checkpoint | None:

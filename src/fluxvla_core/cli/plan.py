@@ -162,18 +162,11 @@ def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
     Raises:
         UsageError: there are checkpoints, with both ways on.
     """
-    from fluxvla_core.checkpoints.checkpoint import folders
-    from fluxvla_core.checkpoints.manifest import step_of
+    from fluxvla_core.checkpoints.checkpoint import refuse_existing
 
     if resume == "auto":
         return
     here = os.path.realpath(work_dir)
     if resume is not None and Path(os.path.realpath(resume)).is_relative_to(here):
         return
-    found = folders(work_dir)
-    if found:
-        raise UsageError(
-            f"the work dir already holds checkpoints, up to step {step_of(found[-1])}",
-            where=str(work_dir),
-            next="resume from there: --resume auto; or use another folder: --work-dir DIR",
-        )
+    refuse_existing(work_dir)

@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fluxvla_core.config.docstrings import argument_texts, field_texts
 from fluxvla_core.config.parameters import OPTIONS, Parameter
 from fluxvla_core.config.signature import (
     Forward,
@@ -22,6 +21,7 @@ from fluxvla_core.config.signature import (
     combine,
     with_kwargs,
 )
+from fluxvla_core.config.source import argument_texts, field_texts
 from fluxvla_core.contracts.check import is_train_runner
 
 _SCALARS = (bool, int, float, str)

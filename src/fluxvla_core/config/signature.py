@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fluxvla_core.config.docstrings import argument_texts, field_texts
 from fluxvla_core.config.parameters import (
     Parameter,
     dataclass_fields,
@@ -25,8 +24,10 @@ from fluxvla_core.config.source import (
     Module,
     Opaque,
     Source,
+    argument_texts,
     assigned,
     dotted_name,
+    field_texts,
     find,
     linearize,
 )

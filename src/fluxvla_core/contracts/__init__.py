@@ -3,10 +3,9 @@
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
-from fluxvla_core.contracts.part import Part
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.reporter import Reporter, SilentReporter
-from fluxvla_core.contracts.robot import ActionFilter, Clock, Operator
+from fluxvla_core.contracts.robot import ActionFilter, Clock, Operator, Part
 from fluxvla_core.contracts.runner import Command, Hook, Runner, TrainRunner
 from fluxvla_core.contracts.training import (
     VLA,

@@ -1,13 +1,15 @@
-"""The contracts of what runs at the rate of the robot: operator, action filter, clock."""
+"""The contracts of what runs at a robot's rate: operator and its parts, action filter, clock."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.errors import NotReady, Rejected
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -149,7 +151,7 @@ class Operator(Contract):
         """JSON values that go into the results of an evaluation, after each episode."""
         return {}
 
-    def pictures_after(
+    def images_after(
         self, camera: str, after: float
     ) -> tuple[Sequence[tuple[float, npt.NDArray[np.uint8]]], int]:
         """Images that are kept for recordings, which then have all that arrive.
@@ -168,7 +170,7 @@ class Operator(Contract):
         None (the default) says that this robot cannot be divided. Called before ``connect``, on an
         operator that is not used itself afterwards: it may return itself. Another process has the
         other part, at the same time. ``embodiment`` is still that of the whole robot, with its
-        cameras. Everything is asked but ``pictures_after`` and ``get_frame``, which raises
+        cameras. Everything is asked but ``images_after`` and ``get_frame``, which raises
         NotReady; ``get_state`` and ``state_stamp`` are needed then.
         """
         return None
@@ -178,7 +180,7 @@ class Operator(Contract):
 
         None (the default) says that this robot cannot be divided. Called as ``without_cameras`` is.
         The part has a connection of its own, and is asked ``connect``, ``get_frame``,
-        ``get_state``, ``state_stamp``, ``pictures_after``, ``close``, ``domain_id``, ``clock`` and
+        ``get_state``, ``state_stamp``, ``images_after``, ``close``, ``domain_id``, ``clock`` and
         ``embodiment`` only. It sends the robot nothing, also not in ``close``; it neither holds the
         arm nor looks for others who command it. ``send_action`` raises Rejected, ``stop`` does
         nothing.
@@ -206,3 +208,69 @@ class ActionFilter(Contract):
 
     def reset(self, pose: npt.NDArray[np.float64]) -> None:
         """An episode begins with the arm at ``(dim,)`` ``pose``."""
+
+
+class Part(Enum):
+    """The whole robot, or one of the two parts that ``Operator`` can be divided into.
+
+    The value says which, in messages.
+    """
+
+    WHOLE = "the whole robot"
+    WITHOUT_CAMERAS = "the part without cameras"
+    WITHOUT_COMMANDS = "the part without commands"
+
+    @property
+    def cameras(self) -> bool:
+        """Whether it reads images."""
+        return self is not Part.WITHOUT_CAMERAS
+
+    @property
+    def commands(self) -> bool:
+        """Whether it sends anything."""
+        return self is not Part.WITHOUT_COMMANDS
+
+    def check_cameras(self, robot: str) -> None:
+        """Refuse a frame where there are no cameras.
+
+        Raises:
+            NotReady: this part has none; names the ``robot``.
+        """
+        if not self.cameras:
+            raise NotReady(
+                f"this part of {robot} has no cameras, and so no frames",
+                cause="the robot is divided, and its cameras are in another process",
+                next="call get_state() here, and get_frame() of the part without commands",
+            )
+
+    def check_commands(self, robot: str) -> None:
+        """Refuse to send anything where nothing is sent.
+
+        Raises:
+            Rejected: this part sends nothing; names the ``robot``.
+        """
+        if not self.commands:
+            raise Rejected(
+                f"this part of {robot} sends no commands",
+                cause="the robot is divided, and another process commands it",
+                next="call send_action() of the part without cameras",
+            )
+
+    def divided(self, part: Part, connected: bool, robot: str) -> Part:
+        """``part``, for an operator that is this one as yet.
+
+        Args:
+            part: what it is to become.
+            connected: whether it is connected.
+            robot: its name, for the message.
+
+        Raises:
+            Rejected: it is connected, or the other part.
+        """
+        if connected or self not in (Part.WHOLE, part):
+            state = "connected" if connected else self.value
+            raise Rejected(
+                f"{robot} cannot become {part.value}: it is {state} already",
+                next="build another operator for it",
+            )
+        return part

@@ -210,7 +210,7 @@ def make_track(
     ends = [0] * len(files)
     for start, length, place in zip(places.starts[chosen], lengths[chosen], wanted, strict=True):
         ends[numbers[place]] = max(ends[numbers[place]], round(start * meta.fps) + int(length))
-    height, width = meta.picture_size(key)
+    height, width = meta.image_size(key)
     for path, end in zip(files, ends, strict=True):
         check(path, ExpectedVideo(end, height, width, meta.fps))
     file = [numbers.get(f, -1) for f in places.files]
@@ -370,7 +370,7 @@ def _no_nulls(column: Any, where: str) -> None:
 def _stored_track(meta: Metadata, key: str) -> Track:
     """The track of an image column: in the parquet files, which are read in any case."""
     numbers = {f: i for i, f in enumerate(dict.fromkeys(meta.episodes.files))}
-    height, width = meta.picture_size(key)
+    height, width = meta.image_size(key)
     files = tuple(ImageColumn(meta.data_file(f), key, (height, width)) for f in numbers)
     for column in files:
         ImageColumnReader(column).close()

@@ -73,7 +73,7 @@ def _write(meta: Metadata, tasks: npt.NDArray[Any], out: Path, reporter: Reporte
         clips, parameters = [], []
         for i, length in enumerate(map(int, episodes.lengths)):
             table = meta.data_file(episodes.files[i])
-            source: Source = ImageColumn(table, key, meta.picture_size(key))
+            source: Source = ImageColumn(table, key, meta.image_size(key))
             period = 1.0
             if key in episodes.videos:
                 source = meta.video_file(key, episodes.videos[key].files[i])

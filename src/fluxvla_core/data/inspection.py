@@ -170,7 +170,7 @@ def write_statistics(meta: Metadata, stats: Mapping[str, Stats]) -> Path:
 
 def _camera(meta: Metadata, key: str) -> dict[str, Any]:
     feature = meta.features[key]
-    height, width = meta.picture_size(key)
+    height, width = meta.image_size(key)
     stated = feature.get("info") or feature.get("video_info") or {}
     places = meta.episodes.videos.get(key)
     files = {meta.video_file(key, file) for file in places.files} if places else set()

@@ -197,7 +197,7 @@ def check_info(table: dict[str, Any], where: str) -> None:
         _check_pattern(info.video_path, "video_path", _NUMBERS | {_KEY}, where)
     for key, feature in info.features.items():
         if feature.dtype in ("video", "image"):
-            _check_picture(key, feature, where)
+            _check_image(key, feature, where)
 
 
 def fill(pattern: str, numbers: dict[str, int], key: str = "") -> str:
@@ -212,7 +212,7 @@ def fill(pattern: str, numbers: dict[str, int], key: str = "") -> str:
     return path
 
 
-def _check_picture(key: str, feature: Feature, where: str) -> None:
+def _check_image(key: str, feature: Feature, where: str) -> None:
     shape = feature.shape
     fits = len(shape) == 3 and all(1 <= side <= LARGEST_SIDE for side in shape)
     sides = shape[1:] if fits and shape[0] == 3 != shape[2] else shape[:2]

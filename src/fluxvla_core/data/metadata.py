@@ -144,7 +144,7 @@ class Metadata:
                 return key
         raise DataError(f"{self.root}: there is no camera {name!r}{self.hint(name, self.cameras)}")
 
-    def picture_size(self, key: str) -> tuple[int, int]:
+    def image_size(self, key: str) -> tuple[int, int]:
         """Height and width of a camera's images; some datasets list the channels first."""
         first, middle, last = map(int, self.features[key]["shape"])
         return (middle, last) if first == 3 and last != 3 else (first, middle)

@@ -215,7 +215,7 @@ class ImageColumnReader:
                 f"{self.path}: row {row} holds no image, at most the name of one",
                 cause="the images were left in files of their own when this was written",
             )
-        stated = picture_size(data)
+        stated = image_size(data)
         if stated is not None and stated != self.path.size:
             raise DataError(
                 f"{self.path}: the image of row {row} is {stated[0]} x {stated[1]}, "
@@ -359,7 +359,7 @@ def count_indexed_frames(path: Path) -> int:
         return len(container.streams.video[0].index_entries)
 
 
-def picture_size(data: bytes) -> tuple[int, int] | None:
+def image_size(data: bytes) -> tuple[int, int] | None:
     """Height and width from the header of a PNG or JPEG; None for anything else.
 
     An image of a few bytes can decode to gigabytes, so this is checked first.

@@ -25,7 +25,7 @@ from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
 from fluxvla_core.evaluation.policies import match_policy, resolve_policy
 from fluxvla_core.evaluation.pool import Outcome, WorkerPool
-from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
+from fluxvla_core.evaluation.stepping import ChunkCommands, Diverged, check_step, shaped
 from fluxvla_core.robot.control.chunks import not_finite
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 from fluxvla_core.untrusted import read_json
@@ -194,8 +194,8 @@ def demonstrate(
         observation = environment.observe(cameras if teaches else ())
         chunk = _checked(actor.predict_action(observation), spec)
         if teaches:
-            for name, pictures in images.items():
-                pictures.append(observation["images"][name])
+            for name, collected in images.items():
+                collected.append(observation["images"][name])
             instruction = observation["task_description"]
             states.append(np.array(environment.state))
             actions.append(chunk[0].copy())
@@ -208,7 +208,7 @@ def demonstrate(
             success, ended = bool(found.success), bool(found.ended)
             if ended or steps >= task.max_steps:
                 break
-    stacked = {name: np.stack(pictures) for name, pictures in images.items()}
+    stacked = {name: np.stack(collected) for name, collected in images.items()}
     return Demonstration(stacked, np.stack(states), np.stack(actions), instruction), success
 
 
@@ -345,9 +345,12 @@ def collect_episodes(
         with WorkerPool(factory, workers) as pool:
             for number, outcome in _in_order(pool.run(jobs), jobs):
                 for frame in range(len(outcome.states)):
-                    pictures = {name: stack[frame] for name, stack in outcome.images.items()}
+                    shown = {name: stack[frame] for name, stack in outcome.images.items()}
                     writer.add_frame(
-                        pictures, outcome.states[frame], outcome.actions[frame], outcome.instruction
+                        shown,
+                        outcome.states[frame],
+                        outcome.actions[frame],
+                        outcome.instruction,
                     )
                 writer.save_episode(key=number)
                 retried += outcome.retried

@@ -10,8 +10,8 @@ from typing import Any
 from fluxvla_core.errors import UsageError
 from fluxvla_core.evaluation.episodes import DONE
 from fluxvla_core.evaluation.eval_log import FORMAT, FORMER, read_log, whole_lines
-from fluxvla_core.evaluation.results_file import flat
-from fluxvla_core.evaluation.success_rates import all_of, mcnemar_test, rate, verdict
+from fluxvla_core.evaluation.results_file import all_of, flat
+from fluxvla_core.evaluation.success_rates import mcnemar_test, rate, verdict
 
 NAMED = 5
 """How many episodes a message names."""

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fluxvla_core.build import RunContext
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.live import live_options
 from fluxvla_core.evaluation.policies import CHECKPOINT, PolicySource
 from fluxvla_core.evaluation.rollout import RolloutSettings
-
-WrongKey = Callable[[str, str], ConfigError]
-"""Makes the error about a key of the section: the key, and what is wrong with its value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +95,7 @@ class EvalOptions:
     video_fps: float = 10.0
     """frames a second."""
 
-    def check(self, wrong: WrongKey) -> None:
+    def check(self, context: RunContext) -> None:
         """Refuse values that no evaluation can have.
 
         Raises:
@@ -114,17 +112,17 @@ class EvalOptions:
             ("swap_seed", self.swap_seed, 0),
         ):
             if value is not None and value < least:
-                raise wrong(name, f"must be at least {least}, got {value}")
+                raise context.error(name, f"must be at least {least}, got {value}")
         if (self.height is None) != (self.width is None):
-            raise wrong("height", "and width belong together: give both or none")
+            raise context.error("height", "and width belong together: give both or none")
         if self.video_fps <= 0:
-            raise wrong("video_fps", f"must be positive, got {self.video_fps:g}")
+            raise context.error("video_fps", f"must be positive, got {self.video_fps:g}")
         try:
             live = live_options(self.live)
         except ConfigError as error:
-            raise wrong("live", error.what) from error
+            raise context.error("live", error.what) from error
         if live is not None and self.instruction_swap:
-            raise wrong("instruction_swap", "cannot be live: evaluate it stepped")
+            raise context.error("instruction_swap", "cannot be live: evaluate it stepped")
 
     @property
     def first_swap_seed(self) -> int:

@@ -1,11 +1,13 @@
-"""``results.json`` of an evaluation: assembling, checking, writing and reporting it."""
+"""``results.json`` of an evaluation: summary of the episodes, checks, writing and reporting."""
 
 from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from fluxvla_core import atomic
@@ -17,13 +19,7 @@ from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluation.episodes import DONE, reason
 from fluxvla_core.evaluation.eval_log import EvalLog
 from fluxvla_core.evaluation.provenance import Code, provenance
-from fluxvla_core.evaluation.success_rates import (
-    all_of,
-    describe_problem,
-    describe_rate,
-    problems,
-    summarise,
-)
+from fluxvla_core.evaluation.success_rates import rate
 
 FORMAT = "fluxvla-eval-1"
 NAMED = 5
@@ -257,3 +253,74 @@ def as_json(table: Any) -> Any:
 
 def _as_json_value(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def summarise(records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Success by group and task.
+
+    Returns:
+        ``{group: {"tasks": {task: rate}, "all": rate}}``, each ``rate`` as :func:`rate` gives it
+        with ``errors`` added, and ``mean_return`` where episodes have a return. An episode that
+        ended in an error is not a trial: it says nothing about the policy, and is counted apart.
+    """
+    table: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+    for record in records:
+        table.setdefault(record["group"], {}).setdefault(record["task"], []).append(record)
+    return {
+        group: {
+            "tasks": {task: _counted(found) for task, found in tasks.items()},
+            "all": _counted([record for found in tasks.values() for record in found]),
+        }
+        for group, tasks in table.items()
+    }
+
+
+def problems(records: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Problems of episodes, the most frequent first, as JSON values.
+
+    Returns:
+        ``group``, ``what``, ``episodes`` (in how many of them), and ``status``: ``error`` for
+        episodes that gave no result, ``done`` for failures of the policy that say why.
+    """
+    found = Counter(
+        (record["group"], record["status"], reason(why))
+        for record in records
+        if not record.get("success")
+        and (why := record.get("problem" if record["status"] == DONE else "error"))
+    )
+    return [
+        {"group": group, "status": status, "what": what, "episodes": count}
+        for (group, status, what), count in found.most_common()
+    ]
+
+
+def describe_problem(row: Mapping[str, Any]) -> str:
+    """One line for people about a row of :func:`problems`."""
+    count = row["episodes"]
+    many = "1 episode" if count == 1 else f"{count} episodes"
+    failed = "failed" if row["status"] == DONE else "gave no result"
+    return f"{row['group']}: {many} {failed}: {row['what']}"
+
+
+def all_of(tasks: int) -> str:
+    """The name of the row over several tasks: they may be few of those that there are."""
+    return f"all {tasks} tasks" if tasks > 1 else "the task"
+
+
+def describe_rate(name: str, counted: Mapping[str, Any]) -> str:
+    """One line for people: ``lift_hold: 44/50 = 88 % (95 % interval 76 to 94 %)``."""
+    if not counted["episodes"]:
+        return f"{name}: no episode gave a result ({counted['errors']} errors)"
+    errors = f", {counted['errors']} errors" if counted.get("errors") else ""
+    share = f"{counted['successes']}/{counted['episodes']} = {counted['rate']:.0%}"
+    ends = f"{counted['low']:.0%} to {counted['high']:.0%}"
+    gained = f", mean return {counted['mean_return']:.4g}" if "mean_return" in counted else ""
+    return f"{name}: {share} ({counted['confidence']:.0%} interval {ends}){gained}{errors}"
+
+
+def _counted(records: list[Mapping[str, Any]]) -> dict[str, Any]:
+    done = [record for record in records if record["status"] == DONE]
+    successes = sum(bool(record["success"]) for record in done)
+    counted = {**rate(successes, len(done)), "errors": len(records) - len(done)}
+    returns = [record["return"] for record in done if record.get("return") is not None]
+    return {**counted, "mean_return": mean(returns)} if returns else counted

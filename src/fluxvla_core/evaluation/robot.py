@@ -96,7 +96,9 @@ class RobotEvalRunner(Runner):
                     "tasks", f"{task!r} is not a task of {section}; there are {there}"
                 )
         if not self.tasks:
-            raise self.config_error("tasks", f"{section} has no task_descriptions to evaluate")
+            raise self.config_error(
+                "tasks", f"cannot be chosen: {section} has no task_descriptions to evaluate"
+            )
         if episodes < 1:
             raise self.config_error("episodes", f"must be at least 1, got {episodes}")
         self._policy: Any = None
@@ -246,10 +248,9 @@ class RobotEvalRunner(Runner):
         self.context.reporter.settle()
         return input(question).strip()
 
-    def config_error(self, name: str, what: str) -> ConfigError:
+    def config_error(self, key: str, problem: str) -> ConfigError:
         """An error about a key of this section."""
-        where = self.context.where(f"{self.context.section}.{name}")
-        return ConfigError(f"{name}: {what}", where=where)
+        return self.context.error(key, problem)
 
 
 def _named(

@@ -81,9 +81,9 @@ class VideoRecorder:
         if steps % stride or not self._video.cameras:
             return
         images = environment.observe(self._video.cameras)["images"]
-        pictures = [images[camera.name] for camera in self._video.cameras]
-        lowest = min(image.shape[0] for image in pictures)
-        frame = np.hstack([image[:lowest] for image in pictures])
+        views = [images[camera.name] for camera in self._video.cameras]
+        lowest = min(image.shape[0] for image in views)
+        frame = np.hstack([image[:lowest] for image in views])
         if self._writer is None:
             self._writer = VideoWriter(self._path, rate / stride, *frame.shape[:2])
         self._writer.add(frame)

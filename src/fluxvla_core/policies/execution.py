@@ -3,23 +3,27 @@
 All three give the same actions, up to the rounding of sums in another order. A model that divides
 its answer (``VLA.observe``, ``VLA.denoise``) is timed in two parts, and can be captured: all of its
 denoising steps are then one graph, and what comes before them is another one where the model says
-that it may be.
+that it may be. Copies between host and device go through pinned memory that is kept, and nobody
+waits for them; clocks take the seconds of an answer's parts without waiting either.
 """
 
 from __future__ import annotations
 
 import inspect
+import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.policies.clocks import Clock
 from fluxvla_core.policies.cuda_graph import CudaGraph, Record, Recorded, check_gpu, static
 from fluxvla_core.training.model import compile_units
 
@@ -226,3 +230,114 @@ def _tensor(value: Any) -> bool:
 
 
 _NOISE = "noise"
+
+
+class Clock(Protocol):
+    """Notes the ends of parts."""
+
+    def mark(self, part: str) -> None:
+        """``part`` ends here, where the next one begins."""
+
+    def seconds(self) -> dict[str, float]:
+        """Part -> seconds; once the device has done all that it was given."""
+
+
+class HostClock:
+    """Clock of a device that has done an operation when the call returns."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+
+    def mark(self, part: str) -> None:
+        now = time.perf_counter()
+        self._seconds[part] = now - self._last
+        self._last = now
+
+    def seconds(self) -> dict[str, float]:
+        return dict(self._seconds)
+
+
+class CudaClock:
+    """Clock of a GPU, by CUDA events: a part that waits for the host to launch operations takes as
+    long as that does."""
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[str, Any]] = [("", _event())]
+
+    def mark(self, part: str) -> None:
+        self._marks.append((part, _event()))
+
+    def seconds(self) -> dict[str, float]:
+        pairs = zip(self._marks, self._marks[1:], strict=False)
+        return {part: begun.elapsed_time(ended) / 1e3 for (_, begun), (part, ended) in pairs}
+
+
+def clock_of(device: str) -> Clock:
+    """A clock that starts now, for ``device``."""
+    import torch
+
+    return CudaClock() if torch.device(device).type == "cuda" else HostClock()
+
+
+def _event() -> Any:
+    import torch
+
+    event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+    event.record()
+    return event
+
+
+class Transfer:
+    """Brings batches to a device, and answers back.
+
+    A copy from pageable memory makes the host wait, and allocating pinned memory takes longer than
+    the copy, so that it is kept, by name, shape and dtype. ``fetch`` waits for the device; until
+    then the pinned memory of a batch may still be read. On a CPU nothing is copied.
+
+    Args:
+        device: where batches go.
+        pinned: whether host memory is pinned; by default on CUDA devices.
+    """
+
+    def __init__(self, device: str, pinned: bool | None = None) -> None:
+        self.device = torch.device(device)
+        self._pinned = self.device.type == "cuda" if pinned is None else pinned
+        self._kept: dict[str, Tensor] = {}
+
+    def to_device(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """The tensors of ``batch`` on the device; what is no tensor stays as it is."""
+        return {
+            key: self._sent(key, value) if isinstance(value, Tensor) else value
+            for key, value in batch.items()
+        }
+
+    def fetch(self, answer: Tensor) -> npt.NDArray[np.float32]:
+        """``answer`` as an array of its own, once the device is done."""
+        wide = answer.detach().float()
+        if self.device.type == "cpu":
+            return np.array(wide.numpy())
+        host = self._buffer("answer", wide)
+        host.copy_(wide, non_blocking=self._pinned)
+        if self.device.type == "cuda":
+            torch.cuda.current_stream(self.device).synchronize()
+        return np.array(host.numpy())
+
+    def _sent(self, key: str, value: Tensor) -> Tensor:
+        if value.device == self.device or self.device.type == "cpu":
+            return value
+        if not self._pinned:
+            return value.to(self.device)
+        buffer = self._buffer(f"batch.{key}", value)
+        buffer.copy_(value)
+        return buffer.to(self.device, non_blocking=True)
+
+    def _buffer(self, key: str, like: Tensor) -> Tensor:
+        """Host memory for ``like``; that of the last call where it fits."""
+        buffer = self._kept.get(key)
+        if buffer is None or buffer.shape != like.shape or buffer.dtype != like.dtype:
+            # In inference mode it would be a tensor that no other mode may write to.
+            with torch.inference_mode(False):
+                buffer = torch.empty(like.shape, dtype=like.dtype, pin_memory=self._pinned)
+            self._kept[key] = buffer
+        return buffer

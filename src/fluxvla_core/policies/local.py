@@ -18,7 +18,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 if TYPE_CHECKING:
-    from fluxvla_core.policies.transfer import Transfer
+    from fluxvla_core.policies.execution import Transfer
 
 Array = npt.NDArray[np.float64]
 # float32 statistics and the sizes that joints have: far above rounding, far below a mistake.
@@ -197,7 +197,7 @@ class LocalPolicy(Policy):
         """
         import torch
 
-        from fluxvla_core.policies.clocks import clock_of
+        from fluxvla_core.policies.execution import clock_of
 
         if not 1 <= len(questions) <= self.batch_size:
             raise ValueError(f"{len(questions)} questions, and batch_size is {self.batch_size}")
@@ -236,7 +236,7 @@ class LocalPolicy(Policy):
         return chunks
 
     def _transfers(self) -> Transfer:
-        from fluxvla_core.policies.transfer import Transfer
+        from fluxvla_core.policies.execution import Transfer
 
         if self._transfer is None or str(self._transfer.device) != self.device:
             self._transfer = Transfer(self.device)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import STATE, Frame
 from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.errors import ConfigError, FluxError, NotReady, SpecMismatch
+from fluxvla_core.errors import FluxError, NotReady, SpecMismatch
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.robot.control.tracking import TrackingWatch
@@ -317,8 +317,7 @@ def fit_cameras(
     policy: Policy,
     embodiment: EmbodimentSpec,
     chosen: tuple[str, ...] | None,
-    error: Callable[[str, str], ConfigError],
-    reporter: Reporter,
+    context: RunContext,
 ) -> tuple[str, ...]:
     """Check that a policy is for a robot; the names of the cameras to observe.
 
@@ -326,8 +325,7 @@ def fit_cameras(
         policy: loaded.
         embodiment: the robot's.
         chosen: the config's ``camera_names``; None for those that the policy looks at.
-        error: makes an error about a key of the config.
-        reporter: warns of images that are scaled.
+        context: of the run; its reporter warns of images that are scaled.
 
     Raises:
         SpecMismatch: the policy is for another robot, or for other views.
@@ -339,11 +337,13 @@ def fit_cameras(
     known = embodiment.camera_names
     for name in (*cameras, *looks_at):
         if name not in known:
-            raise error("camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}")
+            raise context.error(
+                "camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}"
+            )
         if name not in cameras:
-            raise error("camera_names", f"the policy looks at {name!r} too")
+            raise context.error("camera_names", f"the policy looks at {name!r} too")
     for warning in scaled_views(policy.embodiment, embodiment, looks_at):
-        reporter.warn(warning)
+        context.reporter.warn(warning)
     return cameras
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,6 @@ from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-
-WrongKey = Callable[[str, str], ConfigError]
-"""Makes the error about a key of the section: the key, and what is wrong with its value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +101,7 @@ class InferenceOptions:
     """frames a second of the recorded videos, and of a simulation's recorded images; None records
     none."""
 
-    def check(self, wrong: WrongKey) -> None:
+    def check(self, context: RunContext) -> None:
         """Refuse values that no run can have.
 
         Raises:
@@ -116,13 +113,15 @@ class InferenceOptions:
             ("max_publish_step", self.max_publish_step),
         ):
             if value is not None and value < 1:
-                raise wrong(name, f"must be at least 1, got {value}")
+                raise context.error(name, f"must be at least 1, got {value}")
         try:
             joiner = make_joiner(self.joining)
         except ConfigError as error:
-            raise wrong("chunk_joining", error.what) from error
+            raise context.error("chunk_joining", error.what) from error
         if self.async_execution and not joiner.streamed:
-            raise wrong("chunk_joining", f"is {self.chunk_joining!r}, and async_execution is set")
+            raise context.error(
+                "chunk_joining", f"is {self.chunk_joining!r}, and async_execution is set"
+            )
 
     @property
     def joining(self) -> str | Mapping[str, Any]:
@@ -132,7 +131,7 @@ class InferenceOptions:
         return "latest_only" if self.async_execution else "synchronous"
 
 
-def checked_rate(publish_rate: float | None, robot: Robot, wrong: WrongKey) -> float:
+def checked_rate(publish_rate: float | None, robot: Robot, context: RunContext) -> float:
     """Commands a second: the config's ``publish_rate``, or the embodiment's rate.
 
     Raises:
@@ -142,42 +141,42 @@ def checked_rate(publish_rate: float | None, robot: Robot, wrong: WrongKey) -> f
     if publish_rate is None:
         return most
     if not 0 < publish_rate <= most:
-        raise wrong(
+        raise context.error(
             "publish_rate",
             f"is {publish_rate:g} Hz; {robot.embodiment.name} takes up to "
             f"{most:g} commands a second",
         )
     if robot.lockstep and publish_rate != most:
-        raise wrong(
+        raise context.error(
             "publish_rate",
             f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
         )
     return float(publish_rate)
 
 
-def check_state_dim(state_dim: int | None, embodiment: EmbodimentSpec, wrong: WrongKey) -> None:
+def check_state_dim(state_dim: int | None, embodiment: EmbodimentSpec, context: RunContext) -> None:
     """Refuse a ``state_dim`` that is not the robot's.
 
     Raises:
         ConfigError: it is another one.
     """
     if state_dim is not None and state_dim != embodiment.state_dim:
-        raise wrong(
+        raise context.error(
             "state_dim",
             f"is {state_dim}; {embodiment.name} has {embodiment.state_dim} state values",
         )
 
 
-def check_latency(seconds: float, robot: Robot, wrong: WrongKey) -> None:
+def check_latency(seconds: float, robot: Robot, context: RunContext) -> None:
     """Refuse a ``simulated_latency`` that no run can have.
 
     Raises:
         ConfigError: it is negative or not finite, or the robot's time does not stand still.
     """
     if not 0.0 <= seconds < math.inf:
-        raise wrong("simulated_latency", f"must be 0 or more, got {seconds}")
+        raise context.error("simulated_latency", f"must be 0 or more, got {seconds}")
     if seconds and not robot.lockstep:
-        raise wrong("simulated_latency", "is for simulations; this robot has its own")
+        raise context.error("simulated_latency", "is for simulations; this robot has its own")
 
 
 def build_filters(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -182,9 +183,17 @@ class Robot:
         return None if self._has("begin_episode") else before
 
     @property
-    def pictures_after(self) -> Callable[..., Any] | None:
-        """The operator's ``pictures_after``, which gives images that it kept, or None."""
-        return self._operator.pictures_after if self._has("pictures_after") else None
+    def images_after(self) -> Callable[..., Any] | None:
+        """The operator's ``images_after``, which gives images that it kept, or None."""
+        if self._has("images_after"):
+            return self._operator.images_after
+        if self._has("pictures_after"):
+            operator: Any = self._operator
+            message = f"{self.name}.pictures_after is deprecated, name it images_after"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            found: Callable[..., Any] = operator.pictures_after
+            return found
+        return None
 
     @property
     def simulated(self) -> bool:

@@ -88,10 +88,9 @@ class BaseInferenceRunner(Runner):
     ) -> None:
         self.cfg = cfg
         self.context = context or RunContext(config=cfg or {})
-        wrong = self.config_error
         name = type(self).__name__
         self.options = given = bind_options(self.Options, options, name, self.context)
-        given.check(wrong)
+        given.check(self.context)
         # Subclasses may change these when their constructor goes on.
         self.seed, self.prepare_pose = given.seed, given.prepare_pose
         self.max_publish_step, self.action_chunk = given.max_publish_step, given.action_chunk
@@ -104,9 +103,9 @@ class BaseInferenceRunner(Runner):
         self._layout = self._choose_layout(context)
         self.ros_operator, self.robot = self._layout.operator, self._layout.robot
         self.embodiment = self.robot.embodiment
-        self.publish_rate = checked_rate(given.publish_rate, self.robot, wrong)
-        check_state_dim(given.state_dim, self.embodiment, wrong)
-        check_latency(given.simulated_latency, self.robot, wrong)
+        self.publish_rate = checked_rate(given.publish_rate, self.robot, self.context)
+        check_state_dim(given.state_dim, self.embodiment, self.context)
+        check_latency(given.simulated_latency, self.robot, self.context)
         self.action_filters = build_filters(
             given.action_filters, given.gripper_threshold, self.embodiment, context
         )
@@ -172,12 +171,11 @@ class BaseInferenceRunner(Runner):
                 f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
                 "chunk: neither it nor its model takes what is left of the last one",
             )
-        chosen, error, reporter = self.camera_names, self.config_error, self.context.reporter
-        self._cameras = fit_cameras(self.policy, self.embodiment, chosen, error, reporter)
+        self._cameras = fit_cameras(self.policy, self.embodiment, self.camera_names, self.context)
         if self.prepare_pose is not None:
             check_pose(self.prepare_pose, self.embodiment)
         if not self.robot.can_stop:
-            reporter.warn(
+            self.context.reporter.warn(
                 f"{self.robot.name} has no stop(): it is stopped by commands that brake, and held "
                 "by the last of them; a robot that does not hold its last command needs a stop()"
             )
@@ -350,7 +348,6 @@ class BaseInferenceRunner(Runner):
         least = self.options.execute_horizon or (1 if self.robot.lockstep else 0)
         return self.chunk_joining, least / self.policy.action_rate_hz
 
-    def config_error(self, key: str, what: str) -> ConfigError:
+    def config_error(self, key: str, problem: str) -> ConfigError:
         """An error about a key of this section."""
-        section = self.context.section
-        return ConfigError(f"{key} {what}", where=self.context.where(f"{section}.{key}"))
+        return self.context.error(key, problem)

@@ -13,13 +13,11 @@ import ctypes
 import functools
 import importlib
 import importlib.util
-import math
 import os
 import re
 import secrets
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -34,6 +32,8 @@ from fluxvla_core.ros2.streams import Stream
 WATCH_S = 0.25
 """How often the graph is looked at: publishers that come, go or change what they offer."""
 _JOIN_S = 5.0
+# Without any timeout, rclpy 9.1's EventsExecutor keeps the GIL while it waits.
+_SPIN_S = 3600.0
 LARGE_FRAMES = Path(__file__).with_name("fastdds_large_frames.xml")
 _LOOPBACK = Path(__file__).with_name("fastdds_loopback.xml")
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -137,6 +137,7 @@ class Connection:
         keep_large_blocks()
         from rclpy.context import Context
         from rclpy.signals import SignalHandlerOptions
+        from rclpy.task import Future
 
         clean = re.sub(r"\W+", "_", name).strip("_") or "node"
         self.name = f"{clean}_{os.getpid()}_{secrets.token_hex(2)}"
@@ -144,6 +145,7 @@ class Connection:
         self.streams: dict[str, Stream] = {}
         self._watchers: list[Callable[[], None]] = []
         self._closing = threading.Event()
+        self._closed: Any = Future()
         self._lock = threading.Lock()
         self._context = Context()
         transports = ExitStack()
@@ -169,7 +171,7 @@ class Connection:
         try:
             self.domain: int = self._context.get_domain_id()
             self.every(WATCH_S, self._watch)
-            self._executor = _executor(self._context, small)
+            self._loops_in_cpp, self._executor = _executor(self._context, small)
             self._executor.add_node(self.node)
         except BaseException:
             self._context.try_shutdown()
@@ -227,11 +229,18 @@ class Connection:
             if self._closing.is_set():
                 return
             self._closing.set()
+        self._closed.set_result(None)
         self._executor.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_S)
 
     def _watch(self) -> None:
+        # A main thread that ends without close() is noticed, and the process does not hang on a
+        # thread that it must join.
+        if not threading.main_thread().is_alive() or not self._context.ok():
+            self._closing.set()
+            self._closed.set_result(None)
+            return
         for stream in self.streams.copy().values():
             stream.refresh()
         for callback in self._watchers:
@@ -240,18 +249,12 @@ class Connection:
     def _spin(self) -> None:
         # The thread that sends commands waits for the interpreter lock while this one has it.
         realtime.raise_priority()
-        main = threading.main_thread()
         try:
-            # The watch timer wakes this at least every WATCH_S, so a main thread that ends without
-            # close() is noticed, and the process does not hang on a thread that it must join.
-            checked_at = -math.inf
             while not self._closing.is_set():
-                # Both take locks; this loop turns at every message.
-                if (now := time.monotonic()) - checked_at >= WATCH_S:
-                    if not main.is_alive() or not self._context.ok():
-                        break
-                    checked_at = now
-                self._executor.spin_once(timeout_sec=WATCH_S)
+                if self._loops_in_cpp:
+                    self._executor.spin_until_future_complete(self._closed, _SPIN_S)
+                else:
+                    self._executor.spin_once(timeout_sec=WATCH_S)
         except BaseException as error:  # noqa: BLE001 - kept, and raised by the next ``check``
             self.failure = error
         finally:
@@ -261,15 +264,16 @@ class Connection:
             self._context.try_shutdown()
 
 
-def _executor(context: Any, events: bool) -> Any:
+def _executor(context: Any, events: bool) -> tuple[bool, Any]:
+    """An executor, and whether it loops over messages in C++."""
     # Jazzy has no such module.
     if events and importlib.util.find_spec("rclpy.experimental") is not None:
         from rclpy.experimental import EventsExecutor
 
-        return EventsExecutor(context=context)
+        return True, EventsExecutor(context=context)
     from rclpy.executors import SingleThreadedExecutor
 
-    return SingleThreadedExecutor(context=context)
+    return False, SingleThreadedExecutor(context=context)
 
 
 def _check_domain(domain_id: int | None) -> None:

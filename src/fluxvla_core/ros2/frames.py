@@ -40,7 +40,7 @@ def pictures(
     return colours, depths
 
 
-def pictures_after(
+def images_after(
     connection: Connection, specs: Sequence[StreamSpec], camera: str, after: float
 ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
     """The colour images of a camera that are kept and newer than ``after``: see ``RosOperator``.

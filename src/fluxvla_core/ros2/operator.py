@@ -23,8 +23,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.frame import RobotFrame
-from fluxvla_core.contracts.part import Part
-from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.contracts.robot import Operator, Part
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection
@@ -152,6 +151,10 @@ class RosOperator(Operator):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if "pictures_after" in vars(cls) and "images_after" not in vars(cls):
+            message = f"{cls.__name__}.pictures_after is deprecated, name it images_after"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            cls.images_after = vars(cls)["pictures_after"]  # type: ignore[method-assign]
         if "admit" in vars(cls):
             message = f"{cls.__name__}.admit is deprecated, call it check_command"
             warnings.warn(message, DeprecationWarning, stacklevel=2)
@@ -254,7 +257,7 @@ class RosOperator(Operator):
         """
         return min(received.receipt for received in self._reader.states().values())
 
-    def pictures_after(
+    def images_after(
         self, camera: str, after: float
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
         """Images that a camera sent after a time, for recordings; any thread may call it.
@@ -272,7 +275,15 @@ class RosOperator(Operator):
         connection = self._connection
         if connection is None:
             return [], 0
-        return frames.pictures_after(connection, self._specs, camera, after)
+        return frames.images_after(connection, self._specs, camera, after)
+
+    def pictures_after(
+        self, camera: str, after: float
+    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+        """Deprecated name of :meth:`images_after`."""
+        message = "RosOperator.pictures_after is deprecated, use images_after"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return RosOperator.images_after(self, camera, after)
 
     def send_action(self, action: npt.ArrayLike) -> None:
         """Publish one ``(dim,)`` command.
@@ -396,6 +407,9 @@ class RosOperator(Operator):
         for spec in self._specs:
             message = message_class(spec.message)
             connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
+        self._stream_reader = StreamReader(
+            connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on
+        )
         self._publishers = {
             command.topic: connection.publisher(command.topic, message_class(command.message))
             for command in commands
@@ -445,8 +459,8 @@ class RosOperator(Operator):
     @property
     def _reader(self) -> StreamReader:
         """Reader of the streams; raises NotReady without a connection."""
-        connection = self._connected()
-        return StreamReader(connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on)
+        self._connected()
+        return self._stream_reader
 
     def _state_of(self, messages: Mapping[str, Received]) -> tuple[Array, float]:
         """The ``(state_dim,)`` state, and the receipt of the oldest message in it."""

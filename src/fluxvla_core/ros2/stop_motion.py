@@ -6,6 +6,7 @@ A stop goes from the last command to the one that holds the arm, within its limi
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 
@@ -40,8 +41,8 @@ def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
         raise Rejected(
             f"{embodiment.name} takes actions of shape ({embodiment.dim},), got {values.shape}"
         )
-    for joint, value in zip(embodiment.joints, values, strict=True):
-        if not np.isfinite(value):
+    for joint, value in zip(embodiment.joints, values.tolist(), strict=True):
+        if not math.isfinite(value):
             raise Rejected(f"{joint.name}: the command is {value}, not a finite number")
         if not joint.lower <= value <= joint.upper:
             raise Rejected(

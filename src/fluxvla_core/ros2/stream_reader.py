@@ -66,8 +66,8 @@ class StreamReader:
         Args:
             index: -1 for the newest, -2 for the one before it, or the newest if it is the only one.
         """
-        kept = self._kept(self._states)
-        return {name: items[max(index, -len(items))] for name, items in kept.items()}
+        streams = self._connection.streams
+        return {name: streams[name].ring.last(-index)[0] for name in self._states}
 
     def check_states_together(self) -> None:
         """Refuse ``state`` streams whose newest messages are of different times.
@@ -76,7 +76,9 @@ class StreamReader:
             Stale: their stamps are too far apart.
         """
         if self._sync_on == "stamp" and not self._clock_stepped():
-            sync.check_together(self._kept(self._states), self._max_skew, sync.wall_offset())
+            streams = self._connection.streams
+            newest = {name: streams[name].ring.last(sync.CLOCK_SAMPLES) for name in self._states}
+            sync.check_together(newest, self._max_skew, sync.wall_offset())
 
     def matched(self) -> Mapping[str, Received]:
         """Messages of state, cameras and depth that belong together, one of each stream.
@@ -93,7 +95,8 @@ class StreamReader:
         while True:
             self.newest()
             by = "receipt" if self._clock_stepped() else self._sync_on
-            kept = self._kept(self._in_frames)
+            streams = self._connection.streams
+            kept = {name: streams[name].ring.items() for name in self._in_frames}
             try:
                 self.check_states_together()
                 match = sync.match(kept, self._max_skew, by, sync.wall_offset())
@@ -104,9 +107,6 @@ class StreamReader:
                 time.sleep(POLL_S)
             else:
                 return match.messages
-
-    def _kept(self, names: Sequence[str]) -> dict[str, tuple[Received, ...]]:
-        return {name: self._connection.streams[name].ring.items() for name in names}
 
     def _clock_stepped(self) -> bool:
         """Whether a sender's clock stepped so recently that stamps on both sides are kept."""

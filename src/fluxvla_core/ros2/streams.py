@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from fluxvla_core.ros2 import qos
@@ -117,6 +118,11 @@ class Received:
     stamp: float | None
     message: Any
 
+    @cached_property
+    def delay_s(self) -> float | None:
+        """Seconds from stamp to receipt, each on its own clock; None without a stamp."""
+        return None if self.stamp is None else self.receipt - self.stamp
+
 
 class Ring:
     """At most ``depth`` messages, oldest dropped first, in the order of the sender's stamps.
@@ -169,6 +175,12 @@ class Ring:
         """All messages, newest last."""
         with self._lock:
             return tuple(self._items)
+
+    def last(self, count: int) -> tuple[Received, ...]:
+        """The last ``count`` messages, or as many as there are, newest last."""
+        with self._lock:
+            items = self._items
+            return tuple(items[index] for index in range(-min(count, len(items)), 0))
 
 
 class Stream:

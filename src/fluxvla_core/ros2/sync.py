@@ -18,8 +18,8 @@ from fluxvla_core.errors import NotReady
 from fluxvla_core.ros2.streams import STEP, Received
 
 _CLOCKS = "synchronise the machines' clocks (chrony), or set sync_on='receipt'"
-# Messages of a stream that tell how long they take.
-_FEW = 16
+CLOCK_SAMPLES = 16
+"""The last messages of a stream, from which its sender's clock and latency are estimated."""
 Streams = Mapping[str, Sequence[Received]]
 
 
@@ -146,7 +146,8 @@ def _delay(items: Sequence[Received]) -> float:
 
     At best, because messages may come in bursts.
     """
-    return min((m.receipt - m.stamp for m in items[-_FEW:] if m.stamp is not None), default=0.0)
+    delays = [message.delay_s for message in items[-CLOCK_SAMPLES:]]
+    return min((delay for delay in delays if delay is not None), default=0.0)
 
 
 def _wrong_clock(delays: Mapping[str, float], wall_offset: float | None) -> str:

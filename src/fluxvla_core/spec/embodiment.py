@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -223,15 +224,15 @@ class EmbodimentSpec:
         """Length of the state vector."""
         return len(self.state_joints or self.joints)
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         return tuple(j.name for j in self.joints)
 
-    @property
+    @cached_property
     def state_names(self) -> tuple[str, ...]:
         return tuple(j.name for j in self.state_joints or self.joints)
 
-    @property
+    @cached_property
     def camera_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.cameras)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import traceback
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,20 @@ _KIT = Path(__file__).parent
 _LISTED = 12
 
 
-class Conformance:
+class Renamed:
+    """Base class of kits some of whose attributes had another name, which still works."""
+
+    image_size: ClassVar[Any]
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "picture" in vars(cls):
+            message = f"{cls.__name__}.picture is deprecated, use image_size"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            cls.image_size = vars(cls)["picture"]
+
+
+class Conformance(Renamed):
     """Inherit one of the kits, set ``entry_point`` and ``arguments``, and run pytest."""
 
     registry: ClassVar[str]

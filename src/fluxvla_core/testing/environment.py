@@ -24,10 +24,11 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Ste
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation.policies import RandomPolicy
-from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
+from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
+from fluxvla_core.evaluation.stepping import Diverged
 from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
 from fluxvla_core.spec.embodiment import Camera
-from fluxvla_core.testing._conformance import is_json, unequal_keys
+from fluxvla_core.testing._conformance import Renamed, is_json, unequal_keys
 
 SEED = 11
 
@@ -67,7 +68,7 @@ class _SameActions(RandomPolicy):
         return super().predict_action(observation)
 
 
-class EnvironmentConformance:
+class EnvironmentConformance(Renamed):
     """Inherit, set ``entry_point`` and ``arguments``, and run pytest."""
 
     entry_point: ClassVar[str]
@@ -78,7 +79,7 @@ class EnvironmentConformance:
     """Names of the tasks that are tried; by default the first two."""
     steps: ClassVar[int] = 12
     """Control steps of each episode here."""
-    picture: ClassVar[tuple[int, int] | None] = (48, 64)
+    image_size: ClassVar[tuple[int, int] | None] = (48, 64)
     """Height and width of the images here; None for environments that draw in one size only."""
     seeds_differ: ClassVar[bool] = True
     """Whether another seed makes another episode."""
@@ -108,11 +109,11 @@ class EnvironmentConformance:
         return tuple(task for task in environment.spec.tasks if task.name in self.tasks)
 
     def cameras(self, environment: Environment) -> tuple[Camera, ...]:
-        """One camera, in the size of ``picture``; none where there is none."""
+        """One camera, in the size of ``image_size``; none where there is none."""
         known = environment.spec.embodiment.cameras[:1]
-        if self.picture is None:
+        if self.image_size is None:
             return known
-        return tuple(Camera(camera.name, *self.picture) for camera in known)
+        return tuple(Camera(camera.name, *self.image_size) for camera in known)
 
     def episode(
         self,

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fluxvla_core.policies.clocks import HostClock
-from fluxvla_core.policies.execution import Compiled, Eager, Graphed, Parts
+from fluxvla_core.policies.execution import Compiled, Eager, Graphed, HostClock, Parts
 from fluxvla_core.policies.inference_weights import store_in_bf16
 from fluxvla_core.testing.capture import Tape, check_capturable, count_calls
 from fluxvla_core.training.model import blocks_of, compile_units

@@ -40,7 +40,7 @@ class Sizes:
 
     state_dim: int
     cameras: int
-    picture: tuple[int, int]
+    image_size: tuple[int, int]
     words: int
     vocabulary: int
 
@@ -56,7 +56,7 @@ class ModelConformance(Conformance):
     cameras: ClassVar[int | None] = None
     """Images of an observation, whose channels stand one behind the other; None: the
     constructor's ``num_cameras``, else 2."""
-    picture: ClassVar[tuple[int, int] | None] = None
+    image_size: ClassVar[tuple[int, int] | None] = None
     """Height and width of an image; None: the constructor's ``image_size``, else 32 and 32."""
     words: ClassVar[int] = 8
     """Tokens of a prompt."""
@@ -91,11 +91,11 @@ class ModelConformance(Conformance):
         def known(own: Any, names: Sequence[str], other: Any) -> Any:
             return next((v for v in (own, *_named(stated, names)) if v is not None), other)
 
-        side = known(self.picture, ("image_size",), (32, 32))
+        side = known(self.image_size, ("image_size",), (32, 32))
         return Sizes(
             state_dim=known(self.state_dim, ("state_dim", "max_state_dim"), 7),
             cameras=known(self.cameras, ("num_cameras",), 2),
-            picture=(side, side) if isinstance(side, int) else tuple(side),
+            image_size=(side, side) if isinstance(side, int) else tuple(side),
             words=self.words,
             vocabulary=known(self.vocabulary, ("vocab_size",), 100),
         )
@@ -112,7 +112,7 @@ class ModelConformance(Conformance):
         of = self.sizes()
         return {
             "states": torch.randn(size, of.state_dim, generator=draw),
-            "images": torch.rand(size, 3 * of.cameras, *of.picture, generator=draw),
+            "images": torch.rand(size, 3 * of.cameras, *of.image_size, generator=draw),
             "img_masks": torch.ones(size, of.cameras, dtype=torch.bool),
             "lang_tokens": torch.randint(1, of.vocabulary, (size, of.words), generator=draw),
             "lang_masks": torch.ones(size, of.words, dtype=torch.bool),
@@ -196,7 +196,7 @@ class ModelConformance(Conformance):
         stated = numbers(self.stated())
         takes = f"; {self.entry_point} was made with {stated}" if stated else ""
         hint = (
-            "set state_dim, cameras, picture, words, vocabulary and action_shape of this kit's "
+            "set state_dim, cameras, image_size, words, vocabulary and action_shape of this kit's "
             "subclass to what it takes, or override batch(model, size) (fluxvla plugins check: "
             f"--kit FILE with such a subclass){takes}"
         )

@@ -46,7 +46,7 @@ class TransformConformance(Conformance):
     """Actions of a chunk."""
     cameras: ClassVar[int] = 2
     """Images of a sample."""
-    picture: ClassVar[tuple[int, int]] = (24, 32)
+    image_size: ClassVar[tuple[int, int]] = (24, 32)
     """Height and width of an image."""
     draws: ClassVar[bool] = True
     """Whether one with ``needs_rng`` gives another result with another generator."""
@@ -62,7 +62,7 @@ class TransformConformance(Conformance):
         Override it for a transform that comes after others.
         """
         rng = np.random.default_rng(number)
-        dim, height, width = self.state_dim, *self.picture
+        dim, height, width = self.state_dim, *self.image_size
         entry = {
             "mean": [0.1] * dim, "std": [0.5] * dim, "min": [-2.0] * dim, "max": [2.0] * dim,
             "q01": [-1.5] * dim, "q10": [-1.0] * dim, "q50": [0.0] * dim, "q90": [1.0] * dim,
@@ -90,8 +90,8 @@ class TransformConformance(Conformance):
     def apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:
         """Call it as the pipeline does."""
         hint = (
-            "set state_dim, horizon, cameras and picture of this kit's subclass to what it takes, "
-            "or override sample(number) for one that comes after other transforms (fluxvla "
+            "set state_dim, horizon, cameras and image_size of this kit's subclass to what it "
+            "takes, or override sample(number) for one that comes after other transforms (fluxvla "
             "plugins check: --kit FILE with such a subclass)"
         )
         with calling(self.entry_point, dict(sample), hint):

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from fluxvla_core.training.base_runner import BaseTrainRunner as BaseTrainRunner
     from fluxvla_core.training.distributed import World as World
     from fluxvla_core.training.distributed import broadcast_buffers as broadcast_buffers
-    from fluxvla_core.training.layout import Layout as Layout
-    from fluxvla_core.training.layout import bare as bare
-    from fluxvla_core.training.layout import nbytes as nbytes
-    from fluxvla_core.training.layout import replicated_layout as replicated_layout
     from fluxvla_core.training.model import units_of as units_of
+    from fluxvla_core.training.parameters import Layout as Layout
+    from fluxvla_core.training.parameters import bare as bare
     from fluxvla_core.training.parameters import decay_groups as decay_groups
+    from fluxvla_core.training.parameters import nbytes as nbytes
     from fluxvla_core.training.parameters import refuse_scalars as refuse_scalars
+    from fluxvla_core.training.parameters import replicated_layout as replicated_layout
     from fluxvla_core.training.parameters import trainable as trainable
     from fluxvla_core.training.rng import rng_state as rng_state
     from fluxvla_core.training.rng import set_rng_state as set_rng_state
@@ -53,9 +53,16 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
         "fluxvla_core.training.distributed": ["World", "broadcast_buffers"],
-        "fluxvla_core.training.layout": ["Layout", "bare", "nbytes", "replicated_layout"],
         "fluxvla_core.training.model": ["units_of"],
-        "fluxvla_core.training.parameters": ["decay_groups", "refuse_scalars", "trainable"],
+        "fluxvla_core.training.parameters": [
+            "Layout",
+            "bare",
+            "decay_groups",
+            "nbytes",
+            "refuse_scalars",
+            "replicated_layout",
+            "trainable",
+        ],
         "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },

@@ -20,9 +20,8 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from fluxvla_core.training.layout import Layout, nbytes
 from fluxvla_core.training.model import autocast, blocks_of, loss_of
-from fluxvla_core.training.parameters import trainable
+from fluxvla_core.training.parameters import Layout, nbytes, trainable
 
 LEFT_OUT = (
     "fragmentation of the allocator",

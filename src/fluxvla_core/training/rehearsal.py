@@ -35,9 +35,8 @@ from fluxvla_core.training.footprint import (
     kept_by_fake,
     optimizer_bytes,
 )
-from fluxvla_core.training.layout import Layout
 from fluxvla_core.training.model import ForwardArguments, check_observations
-from fluxvla_core.training.parameters import trainable
+from fluxvla_core.training.parameters import Layout, trainable
 from fluxvla_core.training.strategy import Strategy
 
 PROCESSES = (1, 2, 4, 8)

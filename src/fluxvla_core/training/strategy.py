@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from fluxvla_core.training.distributed import World
     from fluxvla_core.training.ema import Ema
     from fluxvla_core.training.flops import Meter
-    from fluxvla_core.training.layout import Layout
     from fluxvla_core.training.model import ForwardArguments
+    from fluxvla_core.training.parameters import Layout
     from fluxvla_core.training.progress import Progress
     from fluxvla_core.training.saving import Saver, Snapshot
     from fluxvla_core.training.weights import LeftOut
@@ -111,7 +111,7 @@ class Strategy(TrainRunner):
             processes: that train, all on one machine.
             device_type: ``cuda`` or ``cpu``.
         """
-        from fluxvla_core.training.layout import replicated_layout
+        from fluxvla_core.training.parameters import replicated_layout
 
         return replicated_layout(model)
 
@@ -293,7 +293,7 @@ class Strategy(TrainRunner):
                 the two keeps averages.
         """
         from fluxvla_core.checkpoints import checkpoint as ckpt
-        from fluxvla_core.training import resuming
+        from fluxvla_core.training import resume_checks, resuming
         from fluxvla_core.training.optimizer_state import SavedOptimizer
         from fluxvla_core.training.progress import Progress
 
@@ -301,7 +301,7 @@ class Strategy(TrainRunner):
         if checkpoint is None:
             return 0
         where = str(checkpoint.path)
-        saved, notes = resuming.check_settings(
+        saved, notes = resume_checks.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
         for note in notes if self.world.is_rank0 else ():

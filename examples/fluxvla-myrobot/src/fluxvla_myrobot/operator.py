@@ -67,13 +67,13 @@ class MyRobotOperator:
             Float64, '/gripper_command', 1)
 
     def _img_front_callback(self, msg):
-        """A picture of the front camera."""
+        """An image of the front camera."""
         img = images.to_rgb(msg, msg.height, msg.width)
         with self._lock:
             self._img_front_buffer.append(img)
 
     def _img_wrist_callback(self, msg):
-        """A picture of the wrist camera."""
+        """An image of the wrist camera."""
         img = images.to_rgb(msg, msg.height, msg.width)
         with self._lock:
             self._img_wrist_buffer.append(img)

@@ -40,7 +40,7 @@ class MyRobotInferenceRunner(BaseInferenceRunner):
         """Read synchronized sensor data.
 
         Returns:
-            tuple: (front picture, wrist picture, joint state)
+            tuple: (front image, wrist image, joint state)
         """
         frame = self.ros_operator.get_frame()
         img_front = frame['img_front']
@@ -52,7 +52,7 @@ class MyRobotInferenceRunner(BaseInferenceRunner):
         """Make the model's input.
 
         Returns:
-            dict: 'qpos' and the pictures
+            dict: 'qpos' and the images
         """
         img_front, img_wrist, joint_state = self.get_ros_observation()
 

@@ -160,6 +160,7 @@ class AlohaOperator(RosOperator):
         self._arm_message = arm_message or known.arm_message
         self._gripper_message = gripper_message or known.gripper_message
         self._camera_hz = camera_rate_hz
+        self._messages: dict[str, Any] = {}
         self._drive = BaseDrive(
             lambda message: self.publish(self._base_topics[1], message),
             lambda: message_class(TWIST)(),
@@ -289,7 +290,11 @@ class AlohaOperator(RosOperator):
     def _command(
         self, topic: str, message: str, names: Sequence[str], values: Array, group: str
     ) -> None:
-        self.publish(topic, fill_command(message_class(message)(), names, values, group))
+        # One message a topic, filled anew: the middleware copies it when it is published.
+        command = self._messages.get(topic)
+        if command is None:
+            command = self._messages[topic] = message_class(message)()
+        self.publish(topic, fill_command(command, names, values, group))
 
 
 def fill_command(message: Any, names: Sequence[str], values: Array, group: str) -> Any:

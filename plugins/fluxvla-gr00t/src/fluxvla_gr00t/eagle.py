@@ -8,7 +8,7 @@ from transformers import Qwen3Config, Qwen3Model, SiglipVisionConfig, SiglipVisi
 from fluxvla_core.errors import ConfigError
 from fluxvla_gr00t.context import Context
 from fluxvla_gr00t.image_tokens import (
-    check_image_token,
+    image_token_of,
     image_token_positions,
     merge_image_features,
 )
@@ -28,7 +28,7 @@ class EagleBackbone(nn.Module):
         text_dim, text_layers, text_heads, text_kv_heads, text_head_dim, text_mlp, vocabulary: the
             language model; ``text_layers`` is the published ``select_layer``.
         rope_theta: base of its rotary positions.
-        picture_token: the token that stands for a part of an image, ``<IMG_CONTEXT>``.
+        image_token: the token that stands for a part of an image, ``<IMG_CONTEXT>``.
     """
 
     def __init__(
@@ -47,7 +47,8 @@ class EagleBackbone(nn.Module):
         text_mlp: int = 6144,
         vocabulary: int = 151680,
         rope_theta: float = 1e6,
-        picture_token: int = 151669,
+        image_token: int = 151669,
+        picture_token: int | None = None,
     ) -> None:
         super().__init__()
         if image_size % patch_size:
@@ -55,10 +56,10 @@ class EagleBackbone(nn.Module):
                 f"EagleBackbone: image_size {image_size} is not a multiple of patch_size "
                 f"{patch_size}"
             )
-        check_image_token("EagleBackbone", picture_token, vocabulary)
+        image_token = image_token_of("EagleBackbone", image_token, picture_token, vocabulary)
         self.out_dim = text_dim
         self.image_size = image_size
-        self.picture_token = picture_token
+        self.image_token = image_token
         self.tokens_per_image = (image_size // patch_size) ** 2
         self.vision = SiglipVisionModel(
             SiglipVisionConfig(
@@ -104,7 +105,7 @@ class EagleBackbone(nn.Module):
         """
         count = _count(images, self.image_size)
         image_mask, mask = image_token_positions(
-            lang_tokens, lang_masks, img_masks, self.picture_token, count, self.tokens_per_image
+            lang_tokens, lang_masks, img_masks, self.image_token, count, self.tokens_per_image
         )
         pixels = images.unflatten(1, (count, 3)).flatten(0, 1)
         features = self.connect(self.vision(pixel_values=pixels).last_hidden_state)

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from torch import Tensor
 
 from fluxvla_core.errors import ConfigError
 
 
-def check_image_token(who: str, picture_token: int, vocabulary: int) -> None:
-    """Refuse a ``picture_token`` that is not among ``vocabulary`` tokens, with a ConfigError."""
-    if not 0 <= picture_token < vocabulary:
+def image_token_of(who: str, image_token: int, picture_token: int | None, vocabulary: int) -> int:
+    """The token that stands for a part of an image; ``picture_token`` is its deprecated name.
+
+    Raises:
+        ConfigError: it is not among ``vocabulary`` tokens.
+    """
+    if picture_token is not None:
+        message = f"{who}: picture_token is deprecated, use image_token"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        image_token = picture_token
+    if not 0 <= image_token < vocabulary:
         raise ConfigError(
-            f"{who}: picture_token {picture_token} is not one of the {vocabulary} tokens of the "
+            f"{who}: image_token {image_token} is not one of the {vocabulary} tokens of the "
             "vocabulary"
         )
+    return image_token
 
 
 def image_token_positions(

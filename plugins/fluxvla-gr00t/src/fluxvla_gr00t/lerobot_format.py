@@ -12,9 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from fluxvla_models.lerobot_files import POSTPROCESSOR, PREPROCESSOR, Step, read_steps, whole
+from fluxvla_models.lerobot_files import (
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    Step,
+    policy_type,
+    read_steps,
+    whole,
+)
 
-from fluxvla_core.errors import CheckpointError, FluxError
+from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
 from fluxvla_gr00t.lerobot_write import write
@@ -70,11 +77,7 @@ class LeRobotGR00TFormat(CheckpointFormat):
 
     def recognizes(self, folder: Path) -> bool:
         """Whether its ``config.json`` says ``"type": "groot"``."""
-        try:
-            config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
-        except FluxError:
-            return False
-        return config.get("type") == "groot"
+        return policy_type(folder) == "groot"
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()

@@ -11,7 +11,7 @@ from transformers import Qwen3VLConfig, Qwen3VLModel
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import has_values
 from fluxvla_gr00t.context import Context
-from fluxvla_gr00t.image_tokens import check_image_token, image_token_positions
+from fluxvla_gr00t.image_tokens import image_token_of, image_token_positions
 
 
 class Qwen3VLBackbone(nn.Module):
@@ -30,7 +30,7 @@ class Qwen3VLBackbone(nn.Module):
         text_dim, text_layers, text_heads, text_kv_heads, text_head_dim, text_mlp, vocabulary: the
             language model; ``text_layers`` is the published ``select_layer``.
         rope_theta, rope_sections: its rotary positions, in time, height and width.
-        picture_token: the token that stands for a part of an image, ``<|image_pad|>``.
+        image_token: the token that stands for a part of an image, ``<|image_pad|>``.
     """
 
     def __init__(
@@ -52,10 +52,11 @@ class Qwen3VLBackbone(nn.Module):
         vocabulary: int = 151936,
         rope_theta: float = 5e6,
         rope_sections: Sequence[int] = (24, 20, 20),
-        picture_token: int = 151655,
+        image_token: int = 151655,
+        picture_token: int | None = None,
     ) -> None:
         super().__init__()
-        check_image_token("Qwen3VLBackbone", picture_token, vocabulary)
+        image_token = image_token_of("Qwen3VLBackbone", image_token, picture_token, vocabulary)
         if max(deepstack, default=0) >= vision_layers or len(deepstack) > text_layers:
             raise ConfigError(
                 f"Qwen3VLBackbone: deepstack {list(deepstack)} names layers that "
@@ -67,13 +68,13 @@ class Qwen3VLBackbone(nn.Module):
                 f"{sum(rope_sections)}, half of text_head_dim {text_head_dim} is expected"
             )
         self.out_dim = text_dim
-        self.picture_token = picture_token
+        self.image_token = image_token
         self.patch_size, self.merge = patch_size, merge
         self.model = Qwen3VLModel(
             Qwen3VLConfig(
-                image_token_id=picture_token,
+                image_token_id=image_token,
                 # Videos are not used; any other token will do.
-                video_token_id=(picture_token + 1) % vocabulary,
+                video_token_id=(image_token + 1) % vocabulary,
                 attn_implementation="sdpa",
                 vision_config={
                     "depth": vision_layers,
@@ -130,7 +131,7 @@ class Qwen3VLBackbone(nn.Module):
             )
         count, tokens_per_image = planes // 3, (height // side) * (width // side)
         image_mask, mask = image_token_positions(
-            lang_tokens, lang_masks, img_masks, self.picture_token, count, tokens_per_image
+            lang_tokens, lang_masks, img_masks, self.image_token, count, tokens_per_image
         )
         if not has_values(images) and not any(p.requires_grad for p in self.parameters()):
             # transformers finds image tokens by their values, which meta tensors do not have; for a

@@ -158,7 +158,7 @@ class LiberoScene:
         with left and right exchanged."""
         if self._drawing is None:
             self._drawing = Drawing(self.model, self._render, SHOWN_GROUPS)
-        upright = self._drawing.picture(self._shown, camera, height, width)
+        upright = self._drawing.image(self._shown, camera, height, width)
         return np.ascontiguousarray(upright[:, ::-1])
 
     def state_hash(self) -> str:

@@ -186,7 +186,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
             getattr(shown, name)[:] = getattr(data, name)
         for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
             update(model, shown)
-        seen = self._drawing.picture(shown, camera.name, camera.height, camera.width)
+        seen = self._drawing.image(shown, camera.name, camera.height, camera.width)
         return np.ascontiguousarray(seen[::-1, ::-1]) if camera.name in TURNED else seen
 
     def _build(self, task: str) -> None:

@@ -44,6 +44,19 @@ class Step:
     tensors: Mapping[str, Stored]
 
 
+def policy_type(folder: Path) -> str | None:
+    """Which of LeRobot's policies ``folder`` holds (``act``, ``pi05``), by its ``config.json``.
+
+    None if it is not a folder of LeRobot's, or its config cannot be read.
+    """
+    try:
+        config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
+    except CheckpointError:
+        return None
+    kind = config.get("type")
+    return kind if isinstance(kind, str) and "input_features" in config else None
+
+
 def read_steps(folder: Path, stem: str, known: Collection[str] | None = None) -> list[Step]:
     """The steps of ``<stem>.json`` in ``folder``.
 

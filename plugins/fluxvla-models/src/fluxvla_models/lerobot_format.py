@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from fluxvla_models.lerobot_statistics import read_normalization, tables
 from fluxvla_models.lerobot_write import write_act, write_diffusion
@@ -41,16 +41,12 @@ class _LeRobotFormat(CheckpointFormat):
         """Actions in a chunk."""
 
     def recognizes(self, folder: Path) -> bool:
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") == self.kind and "input_features" in config
+        return policy_type(folder) == self.kind
 
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        cameras, size = pictures(config, where)
+        cameras, size = image_features(config, where)
         joints, dim = width(config, "input_features", STATE, where), action_dim(config, where)
         model = self.model(config, where)
         normalization = read_normalization(folder, config)
@@ -199,7 +195,7 @@ def features_of(
     return features
 
 
-def pictures(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
+def image_features(config: Mapping[str, Any], where: str) -> tuple[list[str], tuple[int, int]]:
     """The policy's cameras, by feature, and the height and width of their images.
 
     Raises:
@@ -246,7 +242,7 @@ def _common(config: Mapping[str, Any], where: str) -> dict[str, Any]:
     return {
         "state_dim": width(config, "input_features", STATE, where),
         "action_dim": action_dim(config, where),
-        "num_cameras": len(pictures(config, where)[0]),
+        "num_cameras": len(image_features(config, where)[0]),
         "backbone": _value(config, "vision_backbone", where),
     }
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -151,7 +152,7 @@ class Drawing:
         self._renderers: dict[tuple[int, int], Any] = {}
         self._option: Any = None
 
-    def picture(self, data: Any, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
+    def image(self, data: Any, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
         """A new ``(height, width, 3)`` uint8 RGB array of what ``camera`` sees, its top row first.
 
         Args:
@@ -164,6 +165,12 @@ class Drawing:
         renderer.update_scene(data, camera, self._option)
         seen: npt.NDArray[np.uint8] = renderer.render()
         return seen.copy()
+
+    def picture(self, data: Any, camera: str, height: int, width: int) -> npt.NDArray[np.uint8]:
+        """Deprecated name of :meth:`image`."""
+        message = "Drawing.picture is deprecated, use image"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return self.image(data, camera, height, width)
 
     def close(self) -> None:
         """Free the contexts; any number of times."""

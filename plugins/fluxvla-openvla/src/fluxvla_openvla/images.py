@@ -56,8 +56,8 @@ class ResizeOpenVLAImages(Transform):
         from PIL import Image as Pillow
 
         how = Pillow.Resampling[self.interpolation.upper()]
-        picture = Pillow.fromarray(np.ascontiguousarray(image.transpose(1, 2, 0)))
-        out = np.asarray(picture.resize((self.size, self.size), how))
+        whole = Pillow.fromarray(np.ascontiguousarray(image.transpose(1, 2, 0)))
+        out = np.asarray(whole.resize((self.size, self.size), how))
         return np.ascontiguousarray(out.transpose(2, 0, 1))
 
 

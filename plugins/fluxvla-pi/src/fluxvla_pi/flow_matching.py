@@ -322,7 +322,7 @@ class PiFlowMatching(VLA, nn.Module):
         lang_tokens: Tensor,
         lang_masks: Tensor,
     ) -> Prefix:
-        """Pictures ``(B, 3N, H, W)`` and words ``(B, L)`` as one row of tokens, pictures first."""
+        """Images ``(B, 3N, H, W)`` and words ``(B, L)`` as one row of tokens, images first."""
         parts = (self.vision_backbone, self.projector, self.llm_backbone)
         return embed_prefix(*parts, images, img_masks, lang_tokens, lang_masks)
 

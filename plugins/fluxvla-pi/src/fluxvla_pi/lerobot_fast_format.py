@@ -11,44 +11,42 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_models.fast_tokenizer import SETTINGS
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE
+from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
 
 from fluxvla_core.data import PretrainedTokenizer
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, without_cameras
 from fluxvla_core.results import read_json
 from fluxvla_pi.action_tokens import ActionWords
+from fluxvla_pi.lerobot_fast_write import TOKENIZER, write_fast
 from fluxvla_pi.lerobot_format import (
     cameras_in,
     count_of,
     features_of,
     normalization,
     notes_of,
-    of_pictures,
+    of_images,
     of_words,
     resolution_of,
     statistics_of,
     width_of,
 )
 from fluxvla_pi.lerobot_processors import from_files
+from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.published import FAST, weights_in
 
 _FIXED = {"n_obs_steps": 1, "use_peft": False}
-_TOKENIZER = "lerobot/fast-action-tokenizer"
 
 
 class LeRobotPi0FastFormat(CheckpointFormat):
     """LeRobot's ``pi0_fast`` policies."""
 
     name: ClassVar[str] = "lerobot"
+    model_types: ClassVar[Sequence[str]] = (PI0FAST.__name__,)
 
     def recognizes(self, folder: Path) -> bool:
         """Whether ``config.json`` is of such a policy."""
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") == FAST
+        return policy_type(folder) == FAST
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()
@@ -57,7 +55,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
 
         Args:
             tokenizer: the folder of PaliGemma's tokenizer.
-            absent: cameras without pictures, which LeRobot masks.
+            absent: cameras without images, which LeRobot masks.
 
         Raises:
             CheckpointError: it is damaged, does something that PI0-FAST here does not, or the
@@ -106,7 +104,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
             tensors=weights.tensors,
             img_keys=without_cameras(cameras_in(inputs, where), absent, where),
             transforms=[
-                *of_pictures(resolution_of(config, where)),
+                *of_images(resolution_of(config, where)),
                 normalization(preparation),
                 {"type": "PreparePromptWithState", "ending": ""},
                 of_words(preparation, tokenizer),
@@ -117,10 +115,14 @@ class LeRobotPi0FastFormat(CheckpointFormat):
             notes=notes_of(preparation, tokenizer),
         )
 
+    def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
+        """Write ``checkpoint`` into ``folder``; see ``CheckpointFormat``."""
+        write_fast(checkpoint, folder)
+
 
 def _action_tokenizer(folder: Path, config: Mapping[str, Any], where: str) -> Path:
     """The folder of the FAST tokenizer."""
-    name = str(config.get("action_tokenizer_name", _TOKENIZER))
+    name = str(config.get("action_tokenizer_name", TOKENIZER))
     inside = folder / Path(name).name
     for place in (Path(name), inside):
         if (place / SETTINGS).is_file():

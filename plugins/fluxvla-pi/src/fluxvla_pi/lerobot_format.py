@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE
+from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE, policy_type
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
@@ -48,11 +48,7 @@ class LeRobotPiFormat(CheckpointFormat):
 
     def recognizes(self, folder: Path) -> bool:
         """Whether ``config.json`` is of such a policy."""
-        try:
-            config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
-        except CheckpointError:
-            return False
-        return config.get("type") in FAMILIES
+        return policy_type(folder) in FAMILIES
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()
@@ -61,7 +57,7 @@ class LeRobotPiFormat(CheckpointFormat):
 
         Args:
             tokenizer: the folder of PaliGemma's tokenizer.
-            absent: cameras without pictures, which LeRobot masks.
+            absent: cameras without images, which LeRobot masks.
 
         Raises:
             CheckpointError: it is damaged, or does something that PI0 here does not.
@@ -115,19 +111,24 @@ class LeRobotPiFormat(CheckpointFormat):
         family = next(
             f for f, kind in FAMILIES.items() if kind.__name__ in checkpoint.model["type"]
         )
-        config = _config(checkpoint, family)
-        tensors = weights_to_write(checkpoint, LEROBOT)
-        narrow = tensors[f"{LEROBOT.root}action_in_proj.weight"].dtype == torch.bfloat16
-        config["dtype"] = "bfloat16" if narrow else "float32"
-        features = {**config["input_features"], **config["output_features"]}
-        names = action_names(checkpoint)
-        write_processors(folder, family, features, _preparation(checkpoint, family), names)
-        save_file(tensors, folder / "model.safetensors", {"format": "pt"})
-        (folder / CONFIG).write_text(json.dumps(config, indent=4), encoding="utf-8")
+        _check_sizes(checkpoint)
+        if family == "pi0":
+            only(table_of(checkpoint, "PreparePrompt"), "clean", False, True)
+        else:
+            only(table_of(checkpoint, "PreparePromptWithState"), "state_dim", None, None)
+        model = checkpoint.model
+        more = {
+            "action_expert_variant": "gemma_300m",
+            "max_action_dim": model.get("max_action_dim", 32),
+            "num_inference_steps": model.get("num_steps", 10),
+        }
+        if family == "pi0":
+            more["max_state_dim"] = model.get("max_state_dim", 32)
+        write_policy(checkpoint, family, more, folder)
 
 
 def resolution_of(config: Mapping[str, Any], where: str) -> list[int]:
-    """Height and width that pictures are brought to."""
+    """Height and width that images are brought to."""
     size = config.get("image_resolution", [224, 224])
     if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
         raise CheckpointError(f"image_resolution is {size!r}, not two numbers", where=where)
@@ -182,11 +183,11 @@ def _transforms(
         prompt: dict[str, Any] = {"type": "PreparePrompt", "clean": False}
     else:
         prompt = {"type": "PreparePromptWithState"}
-    return [*of_pictures(size), numbers, prompt, of_words(preparation, tokenizer)]
+    return [*of_images(size), numbers, prompt, of_words(preparation, tokenizer)]
 
 
-def of_pictures(size: Sequence[int]) -> list[dict[str, Any]]:
-    """The transforms that bring pictures to ``size``, height and width."""
+def of_images(size: Sequence[int]) -> list[dict[str, Any]]:
+    """The transforms that bring images to ``size``, height and width."""
     height, width = size
     resize = {"type": "ResizeImagesWithPad", "height": height, "width": width}
     return [{**resize, "interpolation": "linear"}, {"type": "SimpleNormalizeImages"}]
@@ -250,7 +251,39 @@ def notes_of(preparation: Preparation, tokenizer: str | None) -> list[str]:
 # -- writing ---------------------------------------------------------------------------------
 
 
-def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
+def write_policy(
+    checkpoint: ForeignCheckpoint,
+    family: str,
+    more: Mapping[str, Any],
+    folder: Path,
+    action_tokens: Mapping[str, Any] | None = None,
+) -> None:
+    """Write config, weights and processors into the empty ``folder``.
+
+    Args:
+        family: LeRobot's ``type`` of the policy.
+        more: settings of its config besides those of every family.
+        action_tokens: as of ``write_processors``.
+
+    Raises:
+        CheckpointError: LeRobot's processors cannot prepare observations as they are here.
+    """
+    preparation = _preparation(checkpoint)
+    tensors = weights_to_write(checkpoint, LEROBOT)
+    narrow = tensors[LEROBOT.theirs("llm_backbone.norm.weight")].dtype == torch.bfloat16
+    config = {
+        **_config(checkpoint, family, preparation),
+        **more,
+        "dtype": "bfloat16" if narrow else "float32",
+    }
+    features = {**config["input_features"], **config["output_features"]}
+    names = action_names(checkpoint)
+    write_processors(folder, family, features, preparation, names, action_tokens)
+    save_file(tensors, folder / "model.safetensors", {"format": "pt"})
+    (folder / CONFIG).write_text(json.dumps(config, indent=4) + "\n", encoding="utf-8")
+
+
+def _check_sizes(checkpoint: ForeignCheckpoint) -> None:
     model = checkpoint.model
     sizes = {key: model.get(key, default) for key, default in _VARIANTS.items()}
     if sizes != _VARIANTS or model.get("vocab_size", 257152) != VOCABULARY:
@@ -258,6 +291,10 @@ def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
             f"LeRobot's policies have the sizes {', '.join(_VARIANTS.values())}; this one has "
             f"{', '.join(map(str, sizes.values()))}"
         )
+
+
+def _config(checkpoint: ForeignCheckpoint, family: str, preparation: Preparation) -> dict[str, Any]:
+    """What the config of every family has."""
     resize = table_of(checkpoint, "ResizeImagesWithPad")
     only(resize, "interpolation", "linear", "antialias")
     size = [int(resize["height"]), int(resize["width"])]
@@ -270,7 +307,6 @@ def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
     entries = checkpoint.statistics["private"]
     widths = {key: len(entries[entry]["mean"]) for key, entry in KEYS.items()}
     inputs[STATE] = {"type": "STATE", "shape": [widths[STATE]]}
-    preparation = _preparation(checkpoint, family)
     theirs = {ours: mode for mode, ours in MODES.items()}
     names = action_names(checkpoint)
     config: dict[str, Any] = {
@@ -280,11 +316,8 @@ def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
         "output_features": {ACTION: {"type": "ACTION", "shape": [widths[ACTION]]}},
         "device": "cpu",
         "paligemma_variant": "gemma_2b",
-        "action_expert_variant": "gemma_300m",
         "chunk_size": checkpoint.horizon,
         "n_action_steps": checkpoint.horizon,
-        "max_action_dim": model.get("max_action_dim", 32),
-        "num_inference_steps": model.get("num_steps", 10),
         "image_resolution": size,
         "normalization_mapping": {
             "VISUAL": "IDENTITY",
@@ -293,8 +326,6 @@ def _config(checkpoint: ForeignCheckpoint, family: str) -> dict[str, Any]:
         },
         "tokenizer_max_length": preparation.max_length,
     }
-    if family == "pi0":
-        config["max_state_dim"] = model.get("max_state_dim", 32)
     if preparation.relative is not None:
         config["use_relative_actions"] = True
         config["action_feature_names"] = None if names is None else list(names)
@@ -305,7 +336,7 @@ VOCABULARY = 257152
 _VARIANTS = {"variant": "gemma_2b", "expert_variant": "gemma_300m", "vision_variant": "so400m"}
 
 
-def _preparation(checkpoint: ForeignCheckpoint, family: str) -> Preparation:
+def _preparation(checkpoint: ForeignCheckpoint) -> Preparation:
     """What LeRobot's processors must do to act as ``checkpoint``.
 
     Raises:
@@ -314,10 +345,6 @@ def _preparation(checkpoint: ForeignCheckpoint, family: str) -> Preparation:
     numbers = table_of(checkpoint, "NormalizeStatesAndActions")
     only(numbers, "std_floor", 0.0, 0.0)
     only(numbers, "action_norm_mask", None, None)
-    if family == "pi0":
-        only(table_of(checkpoint, "PreparePrompt"), "clean", False, True)
-    else:
-        only(table_of(checkpoint, "PreparePromptWithState"), "state_dim", None, None)
     words = table_of(checkpoint, "ProcessPrompts")
     mode = numbers.get("norm_type", "mean_std")
     modes = {STATE: numbers.get("state_norm_type") or mode, ACTION: mode}

@@ -1,4 +1,4 @@
-"""LeRobot's processors of PI0 and PI0.5: what they do to observations and actions, and their files.
+"""LeRobot's processors of the PI models: what they do to observations and actions, and their files.
 
 ``policy_preprocessor.json`` lists steps; the statistics lie next to it, in the file that the
 normalizer's step names, flat as ``<feature>.<statistic>`` (LeRobot 0.4 and later). Before, they
@@ -20,6 +20,7 @@ from fluxvla_models.lerobot_files import (
     STATE,
     read_steps,
     whole,
+    write_steps,
 )
 
 from fluxvla_core.errors import CheckpointError
@@ -157,6 +158,7 @@ def write_processors(
     features: Mapping[str, Mapping[str, Any]],
     preparation: Preparation,
     names: Sequence[str] | None,
+    action_tokens: Mapping[str, Any] | None = None,
 ) -> None:
     """Write both processors of ``family`` into ``folder``.
 
@@ -164,11 +166,8 @@ def write_processors(
         features: all of them as LeRobot's config has them, those of actions last.
         preparation: with ``epsilon_if_zero`` and LeRobot's epsilon.
         names: of the actions, where some are relative.
+        action_tokens: settings of the step that writes actions as tokens, of PI0-FAST.
     """
-    import json
-
-    from safetensors.torch import save_file
-
     theirs = {ours: mode for mode, ours in MODES.items()}
     normalizer = {
         "eps": preparation.epsilon,
@@ -192,9 +191,11 @@ def write_processors(
                 "truncation": True,
                 "tokenizer_name": TOKENIZER,
             },
-        ),
-        ("device_processor", {"device": "cpu", "float_dtype": None}),
+        )
     ]
+    if action_tokens is not None:
+        words.append(("action_tokenizer_processor", dict(action_tokens)))
+    words.append(("device_processor", {"device": "cpu", "float_dtype": None}))
     numbers: list[tuple[str, dict[str, Any]]] = [
         (
             "relative_actions_processor",
@@ -213,7 +214,7 @@ def write_processors(
     if family == "pi0":
         steps = [*first, ("pi0_new_line_processor", {}), *words, *numbers]
     else:
-        steps = [*first, *numbers, ("pi05_prepare_state_tokenizer_processor_step", {}), *words]
+        steps = [*first, *numbers, (f"{family}_prepare_state_tokenizer_processor_step", {}), *words]
     action = {ACTION: features[ACTION]}
     after: list[tuple[str, dict[str, Any]]] = [
         ("unnormalizer_processor", {**normalizer, "features": action}),
@@ -225,16 +226,11 @@ def write_processors(
         for key, rows in preparation.statistics.items()
         for name, row in rows.items()
     }
-    for name, listed in ((PREPROCESSOR, steps), (POSTPROCESSOR, after)):
-        written = []
-        for place, (step, config) in enumerate(listed):
-            entry: dict[str, Any] = {"registry_name": step, "config": config}
-            if step.endswith("normalizer_processor") and tensors:
-                entry["state_file"] = f"{name}_step_{place}_{step}.safetensors"
-                save_file(tensors, folder / entry["state_file"])
-            written.append(entry)
-        text = json.dumps({"name": name, "steps": written}, indent=2)
-        (folder / f"{name}.json").write_text(text, encoding="utf-8")
+    for stem, listed in ((PREPROCESSOR, steps), (POSTPROCESSOR, after)):
+        states = (tensors if step.endswith("normalizer_processor") else {} for step, _ in listed)
+        write_steps(
+            folder, stem, [(*step, state) for step, state in zip(listed, states, strict=True)]
+        )
 
 
 def _setting(
@@ -258,7 +254,7 @@ def _modes(given: Any, where: str) -> dict[str, str]:
         )
     if given.get("VISUAL", "IDENTITY") != "IDENTITY":
         raise CheckpointError(
-            f"pictures are normalized by {given['VISUAL']}; PI0 and PI0.5 take them as they are",
+            f"images are normalized by {given['VISUAL']}; PI0 and PI0.5 take them as they are",
             where=where,
         )
     return {

@@ -155,14 +155,15 @@ def actual_names(names: Iterable[str], layout: Layout) -> dict[str, str]:
 def published(ours: Collection[str], layout: Layout) -> dict[str, str]:
     """Names to write -> our names that they are filled from, for ``layout``.
 
-    The embedding stands under both of its names in LeRobot's, under the head's in openpi's, as
-    their own files have it. ``layout.unused`` is not among them.
+    The embedding stands under both of its names in LeRobot's, but where the head is not tied to
+    it, and under the head's in openpi's, as their own files have it. ``layout.unused`` is not among
+    them.
     """
     found = {layout.theirs(name): name for name in ours}
     if layout.head:
         if layout is OPENPI:
             del found[layout.theirs(_EMBEDDING)]
-        found[layout.head] = _EMBEDDING
+        found.setdefault(layout.head, _EMBEDDING)
     return found
 
 

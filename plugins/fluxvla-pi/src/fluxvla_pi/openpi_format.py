@@ -61,7 +61,7 @@ class OpenPiFormat(CheckpointFormat):
         Args:
             tokenizer: the folder of PaliGemma's tokenizer.
             robot: the folder below ``assets`` that has its statistics.
-            absent: cameras without pictures, which openpi masks.
+            absent: cameras without images, which openpi masks.
 
         Raises:
             CheckpointError: it is damaged, or of a model that is not built here.

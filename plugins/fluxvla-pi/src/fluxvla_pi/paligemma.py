@@ -1,4 +1,4 @@
-"""PaliGemma (Beyer et al. 2024, arXiv 2407.07726): pictures and words as one row of tokens."""
+"""PaliGemma (Beyer et al. 2024, arXiv 2407.07726): images and words as one row of tokens."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Prefix:
 
     @property
     def rope_positions(self) -> Tensor:
-        """``(B, P)``: padding takes no place."""
-        return self.real.long().cumsum(1) - 1
+        """``(B, P)``: :func:`rope_positions` of its tokens."""
+        return rope_positions(self.real)
 
     @property
     def mask(self) -> Tensor:
@@ -35,6 +35,11 @@ class Prefix:
         Padding does so, too: nobody attends to it, and a row without any key has no softmax.
         """
         return self.real[:, None, None]
+
+
+def rope_positions(real: Tensor) -> Tensor:
+    """``(B, L)`` int64 of tokens that are ``real`` ``(B, L)``, or padding, which takes no place."""
+    return real.long().cumsum(1) - 1
 
 
 def embed_prefix(
@@ -46,7 +51,7 @@ def embed_prefix(
     lang_tokens: Tensor,
     lang_masks: Tensor,
 ) -> Prefix:
-    """Pictures and words as tokens, pictures first.
+    """Images and words as tokens, images first.
 
     Args:
         images: ``(B, 3N, H, W)`` in -1..1.

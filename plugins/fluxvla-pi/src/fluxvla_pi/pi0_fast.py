@@ -1,7 +1,7 @@
 """PI0-FAST (Pertsch et al. 2025, arXiv 2501.09747): PaliGemma that answers with action tokens.
 
 The state stands in the prompt. A chunk of actions is an answer in FAST tokens, one after the other:
-pictures and prompt attend to each other, the answer to them and to what it has said already. There
+images and prompt attend to each other, the answer to them and to what it has said already. There
 is no action expert, and nothing is denoised.
 """
 
@@ -22,7 +22,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA, built_without_memory, has_values
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.gemma import GemmaDecoder, rope_of
-from fluxvla_pi.paligemma import Prefix, embed_prefix
+from fluxvla_pi.paligemma import Prefix, embed_prefix, rope_positions
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, siglip_size
 
@@ -43,7 +43,7 @@ class PI0FAST(VLA, nn.Module):
             missing.
         temperature: of sampling; 0 takes the likeliest token.
         strict_decoding: see ``FastTokenizer.decode_actions``.
-        bos_in_prompt: when acting, pictures and prompt attend to the answer's first token, which
+        bos_in_prompt: when acting, images and prompt attend to the answer's first token, which
             they do not in training: as LeRobot's PI0-FAST acts.
         tied_head: the words that are answered are those that are embedded, as in PaliGemma; False
             trains both, as LeRobot does.
@@ -144,7 +144,7 @@ class PI0FAST(VLA, nn.Module):
         places = torch.arange(hidden.shape[1], device=hidden.device)
         # All of the prefix is one block; each token of the answer is one of its own.
         blocks = (places - prefix.hidden.shape[1] + 1).clamp(min=0)
-        hidden, _ = self._layers(hidden, _positions(real), _mask(blocks, real))
+        hidden, _ = self._layers(hidden, rope_positions(real), _mask(blocks, real))
         logits = self._logits(hidden[:, -said.shape[1] :])
         wanted, counted = action_tokens[:, 1:], action_token_masks[:, 1:].float()
         losses = functional.cross_entropy(
@@ -206,7 +206,7 @@ class PI0FAST(VLA, nn.Module):
         blocks = torch.zeros(hidden.shape[1], dtype=torch.long, device=hidden.device)
         if not self.bos_in_prompt:
             blocks[-1] = 1
-        hidden, known = self._layers(hidden, _positions(real), _mask(blocks, real))
+        hidden, known = self._layers(hidden, rope_positions(real), _mask(blocks, real))
         groups, dtype = self.llm_backbone.layers[0].groups, prefix.hidden.dtype
         ended, said = torch.zeros_like(one[:, 0]), []
         for step in range(self.max_decoding_steps):
@@ -219,7 +219,7 @@ class PI0FAST(VLA, nn.Module):
             real = torch.cat([real, one], dim=1)
             mask = folded_mask(real[:, None, None], groups, dtype)
             hidden = self.llm_backbone.embed(token).to(dtype)
-            hidden, known = self._layers(hidden, _positions(real)[:, -1:], mask, known)
+            hidden, known = self._layers(hidden, rope_positions(real)[:, -1:], mask, known)
         return torch.cat(said, dim=1)
 
     def _prefix(
@@ -302,11 +302,6 @@ class PI0FAST(VLA, nn.Module):
             self.words.check(built.vocab_size, "PI0FAST")
             self._tokenizer = built
         return self._tokenizer
-
-
-def _positions(real: Tensor) -> Tensor:
-    """``(B, L)``: padding takes no place."""
-    return real.long().cumsum(1) - 1
 
 
 def _mask(blocks: Tensor, real: Tensor) -> Tensor:

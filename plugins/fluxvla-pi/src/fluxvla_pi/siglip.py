@@ -59,7 +59,7 @@ class SiglipLayer(nn.Module):
 
 
 class SiglipVisionTower(nn.Module):
-    """Pictures of one size to one token a patch."""
+    """Images of one size to one token a patch."""
 
     def __init__(self, size: SiglipSize) -> None:
         super().__init__()
@@ -73,12 +73,12 @@ class SiglipVisionTower(nn.Module):
         """``(B, 3, H, W)`` in -1..1 -> ``(B, patches, width)``.
 
         Raises:
-            DataError: the pictures have another size than the tower was made for.
+            DataError: the images have another size than the tower was made for.
         """
         side = self.size.image_size
         if images.shape[1:] != (3, side, side):
             raise DataError(
-                f"the vision tower takes pictures of 3 x {side} x {side}, "
+                f"the vision tower takes images of 3 x {side} x {side}, "
                 f"got {' x '.join(str(n) for n in images.shape[1:])}",
                 next=f"dict(type='ResizeImagesWithPad', height={side}, width={side}) "
                 "in the dataset's transforms",

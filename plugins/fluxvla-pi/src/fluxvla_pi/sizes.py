@@ -38,7 +38,7 @@ class SiglipSize:
 
     @property
     def patches(self) -> int:
-        """Tokens of one picture."""
+        """Tokens of one image."""
         return (self.image_size // self.patch_size) ** 2
 
 

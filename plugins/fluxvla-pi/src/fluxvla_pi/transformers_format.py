@@ -1,6 +1,6 @@
 """PI0 as transformers saves it: ``PI0ForConditionalGeneration.save_pretrained``.
 
-Its files name no camera, and its processor scales and pads pictures in another way than openpi and
+Its files name no camera, and its processor scales and pads images in another way than openpi and
 LeRobot do, with which the model was made. So the weights are read, to be trained on.
 """
 
@@ -29,7 +29,7 @@ _FIXED: Mapping[tuple[str, ...], Any] = {
 }
 """Settings that no shape tells, and the values that are built here."""
 _NOTE = (
-    "transformers' files name no cameras, and its processor prepares pictures in another way than "
+    "transformers' files name no cameras, and its processor prepares images in another way than "
     "openpi and LeRobot: it can be trained on, and drives no robot"
 )
 

@@ -25,9 +25,9 @@ def weights_to_write(checkpoint: ForeignCheckpoint, layout: Layout) -> dict[str,
     names = published(list(checkpoint.tensors), layout)
     found = {theirs: _whole(checkpoint.tensors[ours]) for theirs, ours in names.items()}
     embedding = _whole(checkpoint.tensors["llm_backbone.embed_tokens.weight"])
-    width = checkpoint.tensors["action_in_proj.weight"].shape[0]
-    for name in layout.unused:
-        found[name] = torch.zeros(len(embedding), width, dtype=embedding.dtype)
+    expert = checkpoint.tensors.get("action_in_proj.weight")
+    for name in layout.unused if expert is not None else ():
+        found[name] = torch.zeros(len(embedding), expert.shape[0], dtype=embedding.dtype)
     owners: set[int] = set()
     for name, tensor in found.items():  # the format has no two names of one memory
         found[name] = tensor.clone() if tensor.data_ptr() in owners else tensor.contiguous()

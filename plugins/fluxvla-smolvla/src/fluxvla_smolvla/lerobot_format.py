@@ -8,9 +8,9 @@ from math import isqrt
 from pathlib import Path
 from typing import Any, ClassVar
 
-from fluxvla_models.lerobot_files import ACTION, BUFFERS, STATE
+from fluxvla_models.lerobot_files import ACTION, BUFFERS, STATE, policy_type
 
-from fluxvla_core.errors import CheckpointError, FluxError
+from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
@@ -57,11 +57,7 @@ class LeRobotSmolVLA(CheckpointFormat):
 
     def recognizes(self, folder: Path) -> bool:
         """Whether its ``config.json`` says ``"type": "smolvla"``."""
-        try:
-            config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
-        except FluxError:
-            return False
-        return config.get("type") == MODEL_TYPE
+        return policy_type(folder) == MODEL_TYPE
 
     def read(
         self, folder: Path, tokenizer: str | None = None, absent: Sequence[str] = ()

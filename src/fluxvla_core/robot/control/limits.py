@@ -240,7 +240,9 @@ class CommandLimiter:
         Raises:
             BadCommand: ``wanted`` has another shape or is not finite; nothing changes then.
         """
-        target = self._checked(wanted, "the command")
+        return self._step_to(self._checked(wanted, "the command"), speed)
+
+    def _step_to(self, target: Array, speed: float) -> tuple[Array, list[Clamp]]:
         self._started()
         before = self._raw
         # The share is of a speed, also where that is the command.
@@ -271,7 +273,7 @@ class CommandLimiter:
         commands = np.empty_like(rows)
         clamps = []
         for index, row in enumerate(rows):
-            commands[index], found = self.step(row, speed)
+            commands[index], found = self._step_to(row, speed)
             clamps.append(found)
         return commands, clamps
 
@@ -386,8 +388,9 @@ class CommandLimiter:
             raise BadCommand(
                 f"{what} has shape {array.shape}; {self.embodiment.name} takes ({len(names)},)"
             )
-        bad = [name for name, ok in zip(names, np.isfinite(array), strict=True) if not ok]
-        if bad:
+        finite = np.isfinite(array)
+        if not finite.all():
+            bad = [name for name, ok in zip(names, finite, strict=True) if not ok]
             raise BadCommand(f"{what} is not finite for {', '.join(bad)}")
         return array
 

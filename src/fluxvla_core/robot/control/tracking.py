@@ -80,7 +80,7 @@ class TrackingWatch:
             NotFollowing: a joint has been too far behind for too long.
         """
         self.seen = np.asarray(state, dtype=np.float64)
-        command = next((c for at, c in reversed(tuple(self._sent)) if at <= measured), None)
+        command = next((c for at, c in reversed(self._sent) if at <= measured), None)
         if command is None:
             return
         error = self._error(command, state)

@@ -114,7 +114,7 @@ class EpisodeRecorder(EpisodeObserver):
         robot, policy = self._robot, self._policy
         spec = robot.embodiment
         self._rate_hz = event.rate_hz
-        source = robot.pictures_after
+        source = robot.images_after
         names = {"state": spec.state_names, "action": spec.joint_names}
         recording = Recording(names, spec.camera_names, source) if self._everything else None
         self._trace = EpisodeTrace(self.folder, self._video_fps, recording)

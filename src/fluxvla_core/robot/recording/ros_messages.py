@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.data.lerobot import MOST_PIXELS
-from fluxvla_core.data.video_decode import picture_size
+from fluxvla_core.data.video_decode import image_size
 from fluxvla_core.errors import DataError, RunFailed
 from fluxvla_core.robot.recording.episode_log import parse_event
 from fluxvla_core.ros2.images import to_depth, to_millimetres
@@ -291,7 +291,7 @@ class Unpacker:
             )
         import cv2
 
-        size = picture_size(message.data.tobytes())
+        size = image_size(message.data.tobytes())
         small = size is not None and size[0] * size[1] <= MOST_PIXELS
         bgr = cv2.imdecode(message.data, cv2.IMREAD_COLOR) if small else None
         if bgr is None:

@@ -42,7 +42,7 @@ _POLL_S = 0.03
 
 Picture = npt.NDArray[np.uint8]
 Source = Callable[[str, float], tuple[Sequence[tuple[float, Picture]], int]]
-"""``pictures_after`` of an operator: camera and a time -> the kept ones of those that arrived
+"""``images_after`` of an operator: camera and a time -> the kept ones of those that arrived
 later, ``(stamp, image)``, oldest first, and how many arrived since it was connected. It must be
 safe to call from any thread."""
 

@@ -137,11 +137,11 @@ class InSimulation(RosOperator):
         """As the robot's operator; on ``clock``."""
         return super().state_stamp() * self.real_time_factor
 
-    def pictures_after(
+    def images_after(
         self, camera: str, after: float
     ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
         """As the robot's operator; times are on ``clock``."""
-        found, arrived = super().pictures_after(camera, after / self.real_time_factor)
+        found, arrived = super().images_after(camera, after / self.real_time_factor)
         return [(at * self.real_time_factor, image) for at, image in found], arrived
 
     def begin_episode(self, instruction: str, episode: int) -> None:

@@ -345,3 +345,11 @@ def test_a_full_disk_says_how_a_collection_goes_on(tmp_path, monkeypatch):
     assert caught.value.next == "make room, then run the same command with --resume"
     write(tmp_path / "out", resume=True)
     assert (tmp_path / "out" / "meta" / "info.json").is_file()
+
+
+def test_a_demonstrator_of_several_observations_is_refused(walk):
+    walker = walk.Walker()
+    walker.n_obs_steps = 2
+    world = walk.Walk()
+    with pytest.raises(ConfigError, match=r"Walker acts on 2 observations \(n_obs_steps\)"):
+        demonstrate(world, walker, world.spec.task("right"), 3, ())

@@ -57,6 +57,46 @@ def test_so_many_actions_of_a_chunk_are_used(walk):
     assert episode(walk.Walk(), Says(chunk), max_steps=12, replan_every=4)["calls"] == 3
 
 
+class LooksBack(Says):
+    """Keeps what its questions show."""
+
+    def reset(self, seed):
+        self.shown = []
+
+    def predict_action(self, observation):
+        seen = [*observation["history"], observation]
+        self.shown.append([float(each["qpos"][0]) for each in seen])
+        return self.chunk
+
+
+@pytest.mark.parametrize(
+    ("rate", "n_obs_steps", "replan_every", "steps"),
+    [
+        (10.0, 2, None, [[0, 0], [5, 6], [11, 12]]),
+        (10.0, 3, 1, [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]),
+        (5.0, 3, None, [[0, 0, 0], [2, 4, 6], [8, 10, 12]]),
+        (5.0, 4, 2, [[0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 2, 4], [0, 2, 4, 6]]),
+    ],
+)
+def test_a_policy_of_several_observations_gets_those_of_the_actions_before(
+    walk, rate, n_obs_steps, replan_every, steps
+):
+    actor = LooksBack([[0.01]] * 6, action_rate_hz=rate, n_obs_steps=n_obs_steps)
+    places = []
+    episode(
+        walk.Walk(), actor, max_steps=13, replan_every=replan_every,
+        on_step=lambda world, step: places.append(np.float32(world.state[0])),
+    )  # fmt: skip
+    assert len(set(places)) == 14
+    assert actor.shown[: len(steps)] == [[places[step] for step in each] for each in steps]
+
+
+def test_a_history_between_two_steps_is_refused(walk):
+    actor = LooksBack([[0.0]], action_rate_hz=4.0, n_obs_steps=2)
+    with pytest.raises(ConfigError, match=r"2 observations \(n_obs_steps\) 1/4 s apart"):
+        episode(walk.Walk(), actor)
+
+
 def test_the_policy_sees_what_it_asks_for_and_has_a_seed_of_its_own(walk):
     says = Says([[0.0]])
     episode(walk.Walk(), says, cameras=(Camera("eye", 8, 9),), policy_seed=100, max_steps=1)

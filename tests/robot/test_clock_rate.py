@@ -15,6 +15,7 @@ from fluxvla_core.robot.control.clock import (
     clock_of,
     in_lockstep,
 )
+from fluxvla_core.robot.control.sender import CommandRate
 
 
 class Stepped:
@@ -102,7 +103,7 @@ def test_after_a_reset_a_long_pause_is_no_miss():
     assert clock.slept[-1] == pytest.approx(105.04)
 
 
-def test_the_supervisor_is_called_at_each_beat_and_can_leave_the_loop():
+def test_the_supervisor_is_called_at_each_tick_and_can_leave_the_loop():
     beats = []
 
     def look():
@@ -110,8 +111,7 @@ def test_the_supervisor_is_called_at_each_beat_and_can_leave_the_loop():
         if len(beats) == 3:
             raise KeyError("enough")
 
-    rate = Rate(50, Stepped())
-    rate.on_tick = look
+    rate = CommandRate(50, Stepped(), 0.0, look)
     rate.sleep()
     rate.sleep()
     with pytest.raises(KeyError, match="enough"):

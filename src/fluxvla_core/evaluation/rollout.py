@@ -21,9 +21,8 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Tas
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import RunFailed, SpecMismatch
 from fluxvla_core.robot.control.chunks import interpolate, not_finite
-from fluxvla_core.robot.control.clamps import PassThrough
 from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.sender import CommandPipeline
+from fluxvla_core.robot.control.sender import CommandPipeline, PassThrough
 from fluxvla_core.robot.control.tracking import action_columns, action_values
 from fluxvla_core.spec.embodiment import Camera
 

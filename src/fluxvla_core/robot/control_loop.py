@@ -1,6 +1,7 @@
-"""The control loop of an episode: ask the policy, join its chunks, play them, until it is over.
+"""An episode's control loop (``ControlLoop``), and its checks at each tick (``Supervisor``).
 
-The thread that calls ``run`` alone sends commands, on the absolute deadlines of the control rate.
+The loop asks the policy, joins its chunks and plays them, until the episode is over. The thread
+that calls ``run`` alone sends commands, on the absolute deadlines of the control rate.
 On a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
 policy never keeps a command from being sent: without a chunk the arm brakes and holds, and after
 ``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still

@@ -10,8 +10,8 @@ process of its own:
 * ``busy, one process``: the same with ``control_process=False``.
 * ``idle``: nothing else runs.
 
-A beat whose command was not sent is skipped; late is a command more than 2 ms behind its deadline.
-Goals: with a process of its own under 0.5 % of the beats skipped, and 15 % of a core (``idle``).
+A tick whose command was not sent is skipped; late is a command more than 2 ms behind its deadline.
+Goals: with a process of its own under 0.5 % of the ticks skipped, and 15 % of a core (``idle``).
 Loopback only. Writes ``benchmarks/results/ur_rate.json``.
 """
 
@@ -136,12 +136,12 @@ def measured(name: str, seconds: float) -> dict[str, Any]:
         rows = [row for row in recording.of("command") if row["phase"] == "run"]
         (end,) = recording.of("end")
         found = json.loads(times.read_text(encoding="utf-8"))
-    beats = len(rows) + end["skipped_beats"]
+    ticks = len(rows) + end["skipped_beats"]
     late = np.array([row["ms"]["late"] for row in rows]) > LATE_S * 1e3
     return {
-        "beats": beats,
+        "beats": ticks,
         "skipped": end["skipped_beats"],
-        "skipped_share": round(end["skipped_beats"] / beats, 5),
+        "skipped_share": round(end["skipped_beats"] / ticks, 5),
         "late_share": round(float(late.mean()), 5),
         **({"control_core_share": found["core_share"]} if control_process else {}),
     }

@@ -53,7 +53,7 @@ def test_hundreds_of_adversarial_chunks(bench, seed):
 
 @pytest.mark.realtime
 def test_an_adversary_on_a_robot_in_real_time(bench, make_arm):
-    """Chunks replace each other while they are played, and beats come when they come."""
+    """Chunks replace each other while they are played, and ticks come when they come."""
     bench.arm = make_arm(realtime=True)
     bench.policy = Adversary(bench.arm.embodiment, 2)
 

@@ -160,8 +160,8 @@ def played(joiner, events, constant=None):
         due.append((observed + latency, chunk(shown, observed)))
     due.sort(key=lambda item: item[0])
     found = []
-    for beat in range(100):
-        now = beat * 0.04
+    for tick in range(100):
+        now = tick * 0.04
         while due and due[0][0] <= now:
             joiner.add(due.pop(0)[1], now)
         target = joiner.target(now)

@@ -1,4 +1,4 @@
-"""Clocks and the beat: deadlines do not drift, misses are skipped, simulations not waited for."""
+"""Clocks and the control rate: deadlines do not drift, misses are skipped, not made up for."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from fluxvla_core.robot.control.clock import (
     clock_of,
     in_lockstep,
 )
+from fluxvla_core.robot.control.sender import CommandRate
 
 
 class Stepped:
@@ -65,7 +66,7 @@ def test_a_missed_deadline_is_skipped_not_made_up_for():
 
     rate.sleep()
 
-    # Deadlines 100.04 to 100.10 are past at 100.11; the beat is the overdue one, the next in time.
+    # Deadlines 100.04 to 100.10 are past at 100.11; the tick is the overdue one, the next in time.
     assert rate.skipped == 3
     assert rate.late_s == pytest.approx(0.01)
     rate.sleep()
@@ -102,21 +103,20 @@ def test_after_a_reset_a_long_pause_is_no_miss():
     assert clock.slept[-1] == pytest.approx(105.04)
 
 
-def test_the_supervisor_is_called_at_each_beat_and_can_leave_the_loop():
-    beats = []
+def test_the_supervisor_is_called_at_each_tick_and_can_leave_the_loop():
+    ticks = []
 
     def look():
-        beats.append(rate.ticks)
-        if len(beats) == 3:
+        ticks.append(rate.ticks)
+        if len(ticks) == 3:
             raise KeyError("enough")
 
-    rate = Rate(50, Stepped())
-    rate.on_tick = look
+    rate = CommandRate(50, Stepped(), 0.0, look)
     rate.sleep()
     rate.sleep()
     with pytest.raises(KeyError, match="enough"):
         rate.sleep()
-    assert beats == [1, 2, 3]
+    assert ticks == [1, 2, 3]
 
 
 def test_a_lockstep_simulation_is_not_waited_for():

@@ -100,7 +100,7 @@ def test_a_simulated_latency_is_between_observation_and_chunk(bench, going, meth
 
     chunks = [row for row in bench.trace() if row["event"] == "chunk"][1:]
     took = [row["t"] - row["observed"] for row in chunks]
-    # It is there at the first beat after it.
+    # It is there at the first tick after it.
     np.testing.assert_allclose(took, np.ceil(latency * 50 - 1e-6) / 50, atol=1e-6)
     assert bench.arm.state[0] == pytest.approx(0.8, abs=0.05)
     bench.assert_within_limits()

@@ -112,7 +112,7 @@ def reader_of(clock: Any, took: float = 0.0) -> Any:
         clock.time += took
         return SimpleNamespace(observation={"qpos": made})
 
-    return SimpleNamespace(read=read, sample=read)
+    return read
 
 
 @pytest.mark.parametrize("took", [0.0, 0.03])
@@ -125,7 +125,8 @@ def test_what_is_missing_is_waited_for(took):
     def sleep(seconds: float) -> None:
         clock.time += seconds
 
-    history = ObservationHistory(reader_of(clock, took), robot, policy, 0.5, sleep)
+    read = reader_of(clock, took)
+    history = ObservationHistory(read, read, robot, policy, 0.5, sleep)
 
     def times(seen: Any) -> list[float]:
         return [each["qpos"] for each in (*seen["history"], seen)]

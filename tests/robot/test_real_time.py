@@ -47,8 +47,8 @@ def line(observed, start=0.0, slope=1.0):
 
 
 def test_nothing_is_under_way_at_first():
-    assert RealTime().ahead() is None
-    assert LatestOnly().ahead() is None
+    assert RealTime().previous_chunk() is None
+    assert LatestOnly().previous_chunk() is None
 
 
 def test_the_rest_of_the_chunk_is_read_off_at_the_times_of_the_new_one():
@@ -56,7 +56,7 @@ def test_the_rest_of_the_chunk_is_read_off_at_the_times_of_the_new_one():
     joiner.add(line(observed=5.0), now=5.25)
 
     # Observed 0.33 s later: no multiple of an action.
-    found = joiner.ahead().seen_at(5.33, HORIZON)
+    found = joiner.previous_chunk().continuation(5.33, HORIZON)
 
     times = 0.33 + (np.arange(HORIZON) + 1) / RATE
     np.testing.assert_allclose(found.actions[:, 0], np.minimum(times, 1.0))
@@ -71,7 +71,7 @@ def test_the_longest_of_the_last_latencies_is_expected():
     for number, latency in enumerate([0.35, 0.1, 0.1, 0.1, 0.2]):
         observed = float(number)
         joiner.add(line(observed), now=observed + latency)
-        frozen.append(joiner.ahead().seen_at(observed + 0.1, HORIZON).frozen)
+        frozen.append(joiner.previous_chunk().continuation(observed + 0.1, HORIZON).frozen)
 
     # A spike is remembered for three answers, then forgotten.
     assert frozen == [4, 4, 4, 1, 2]
@@ -80,17 +80,17 @@ def test_the_longest_of_the_last_latencies_is_expected():
 def test_a_chunk_that_is_over_before_the_new_one_begins_binds_nothing():
     joiner = RealTime()
     joiner.add(line(observed=0.0), now=0.1)
-    ahead = joiner.ahead()
+    ahead = joiner.previous_chunk()
 
-    assert ahead.seen_at(1.0, HORIZON) is None
-    assert ahead.seen_at(0.85, HORIZON).weights[1:].tolist() == [0.0] * 9
+    assert ahead.continuation(1.0, HORIZON) is None
+    assert ahead.continuation(0.85, HORIZON).weights[1:].tolist() == [0.0] * 9
 
 
 def test_a_latency_beyond_what_is_known_freezes_all_of_it():
     joiner = RealTime()
     joiner.add(line(observed=0.0), now=0.9)
 
-    found = joiner.ahead().seen_at(0.5, HORIZON)
+    found = joiner.previous_chunk().continuation(0.5, HORIZON)
     assert found.frozen == 5
     assert found.weights.tolist() == [1.0] * 5 + [0.0] * 5
 
@@ -99,7 +99,7 @@ def test_an_answer_in_no_time_freezes_nothing():
     joiner = RealTime()
     joiner.add(line(observed=2.0), now=2.0)
 
-    assert joiner.ahead().seen_at(2.1, HORIZON).frozen == 0
+    assert joiner.previous_chunk().continuation(2.1, HORIZON).frozen == 0
 
 
 def test_the_old_chunk_is_played_up_to_the_first_action_that_is_not_over():
@@ -159,8 +159,8 @@ def test_a_policy_that_keeps_to_what_is_frozen_leaves_no_seam(seed, rounds):
     path = []
     for pause, share in rounds:
         observed = now + pause
-        ahead = joiner.ahead()
-        found = ahead.seen_at(observed, HORIZON)
+        ahead = joiner.previous_chunk()
+        found = ahead.continuation(observed, HORIZON)
         arrives = observed + share * 0.3
         if found is None or found.frozen < math.ceil(share * 3 - 1e-6):
             break

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.control.clock import Rate, SimulatedClock
+from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.control.sender import CommandSender
@@ -23,11 +23,12 @@ class Rig:
         self.latch = Latch(lambda: 4.0)
         self.path = CommandSender(
             execute or self.execute,
-            Rate(50, SimulatedClock()),
+            50,
+            SimulatedClock(),
             self.limiter,
             self.latch,
             filters,
-            self.sent.append,
+            lambda sent, sent_at, late_s: self.sent.append(sent),
         )
 
     def execute(self, actions, rate):
@@ -41,10 +42,10 @@ def pushes(values):
     return np.abs(np.diff(speed)).max() * 50
 
 
-def test_each_target_is_reported_with_its_command_at_its_beat():
+def test_each_target_is_reported_with_its_command_at_its_tick():
     rig = Rig()
 
-    rig.path.play([[0.001], [0.5]])
+    rig.path.send_targets([[0.001], [0.5]])
 
     assert [s.target[0] for s in rig.sent] == [0.001, 0.5]
     assert [s.command[0] for s in rig.sent] == rig.robot
@@ -58,22 +59,22 @@ def test_commands_are_handed_over_read_only():
 
     rig = Rig(meddle)
     with pytest.raises(ValueError, match="read-only"):
-        rig.path.play([[0.001]])
+        rig.path.send_targets([[0.001]])
 
 
 def test_filters_come_before_the_limits_and_reports_keep_the_plan():
     rig = Rig(filters=[lambda row: row * 1000])
 
-    rig.path.play([[0.1]])
+    rig.path.send_targets([[0.1]])
 
     assert rig.sent[0].target[0] == 0.1
     assert rig.robot[0] < 0.01
-    rig.path.play([[0.1]], filtered=False)
+    rig.path.send_targets([[0.1]], filtered=False)
 
 
 def test_holding_brakes_and_then_repeats():
     rig = Rig()
-    rig.path.play([[1.0]] * 5)
+    rig.path.send_targets([[1.0]] * 5)
     for _ in range(8):
         rig.path.hold()
 
@@ -84,10 +85,10 @@ def test_holding_brakes_and_then_repeats():
 
 def test_a_tripped_latch_lets_nothing_through_but_braking():
     rig = Rig()
-    rig.path.play([[1.0]] * 5)
+    rig.path.send_targets([[1.0]] * 5)
     rig.latch.trip("chunk", "not finite")
 
-    for call in (rig.path.hold, lambda: rig.path.play([[0.0]])):
+    for call in (rig.path.hold, lambda: rig.path.send_targets([[0.0]])):
         with pytest.raises(SafetyStop, match="stopped by rule chunk: not finite"):
             call()
     count = len(rig.robot)
@@ -103,7 +104,7 @@ def test_a_loop_that_stops_half_way_leaves_the_limits_where_it_stopped():
 
     rig = Rig(three)
     for _ in range(6):
-        rig.path.play([[1.0]] * 10)
+        rig.path.send_targets([[1.0]] * 10)
 
     assert len(rig.robot) == 18
     assert pushes(rig.robot) <= 10.0
@@ -114,15 +115,15 @@ def test_a_loop_left_at_a_beat_goes_on_from_the_command_before_it():
     class Enough(Exception):
         pass
 
-    def leave(sent):
+    def leave(sent, sent_at, late_s):
         rig.sent.append(sent)
         if len(rig.sent) == 4:
             raise Enough
 
     rig = Rig()
-    rig.path = CommandSender(rig.execute, rig.path.rate, rig.limiter, rig.latch, (), leave)
+    rig.path = CommandSender(rig.execute, 50, SimulatedClock(), rig.limiter, rig.latch, (), leave)
     with pytest.raises(Enough):
-        rig.path.play([[1.0]] * 10)
+        rig.path.send_targets([[1.0]] * 10)
 
     assert rig.limiter.last[0] == rig.robot[-1]
     rig.path.brake()
@@ -137,7 +138,7 @@ def test_a_command_that_raised_counts_as_sent():
 
     rig = Rig(break_off)
     with pytest.raises(OSError):
-        rig.path.play([[1.0]] * 10)
+        rig.path.send_targets([[1.0]] * 10)
 
     assert rig.limiter.last[0] == rig.robot[-1]
 
@@ -153,7 +154,7 @@ def test_what_is_interrupted_before_anything_is_sent_moves_nothing(monkeypatch):
 
     monkeypatch.setattr(rig.limiter, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        rig.path.play([[1.0]] * 10)
+        rig.path.send_targets([[1.0]] * 10)
 
     assert rig.robot == []
     assert rig.limiter.last[0] == 0.0
@@ -163,9 +164,9 @@ def test_what_is_interrupted_before_anything_is_sent_moves_nothing(monkeypatch):
 def test_a_robot_that_is_slowed_down_in_the_middle_keeps_its_limits_and_stays_with_its_commands():
     rig, shares = Rig(), iter([1.0] * 20 + [0.3] * 30 + [1.0] * 30)
     rig.path = CommandSender(
-        rig.execute, rig.path.rate, rig.limiter, rig.latch, (), speed=lambda: next(shares)
+        rig.execute, 50, SimulatedClock(), rig.limiter, rig.latch, (), speed=lambda: next(shares)
     )
-    rig.path.play([[1.4]] * 80)
+    rig.path.send_targets([[1.4]] * 80)
 
     pace = np.abs(np.diff(rig.robot)) * 50
     fastest = ONE.joints[0].velocity
@@ -180,20 +181,27 @@ def test_a_robot_that_is_slowed_down_in_the_middle_keeps_its_limits_and_stays_wi
 def test_targets_may_be_played_at_a_share_of_the_speed(speed):
     rig = Rig()
     rig.path = CommandSender(
-        rig.execute, rig.path.rate, rig.limiter, rig.latch, (), rig.sent.append, speed
+        rig.execute,
+        50,
+        SimulatedClock(),
+        rig.limiter,
+        rig.latch,
+        (),
+        lambda sent, *_: rig.sent.append(sent),
+        speed,
     )
-    rig.path.play([[1.0]] * 30, most=0.25)
+    rig.path.send_targets([[1.0]] * 30, most=0.25)
 
     pace = np.abs(np.diff(rig.robot)) * 50
     assert pace.max() == pytest.approx(0.25 * ONE.joints[0].velocity, rel=1e-3)
 
 
-def test_a_loop_without_beats_is_reported_afterwards():
+def test_a_loop_without_ticks_is_reported_afterwards():
     def unpaced(actions, rate):
         rig.robot.extend(float(a[0]) for a in actions)
 
     rig = Rig(unpaced)
-    rig.path.play([[1.0]] * 4)
+    rig.path.send_targets([[1.0]] * 4)
 
     assert [s.command[0] for s in rig.sent] == rig.robot
     assert rig.limiter.last[0] == rig.robot[-1]
@@ -205,6 +213,6 @@ def test_a_beat_without_a_command_is_reported_as_none():
         rate.sleep()
 
     rig = Rig(idle)
-    rig.path.play([[0.0]])
+    rig.path.send_targets([[0.0]])
 
     assert [s is None for s in rig.sent] == [False, True]

@@ -58,8 +58,8 @@ def test_an_old_state_does_not_say_that_the_arm_stays_behind():
     watch = TrackingWatch(ARM, SETTINGS)
     state = np.array([0.6, 0.5, 1.0])
     watch.sent(np.array([0.9, 0.5, 0.0]), 9.9)
-    for beat in range(50):
-        watch.sent(np.array([1.0 + beat / 20, 0.5, 0.0]), 10.0 + beat / 50)
+    for tick in range(50):
+        watch.sent(np.array([1.0 + tick / 20, 0.5, 0.0]), 10.0 + tick / 50)
         watch.check(state, 10.0)
 
     with pytest.raises(SafetyStop, match=r"turn is 1\.15 away from its command for 0\.30 s"):
@@ -69,8 +69,8 @@ def test_an_old_state_does_not_say_that_the_arm_stays_behind():
 def test_a_state_is_held_against_the_command_that_the_arm_had_then():
     watch = TrackingWatch(ARM, SETTINGS)
     speed, lag, latency = 1.6, 0.06, 0.15
-    for beat in range(100):
-        now = beat / 50
+    for tick in range(100):
+        now = tick / 50
         watch.sent(np.array([speed * now, 0.5, 0.0]), now)
         seen = now - latency
         watch.check(np.array([max(0.0, speed * (seen - lag)), 0.5, 0.0]), seen)

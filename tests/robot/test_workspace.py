@@ -128,8 +128,8 @@ def test_a_smooth_motion_into_a_wall_stays_within_a_centimetre_of_the_box():
     filter_, limiter = box(), CommandLimiter(ARM, 0.02)
     limiter.start(START)
     worst = 0.0
-    for beat in range(400):
-        phase = beat * 0.02
+    for tick in range(400):
+        phase = tick * 0.02
         wanted = START + [
             0,
             0.4 * np.sin(2 * phase),

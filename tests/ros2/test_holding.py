@@ -109,7 +109,7 @@ def test_commands_that_came_one_by_one_are_no_motion():
 
 @pytest.mark.parametrize("late_s", [0.0, 0.007])
 def test_a_motion_is_gone_on_from_at_the_speed_that_it_has(monkeypatch, late_s):
-    """However late a single command was, those of a beat are a beat apart."""
+    """However late a single command was, those of a tick are a period apart."""
     now = [100.0]
     monkeypatch.setattr("fluxvla_core.ros2.stop_motion.time.monotonic", lambda: now[0])
     motion, sent = Motion(), [np.full(3, 0.5), np.full(3, 0.51)]

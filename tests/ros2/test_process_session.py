@@ -65,7 +65,7 @@ def test_tasks_are_done_held_stopped_and_done_again_after_a_rearm(stage, tmp_pat
                 assert time.monotonic() < until, "the arm is not held between two tasks"
                 time.sleep(0.02)
             seen["held"] = heard()[-20:]
-            maps = Path(f"/proc/{runner._session.engine._process.pid}/maps").read_text()
+            maps = Path(f"/proc/{runner._engine._process.pid}/maps").read_text()
             seen["shared"] = [line for line in maps.splitlines() if "/dev/shm/fastdds" in line]
             policy.left = 10
             somebody.say("1")
@@ -83,7 +83,7 @@ def test_tasks_are_done_held_stopped_and_done_again_after_a_rearm(stage, tmp_pat
         except BaseException as error:  # noqa: BLE001 - raised in the test's own thread
             seen["failed"] = error
         finally:
-            runner._session.interrupts._pending = 15  # as SIGTERM does
+            runner._engine._interrupts._pending = 15  # as SIGTERM does
 
     thread = threading.Thread(target=person)
     thread.start()

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Continuation:
-    """The rest of the chunk that is being played, at the times of the chunk that is asked for.
+    """The prefix that a policy's next chunk has to continue (real-time chunking).
+
+    It is what is left of the chunk that is being executed, at the times of the next one's actions.
 
     Args:
         actions: ``(T, dim)`` float64 in physical units, ``T`` being the policy's horizon: where

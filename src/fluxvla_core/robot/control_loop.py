@@ -1,6 +1,7 @@
-"""The control loop of an episode: ask the policy, join its chunks, play them, until it is over.
+"""An episode's control loop (``ControlLoop``), and its checks at each tick (``Supervisor``).
 
-The thread that calls ``run`` alone sends commands, on the absolute deadlines of the control rate.
+The loop asks the policy, joins its chunks and plays them, until the episode is over. The thread
+that calls ``run`` alone sends commands, on the absolute deadlines of the control rate.
 On a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
 policy never keeps a command from being sent: without a chunk the arm brakes and holds, and after
 ``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still
@@ -14,6 +15,7 @@ while its last answer is being played (the joiners that are ``streamed``).
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import NoReturn
@@ -21,18 +23,29 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.chunks import Chunk, check_beginning
 from fluxvla_core.robot.control.interrupt import Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner
 from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyEnded
 from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
-from fluxvla_core.robot.control.sender import CommandSender
+from fluxvla_core.robot.control.sender import CommandSender, SentCommand
+from fluxvla_core.robot.control.tracking import TrackingWatch
+from fluxvla_core.robot.events import CommandSent, Event, Phase
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.supervisor import EpisodeOver, Supervisor
 
 Array = npt.NDArray[np.float64]
 # How often a wait that may be long checks for an interrupt.
 _POLL_S = 0.02
+
+
+class EpisodeOver(BaseException):
+    """Ends an episode from inside a tick. Not an error, and nobody's ``except Exception``."""
+
+    def __init__(self, outcome: str) -> None:
+        self.outcome = outcome
+        super().__init__(outcome)
 
 
 @dataclass(frozen=True)
@@ -104,7 +117,7 @@ class ControlLoop:
 
     def _play_whole(self) -> NoReturn:
         while True:
-            self.sender.play(self._targets())
+            self.sender.send_targets(self._targets())
             query, since = self._ask(), self.robot.clock.now()
             while not self._arrived(query):
                 self._check_starved(self.robot.clock.now() - since)
@@ -128,7 +141,7 @@ class ControlLoop:
             target = self.joiner.target(now + period)
             if target is not None:
                 starved_since = None
-                self.sender.play(target[None])
+                self.sender.send_targets(target[None])
                 continue
             if ended is not None:
                 raise ended
@@ -153,7 +166,7 @@ class ControlLoop:
         last = self.sender.limiter.last
         due = self.robot.clock.now() + self.latency_s
         until = time.monotonic() + self.safety.first_chunk_s
-        future = self.client.ask(self.joiner.ahead())
+        future = self.client.ask(self.joiner.previous_chunk())
         if self.robot.lockstep and time.monotonic() > until:
             raise self._no_chunk(until)
         return PendingQuery(future, last, due)
@@ -245,3 +258,83 @@ class ControlLoop:
                 cause=late.cause,
                 next=late.next,
             )
+
+
+class Supervisor:
+    """Watches the robot at every tick: its state, its tracking error, signals, the episode's end.
+
+    Args:
+        robot: the connected robot.
+        tracking: compares its state with its commands.
+        interrupts: signals that ask the run to end.
+        max_steps: commands of the phase ``run`` after which the episode is over.
+        reporter: shows how many commands were sent.
+        emit: takes the event ``CommandSent``.
+
+    ``phase`` is the current phase of the episode.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        tracking: TrackingWatch,
+        interrupts: Interrupts,
+        max_steps: int,
+        reporter: Reporter,
+        emit: Callable[[Event], None],
+    ) -> None:
+        self.phase = Phase.START
+        self._robot = robot
+        self._tracking = tracking
+        self._interrupts = interrupts
+        self._max_steps = max_steps
+        self._steps = 0
+        self._reporter = reporter
+        self._emit = emit
+
+    def chunk_accepted(self) -> None:
+        """The policy's motion begins, or continues."""
+        self.phase = Phase.RUN
+
+    def after_tick(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
+        """The tick after each command: reported always, supervised while it may still stop.
+
+        Args:
+            sent: the command; None at a tick without one.
+            sent_at: time at which it was sent.
+            late_s: seconds after its deadline.
+
+        Raises:
+            EpisodeOver: the task is done, or there were enough commands.
+            NotFollowing: the arm is not where it is commanded to be.
+            Interrupted: a signal came.
+            FluxError: the state could not be read.
+        """
+        robot, phase = self._robot, self.phase
+        try:
+            measured, problem = robot.state(), None
+        except FluxError as error:
+            # What was sent is recorded all the same; and a stream that fell silent stops an arm,
+            # it does not keep it from braking.
+            measured, problem = None, error
+        if sent is not None and phase is not Phase.OVER:
+            state = None if measured is None else measured.state
+            self._emit(CommandSent(robot.clock.now(), sent, phase, state, robot.sent_s, late_s))
+        # Between two episodes, too: an arm that is held may be switched off, or moved.
+        if not (phase.stoppable or phase is Phase.OVER):
+            return
+        if problem is not None:
+            raise problem
+        self._interrupts.check()
+        if sent is not None:
+            self._tracking.sent(sent.command, sent_at)
+        if measured is not None and robot.follows_commands:
+            self._tracking.check(measured.state, measured.at)
+        if phase is not Phase.RUN or sent is None:
+            return
+        self._steps += 1
+        self._reporter.progress("commands", self._steps, self._max_steps)
+        if robot.done():
+            raise EpisodeOver("done")
+        if self._steps >= self._max_steps:
+            raise EpisodeOver("max_steps")

@@ -52,7 +52,7 @@ class Engine(ABC):
         """Entered while there are episodes."""
 
     @abstractmethod
-    def play(
+    def run_episode(
         self,
         task: Task,
         number: int,
@@ -130,7 +130,7 @@ class LocalEngine(Engine):
     def commanding(self) -> AbstractContextManager[object]:
         return nullcontext() if self._parts.robot.lockstep else realtime.real_time()
 
-    def play(
+    def run_episode(
         self,
         task: Task,
         number: int,

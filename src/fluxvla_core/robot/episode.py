@@ -25,13 +25,13 @@ from fluxvla_core.robot.control.policy_client import PolicyClient
 from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
 from fluxvla_core.robot.control.sender import (
     CommandSender,
-    Execute,
+    ExecuteActions,
     SentCommand,
     come_to_rest,
     ramp,
 )
 from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.control_loop import ControlLoop
+from fluxvla_core.robot.control_loop import ControlLoop, Supervisor
 from fluxvla_core.robot.events import (
     EpisodeEnded,
     EpisodeObserver,
@@ -43,7 +43,6 @@ from fluxvla_core.robot.events import (
     StoppedWhileHeld,
 )
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.supervisor import Supervisor
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]
@@ -94,7 +93,7 @@ class EpisodeParts:
         make_client: makes the policy client of an episode's chunks.
         filters: the config's ``action_filters``.
         joiner: joins the chunks to one motion.
-        execute: sends commands: ``(N, D)`` and the rate.
+        execute_actions: sends commands.
         latch: an episode does not begin while it is tripped.
         interrupts: signals that ask the run to end.
         reporter: shows progress and warnings.
@@ -105,7 +104,7 @@ class EpisodeParts:
     make_client: PolicyClientFactory
     filters: Sequence[ActionFilter]
     joiner: ChunkJoiner
-    execute: Execute
+    execute_actions: ExecuteActions
     latch: Latch
     interrupts: Interrupts
     reporter: Reporter
@@ -147,19 +146,22 @@ class Episode:
         self._task, self._number = task, number
         self._before, self._held = before, held
         lead_s = min(_LEAD_S, _LEAD_SHARE / settings.rate_hz)
-        self._rate = Rate(settings.rate_hz, robot.clock, lead_s=lead_s)
         self._limiter = CommandLimiter(
-            robot.embodiment, self._rate.period, safety.velocity_scale, safety.acceleration_scale
+            robot.embodiment,
+            1.0 / settings.rate_hz,
+            safety.velocity_scale,
+            safety.acceleration_scale,
         )
-        self._sender = CommandSender(
-            self._execute, self._rate, self._limiter, parts.latch, parts.filters,
-            self._after_tick, robot.speed, parts.one_by_one,
-        )  # fmt: skip
         self._tracking = TrackingWatch(robot.embodiment, safety)
         self._supervisor = Supervisor(
             robot, self._tracking, parts.interrupts, settings.max_steps, parts.reporter,
             self._emit,
         )  # fmt: skip
+        self._sender = CommandSender(
+            self._execute_actions, settings.rate_hz, robot.clock, self._limiter, parts.latch,
+            parts.filters, self._after_tick, robot.speed, parts.one_by_one, lead_s,
+        )  # fmt: skip
+        self._rate = self._sender.rate
         self._client = parts.make_client(task, seed, self._tracking, self._emit)
         self._grippers = np.array([joint.kind == "gripper" for joint in robot.embodiment.joints])
         self._trips = len(parts.latch.trips)
@@ -298,13 +300,13 @@ class Episode:
             kept = kept | self._tracking.settled(commanded, state)
         return np.where(kept, commanded, self._tracking.positions(state))
 
-    def _execute(self, actions: Array, rate: Rate) -> None:
+    def _execute_actions(self, actions: Array, rate: Rate) -> None:
         self._executing = True
-        self._parts.execute(actions, rate)
+        self._parts.execute_actions(actions, rate)
         self._executing = False
 
-    def _after_tick(self, sent: SentCommand | None) -> None:
-        self._supervisor.after_tick(sent, self._sender.sent_at, self._rate.late_s)
+    def _after_tick(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
+        self._supervisor.after_tick(sent, sent_at, late_s)
         if self._supervisor.phase is Phase.RUN:
             self._client.ticked()
 

@@ -19,7 +19,6 @@ from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Policy, with_history
 from fluxvla_core.robot.control.safety import BadTiming
 from fluxvla_core.robot.events import RobotReading
-from fluxvla_core.robot.observation import ObservationReader
 from fluxvla_core.robot.robot import Robot
 
 _AWAY = 0.6  # of an action: half of one, where it is read once an action, and what threads add
@@ -31,7 +30,8 @@ class ObservationHistory:
     """Reads what one policy is asked with in one episode. All but ``due`` in the reading thread.
 
     Args:
-        reader: reads the robot.
+        read: reads the robot for a question.
+        sample: reads it between two questions.
         robot: whose clock counts.
         policy: says how many observations it takes, and how far they are apart.
         patience_s: how long a question may wait for a history that is complete.
@@ -40,14 +40,16 @@ class ObservationHistory:
 
     def __init__(
         self,
-        reader: ObservationReader,
+        read: Callable[[], RobotReading],
+        sample: Callable[[], RobotReading],
         robot: Robot,
         policy: Policy,
         patience_s: float,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.steps = policy.n_obs_steps
-        self._reader, self._robot, self._sleep = reader, robot, sleep
+        self._read, self._sample = read, sample
+        self._robot, self._sleep = robot, sleep
         self._apart, self._patience_s = 1.0 / policy.action_rate_hz, patience_s
         self._kept: deque[tuple[float, Observation]] = deque()
         self._first = 0.0
@@ -75,7 +77,7 @@ class ObservationHistory:
             BadFrame, BadTiming: as ``ObservationReader.read``.
         """
         at = self._robot.clock.now()
-        self._keep(at, self._reader.sample())
+        self._keep(at, self._sample())
 
     def read(self) -> tuple[RobotReading, Observation]:
         """What the policy is asked with: the robot's reading, and its observation with the history.
@@ -87,7 +89,7 @@ class ObservationHistory:
         began = self._robot.clock.now()
         while True:
             at = self._robot.clock.now()
-            reading = self._reader.read()
+            reading = self._read()
             present: Observation = {**reading.observation}  # type: ignore[typeddict-item]
             if self.steps == 1:
                 return reading, present

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext, build_action_filter_from_cfg
+from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.robot.control.filters import SnapGripper
 from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +178,77 @@ def check_latency(seconds: float, robot: Robot, context: RunContext) -> None:
         raise context.error("simulated_latency", f"must be 0 or more, got {seconds}")
     if seconds and not robot.lockstep:
         raise context.error("simulated_latency", "is for simulations; this robot has its own")
+
+
+def fit_cameras(
+    policy: Policy,
+    embodiment: EmbodimentSpec,
+    chosen: tuple[str, ...] | None,
+    context: RunContext,
+) -> tuple[str, ...]:
+    """Check that a policy is for a robot; the names of the cameras to observe.
+
+    Args:
+        policy: loaded.
+        embodiment: the robot's.
+        chosen: the config's ``camera_names``; None for those that the policy looks at.
+        context: of the run; its reporter warns of images that are scaled.
+
+    Raises:
+        SpecMismatch: the policy is for another robot, or for other views.
+        ConfigError: ``camera_names`` does not fit.
+    """
+    looks_at = tuple(policy.cameras)
+    cameras = chosen or looks_at
+    check_match(policy.embodiment, embodiment, "the policy", "the robot", looks_at)
+    known = embodiment.camera_names
+    for name in (*cameras, *looks_at):
+        if name not in known:
+            raise context.error(
+                "camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}"
+            )
+        if name not in cameras:
+            raise context.error("camera_names", f"the policy looks at {name!r} too")
+    for warning in _scaled_views(policy.embodiment, embodiment, looks_at):
+        context.reporter.warn(warning)
+    return cameras
+
+
+def _scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:
+    """Check that a robot's cameras show what the policy was trained on, perhaps larger.
+
+    A camera may have more pixels than in training; it may not show another view.
+
+    Args:
+        trained, here: the embodiments of the policy and of the robot.
+        names: the cameras that the policy looks at.
+
+    Returns:
+        What is to be said of images that are scaled.
+
+    Raises:
+        SpecMismatch: a camera's images have another aspect.
+    """
+    cameras = {camera.name: camera for camera in here.cameras}
+    said = []
+    for then in trained.cameras:
+        now = cameras.get(then.name)
+        if then.name not in names or now is None:
+            continue
+        if (now.height, now.width) == (then.height, then.width):
+            continue
+        sizes = (
+            f"camera {then.name} gives {now.height} x {now.width} images; the policy was "
+            f"trained on {then.height} x {then.width}"
+        )
+        difference = abs(now.width * then.height - then.width * now.height)
+        if difference > 0.01 * now.height * then.width:
+            raise SpecMismatch(
+                f"{sizes}: another view",
+                next="set the camera to the size, or at least the aspect, of the recordings",
+            )
+        said.append(f"{sizes}; they are scaled")
+    return said
 
 
 def build_filters(

@@ -1,4 +1,4 @@
-"""Which process commands a robot (``choose_layout``), and the engine for it (``make_engine``).
+"""Which process commands a robot: ``choose_layout``.
 
 A control process is used wherever that is possible. An operator may be divided between the two: the
 control process commands the robot, the main process reads its cameras. One that cannot be divided
@@ -14,27 +14,12 @@ from typing import Any, TypeAlias
 
 from fluxvla_core.build import RunContext, parameters
 from fluxvla_core.contracts.contract import implements
-from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.contracts.robot import ActionFilter, Operator
+from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS, RUNNERS
 from fluxvla_core.robot.control.clock import MonotonicClock, clock_of, in_lockstep
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.joiners import make_joiner
-from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.sender import Execute
-from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
-from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
-from fluxvla_core.robot.events import Event
-from fluxvla_core.robot.local_policy_client import LocalPolicyClient, PolicyCaller
-from fluxvla_core.robot.observation import ObservationReader, Observe
-from fluxvla_core.robot.observation_history import ObservationHistory
-from fluxvla_core.robot.policy_thread import PolicyThread
-from fluxvla_core.robot.process.remote_engine import RemoteEngine
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
-from fluxvla_core.robot.process.setup import ControlSetup, import_path, not_plain, registered_here
+from fluxvla_core.robot.process.setup import import_path, not_plain
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.tasks import Task
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Embodiment: TypeAlias = "EmbodimentSpec | Mapping[str, Any] | None"
@@ -64,7 +49,7 @@ class ProcessLayout:
         robot: made of it; not connected.
         tables: what the control process is built from; None where there is none.
         why_single_process: why there is no control process; None where there is one.
-        frames: ``operator``, where the control process has all of the robot.
+        remote_operator: ``operator``, where the control process has all of the robot.
         runner: the table of the runner, where the control process needs its methods too.
     """
 
@@ -72,13 +57,13 @@ class ProcessLayout:
     robot: Robot
     tables: ControlTables | None = None
     why_single_process: str | None = None
-    frames: RemoteOperator | None = None
+    remote_operator: RemoteOperator | None = None
     runner: Mapping[str, Any] | None = None
 
     @property
     def notice(self) -> str | None:
         """What to tell the user about it; None for nothing."""
-        if self.frames is not None:
+        if self.remote_operator is not None:
             return f"{self.robot.name} is not divided: the control process reads its images too"
         if self.why_single_process is None or self.robot.lockstep:
             return None
@@ -201,101 +186,8 @@ def choose_layout(
     return _undivided(stand_in, None, type(made), tables, overrides)
 
 
-@dataclass(frozen=True)
-class RunParts:
-    """The objects and settings of a run.
-
-    Args:
-        robot: not connected; where another process commands it, the part without commands.
-        policy: loaded, and fitting the robot.
-        observe: makes an observation of the robot's newest frame.
-        cameras: names of the cameras that the policy looks at.
-        ready_s: seconds that the robot may take to give its first reading.
-        filters: the config's ``action_filters``.
-        joining: the config's ``chunk_joining``, and the seconds between two observations.
-        execute: sends commands: ``(N, D)`` and the rate.
-        settings: how episodes are driven.
-        latch: an episode does not begin while it is tripped.
-        context: of the run.
-        history: of the runner's earlier runs.
-    """
-
-    robot: Robot
-    policy: Policy
-    observe: Observe
-    cameras: tuple[str, ...]
-    ready_s: float
-    filters: Sequence[ActionFilter]
-    joining: tuple[Any, float]
-    execute: Execute
-    settings: EpisodeSettings
-    latch: Latch
-    context: RunContext
-    history: RunHistory
-
-
-def make_engine(
-    parts: RunParts, layout: ProcessLayout, interrupts: Interrupts, thread: PolicyThread
-) -> Engine:
-    """The engine of one run: ``RemoteEngine`` with a control process, else ``LocalEngine``.
-
-    Args:
-        parts: what the run drives the robot with.
-        layout: whether another process commands the robot.
-        interrupts: signals that ask the run to end.
-        thread: the thread in which the policy computes.
-    """
-    robot, policy, settings, safety = (
-        parts.robot,
-        parts.policy,
-        parts.settings,
-        parts.settings.safety,
-    )
-
-    observe = parts.observe
-    if layout.frames is not None and layout.runner is not None:
-        observe = layout.frames.observe
-
-    def make_client(
-        task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
-    ) -> LocalPolicyClient:
-        reader = ObservationReader(
-            robot, observe, task.instruction, parts.cameras, safety, parts.ready_s,
-            tracking, thread, interrupts, emit,
-        )  # fmt: skip
-        caller = PolicyCaller(policy, robot.embodiment, safety, robot.delays, seed)
-        seen = ObservationHistory(reader, robot, policy, safety.max_age_s)
-        return LocalPolicyClient(robot, reader, seen, caller, thread, emit)
-
-    reporter, latch, history = parts.context.reporter, parts.latch, parts.history
-    tables, frames = layout.tables, layout.frames
-    if tables is not None:
-        setup = ControlSetup(
-            config=parts.context.config,
-            section=parts.context.section,
-            work_dir=str(parts.context.work_dir),
-            operator=tables.operator,
-            embodiment=robot.embodiment.to_dict(),
-            filters=tables.filters,
-            gripper_threshold=tables.gripper_threshold,
-            joining=parts.joining,
-            settings=settings,
-            before=history.commanded,
-            python_path=sys.path,
-            registered=registered_here(tables.operator, tables.filters, layout.runner),
-            cameras=None if frames is None else parts.cameras,
-            runner=layout.runner,
-        )
-        return RemoteEngine(setup, robot, make_client, latch, interrupts, reporter, history, frames)
-    joiner, filters = make_joiner(*parts.joining), parts.filters
-    episode = EpisodeParts(
-        robot, make_client, filters, joiner, parts.execute, latch, interrupts, reporter
-    )
-    return LocalEngine(episode, settings, history)
-
-
 def _undivided(
-    frames: RemoteOperator,
+    remote_operator: RemoteOperator,
     embodiment: Embodiment,
     cls: type,
     tables: ControlTables,
@@ -305,8 +197,10 @@ def _undivided(
     if overrides.table is not None and (overrides.sends or overrides.observes):
         given = {"operator": tables.operator} if "operator" in overrides.table else {}
         runner = {**overrides.table, **given}
-    robot = Robot(frames, embodiment, overrides.sends, kind=cls)
-    return ProcessLayout(frames, robot, tables, frames=frames, runner=runner)
+    robot = Robot(remote_operator, embodiment, overrides.sends, kind=cls)
+    return ProcessLayout(
+        remote_operator, robot, tables, remote_operator=remote_operator, runner=runner
+    )
 
 
 def _embodiment_before_connect(cls: type, embodiment: Embodiment) -> EmbodimentSpec | None:

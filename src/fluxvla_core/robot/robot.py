@@ -26,11 +26,17 @@ from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, Spe
 from fluxvla_core.robot.control.clock import Rate, clock_of, in_lockstep
 from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
 from fluxvla_core.robot.control.safety import BadFrame
+from fluxvla_core.robot.operator_values import as_action, as_frame, as_number, as_state
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before the message says to use the emergency stop.
 STOP_S = 5.0
 _LEAST_SPEED = 0.01
+
+
+Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
+"""Makes an observation of the robot's newest frame, and returns the frame as well if it has it:
+a runner's ``update_observation_window``."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class Robot:
     Args:
         operator: an object; not connected yet if it has ``connect``.
         embodiment: what the config says about it; None when it has its own.
-        sends: whether the runner has an ``_execute_actions`` of its own, and so needs no
+        runner_sends: whether the runner has an ``_execute_actions`` of its own, and so needs no
             ``send_action``.
         kind: the class of an operator in another process that ``operator`` stands in for.
 
@@ -60,7 +66,7 @@ class Robot:
         self,
         operator: Any,
         embodiment: EmbodimentSpec | Mapping[str, Any] | None = None,
-        sends: bool = False,
+        runner_sends: bool = False,
         kind: type | None = None,
     ) -> None:
         self._operator = Operator.adapt(operator)
@@ -80,7 +86,7 @@ class Robot:
             )
         lacks = missing_operator_methods(operator)
         self.complete = not lacks
-        if not sends and "send_action()" in lacks:
+        if not runner_sends and "send_action()" in lacks:
             raise LoadFailed(
                 f"{self.name} has no send_action(); no command could be sent to it",
                 next="see docs/writing-a-plugin.md for what an operator has, or give the runner "
@@ -105,7 +111,7 @@ class Robot:
         """
         self._call("connect", self._operator.connect)
 
-    def send(self, action: npt.NDArray[np.float64]) -> None:
+    def send_action(self, action: npt.NDArray[np.float64]) -> None:
         """Send one ``(D,)`` command; ``sent_s`` is how long the last one took.
 
         Raises:
@@ -116,15 +122,15 @@ class Robot:
             self._call("send_action", self._operator.send_action, action)
         self.sent_s = time.perf_counter() - began
 
-    def play(self, actions: npt.NDArray[np.float64], rate: Rate) -> None:
+    def send_actions(self, actions: npt.NDArray[np.float64], rate: Rate) -> None:
         """Send ``(N, D)`` commands, one at each tick of ``rate``.
 
         Raises:
-            OperatorError: as :meth:`send`.
+            OperatorError: as :meth:`send_action`.
         """
         for action in actions:
             rate.wait()
-            self.send(action)
+            self.send_action(action)
             rate.sleep()
 
     def frame(self) -> Frame:
@@ -344,79 +350,3 @@ def _check_tighter(config: EmbodimentSpec, operator: EmbodimentSpec) -> None:
                     f"the config's embodiment widens {name} of {config_joint.name} to {value:g}; "
                     f"the robot's own limit is {own_limit:g}"
                 )
-
-
-def as_frame(value: Any, source: str) -> Frame:
-    """``value``, checked to have the fields of a ``Frame``.
-
-    Args:
-        value: what ``source`` gave, for example ``Arm.get_frame()``.
-
-    Raises:
-        BadFrame: it is something else; names ``source``.
-    """
-    fields = ("state", "images", "stamps")
-    if not all(hasattr(value, field) for field in fields):
-        raise BadFrame(
-            f"{source} gave a {type(value).__name__}, not a Frame",
-            cause="a Frame has state, images and stamps; where there is no reading yet, "
-            "get_frame() raises NotReady",
-            next="see docs/writing-a-plugin.md for an example",
-        )
-    for field in fields[1:]:
-        found = getattr(value, field)
-        if not isinstance(found, Mapping):
-            raise BadFrame(f"{field} of what {source} gave is a {type(found).__name__}, not a dict")
-    frame: Frame = value
-    return frame
-
-
-def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
-    """``value`` as a checked ``(state_dim,)`` float64 array; ``source`` is for the message.
-
-    Raises:
-        BadFrame: it is no array of numbers, has another shape, or is not finite.
-    """
-    return _as_vector(value, embodiment.state_names, embodiment.name, source)
-
-
-def as_action(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
-    """``value`` as a checked ``(dim,)`` float64 array; ``source`` is for the message.
-
-    Raises:
-        BadFrame: it is no array of numbers, has another shape, or is not finite.
-    """
-    return _as_vector(value, embodiment.joint_names, embodiment.name, source)
-
-
-def as_number(value: Any, source: str) -> float:
-    """``value`` as a float, checked to be finite; ``source`` is for the message.
-
-    Raises:
-        BadFrame: it is none.
-    """
-    if not is_number(value) or not math.isfinite(value):
-        raise BadFrame(f"{source} is {value!r}, not a finite number")
-    return float(value)
-
-
-def is_number(value: Any) -> bool:
-    """Whether ``value`` is a real number, of Python or numpy, and not a bool."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-
-
-def _as_vector(
-    value: Any, names: tuple[str, ...], robot: str, source: str
-) -> npt.NDArray[np.float64]:
-    try:
-        vector = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        vector = np.empty(0, dtype=object)
-    if vector.dtype.kind not in "fiu":
-        raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
-    if vector.shape != (len(names),):
-        raise BadFrame(f"{source} has shape {vector.shape}; {robot} has ({len(names)},)")
-    bad = [name for name, ok in zip(names, np.isfinite(vector), strict=True) if not ok]
-    if bad:
-        raise BadFrame(f"{source} is not finite for {', '.join(bad)}")
-    return vector.astype(np.float64)

@@ -7,6 +7,7 @@ upstream FluxVLA override ``get_ros_observation``, ``update_observation_window``
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,26 +33,29 @@ from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
 from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.control.sender import Execute, check_pose
-from fluxvla_core.robot.engine import Engine, RunHistory
-from fluxvla_core.robot.episode import EpisodeSettings
-from fluxvla_core.robot.events import HookObserver
-from fluxvla_core.robot.observation import fit_cameras
+from fluxvla_core.robot.control.sender import ExecuteActions, check_pose
+from fluxvla_core.robot.control.tracking import TrackingWatch
+from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
+from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
+from fluxvla_core.robot.events import Event, HookObserver
+from fluxvla_core.robot.inference import LocalPolicyClient, ObservationReader
+from fluxvla_core.robot.observation_history import ObservationHistory
 from fluxvla_core.robot.options import (
     InferenceOptions,
     build_filters,
     check_latency,
     check_state_dim,
     checked_rate,
+    fit_cameras,
 )
 from fluxvla_core.robot.policy_thread import PolicyThread
+from fluxvla_core.robot.process.remote_engine import RemoteEngine
+from fluxvla_core.robot.process.setup import ControlSetup, registered_here
 from fluxvla_core.robot.process_layout import (
     ControlTables,
     ProcessLayout,
     RunnerOverrides,
-    RunParts,
     choose_layout,
-    make_engine,
 )
 from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
@@ -198,33 +202,39 @@ class BaseInferenceRunner(Runner):
         watched = self.robot.delays.watched(self.context.reporter.warn, self.safety.starvation_s)
         with Interrupts() as interrupts, watched:
             self._observers = (HookObserver(hooks),)
-            engine = self._engine(interrupts, thread)
+            self._engine = engine = self._make_engine(interrupts, thread)
             if self._layout.notice is not None:
                 self.context.reporter.info(self._layout.notice)
-            self._session = session = RobotSession(
-                source, self.task_descriptions, self.free_tasks, self.seed, self._history,
-                engine, self.latch, interrupts, thread,
+            session = RobotSession(
+                source, self.task_descriptions, self.free_tasks, engine, self.latch, interrupts,
+                thread,
             )  # fmt: skip
             try:
                 hooks.call("run_started", embodiment=self.embodiment)
                 source.open()
                 engine.connect()
                 with engine.commanding():
-                    result = session.run(self._run_episode)
+                    for task in session.tasks():
+                        summary = None
+                        with session.episode(task):
+                            summary = self._run_episode(task)
+                        if summary is not None:
+                            session.ended(task, summary)
+                    result = session.result()
                 ended = "ok"
             except Interrupted as signal:
                 ended = "interrupted"
                 raise signal.final() from None
             finally:
                 interrupts.stopping = True
-                self._shut_down(session)
+                self._shut_down(thread)
                 source.close()
                 hooks.call("run_finished", outcome=ended)
         return result
 
     def episode_facts(self) -> Mapping[str, Any]:
         """JSON values that the operator tells of the last episode."""
-        return self._session.engine.episode_facts()
+        return self._engine.episode_facts()
 
     @property
     def divided(self) -> bool:
@@ -255,11 +265,11 @@ class BaseInferenceRunner(Runner):
 
     def _execute_actions(self, actions: Array, rate: Any) -> None:
         """Send ``(N, D)`` commands that are within all limits, one at each tick of ``rate``."""
-        self.robot.play(actions, rate)
+        self.robot.send_actions(actions, rate)
 
     def control_side(
         self, robot: Robot, cameras: Sequence[str]
-    ) -> tuple[Execute, Callable[[], tuple[dict[str, Any], Frame | None]]]:
+    ) -> tuple[ExecuteActions, Callable[[], tuple[dict[str, Any], Frame | None]]]:
         """The functions of this runner that the control process uses: it sends commands and
         observes.
 
@@ -283,54 +293,88 @@ class BaseInferenceRunner(Runner):
             folder is not None, reporter,
         )  # fmt: skip
         reporter.info(f"task: {task.instruction}")
-        self._session.play(task, (self.recorder, *self._observers), self.recorder.folder)
+        number = self._history.episodes
+        observers = (self.recorder, *self._observers)
+        self._engine.run_episode(task, number, self.seed + number, observers, self.recorder.folder)
+        self._history.episodes += 1
         return self.recorder.summary
 
-    def _engine(self, interrupts: Interrupts, thread: PolicyThread) -> Engine:
-        """The engine of one run."""
-        policy = self.policy
-        assert policy is not None, "run_setup() comes before run()"
+    def _make_engine(self, interrupts: Interrupts, thread: PolicyThread) -> Engine:
+        """The engine of one run: ``RemoteEngine`` with a control process, else ``LocalEngine``.
+
+        Args:
+            interrupts: signals that ask the run to end.
+            thread: the thread in which the policy computes.
+        """
+        robot, latch, history, layout = self.robot, self.latch, self._history, self._layout
+        reporter, remote = self.context.reporter, layout.remote_operator
+        observe = self._observe if remote is None or layout.runner is None else remote.observe
+
+        def make_client(
+            task: Task, seed: int, tracking: TrackingWatch, emit: Callable[[Event], None]
+        ) -> LocalPolicyClient:
+            reader = ObservationReader(
+                robot, observe, task.instruction, self._cameras, self.safety,
+                self.options.ready_timeout, tracking, thread, interrupts, emit,
+            )  # fmt: skip
+            seen = ObservationHistory(
+                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s
+            )
+            return LocalPolicyClient(
+                robot, reader, seen, self.policy, seed, thread, self.safety, emit
+            )
+
+        settings, tables = self._episode_settings(), layout.tables
+        if tables is None:
+            parts = EpisodeParts(
+                robot, make_client, self.action_filters, self._joiner(), self._execute_actions,
+                latch, interrupts, reporter,
+            )  # fmt: skip
+            return LocalEngine(parts, settings, history)
+        setup = ControlSetup(
+            config=self.context.config,
+            section=self.context.section,
+            work_dir=str(self.context.work_dir),
+            operator=tables.operator,
+            embodiment=robot.embodiment.to_dict(),
+            filters=tables.filters,
+            gripper_threshold=tables.gripper_threshold,
+            joining=self._joining(),
+            settings=settings,
+            before=history.commanded,
+            python_path=sys.path,
+            registered=registered_here(tables.operator, tables.filters, layout.runner),
+            cameras=None if remote is None else self._cameras,
+            runner=layout.runner,
+        )
+        return RemoteEngine(setup, robot, make_client, latch, interrupts, reporter, history, remote)
+
+    def _episode_settings(self) -> EpisodeSettings:
         # Played in motion, a chunk is left when the next is there, not before.
         horizon = None if self._joiner().streamed else self.options.execute_horizon
-        used = () if policy.whole_motion else (self.action_chunk, horizon)
-        settings = EpisodeSettings(
+        used = () if self.policy.whole_motion else (self.action_chunk, horizon)
+        return EpisodeSettings(
             rate_hz=self.publish_rate,
             safety=self.safety,
             start_pose=self.prepare_pose,
             max_actions=min((n for n in used if n is not None), default=None),
             latency_s=self.options.simulated_latency,
             max_steps=self.max_publish_step,
-            action_rate_hz=policy.action_rate_hz,
+            action_rate_hz=self.policy.action_rate_hz,
         )
-        parts = RunParts(
-            robot=self.robot,
-            policy=policy,
-            observe=self._observe,
-            cameras=self._cameras,
-            ready_s=self.options.ready_timeout,
-            filters=self.action_filters,
-            joining=self._joining(),
-            execute=self._execute_actions,
-            settings=settings,
-            latch=self.latch,
-            context=self.context,
-            history=self._history,
-        )
-        return make_engine(parts, self._layout, interrupts, thread)
 
     def _observe(self) -> tuple[dict[str, Any], Frame | None]:
         self._frame = None
         window = self.update_observation_window()
         return window, self._frame
 
-    def _shut_down(self, session: RobotSession) -> None:
-        reporter = self.context.reporter
-        engine = session.engine
+    def _shut_down(self, thread: PolicyThread) -> None:
+        reporter, engine = self.context.reporter, self._engine
         for problem in (engine.stop(), engine.close()):
             # A stop that failed at the episode's end fails here again.
             if problem and problem != engine.stop_failure:
                 reporter.warn(problem)
-        if not session.thread.close(1.0):
+        if not thread.close(1.0):
             hung = " and ".join(self.robot.delays.under_way()) or "the policy's thread"
             reporter.warn(f"{hung} still hangs; its thread ends with the program")
 

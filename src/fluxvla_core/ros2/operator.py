@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
-import time
 import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -28,9 +27,9 @@ from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
 from fluxvla_core.ros2 import discovery, frames
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.messages import message_class
-from fluxvla_core.ros2.startup import StartupChecks
-from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action
-from fluxvla_core.ros2.stream_reader import POLL_S, StreamReader
+from fluxvla_core.ros2.startup import StartupChecks, wait_for_reading
+from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action, wait_for_receipt
+from fluxvla_core.ros2.stream_reader import StreamReader
 from fluxvla_core.ros2.streams import (
     CAMERA,
     DEPTH,
@@ -40,14 +39,11 @@ from fluxvla_core.ros2.streams import (
     Stream,
     StreamSpec,
 )
-from fluxvla_core.ros2.sync import Stale
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")
 
-# How long a last command may take to be acknowledged before the connection is given up.
-_FLUSH_S = 0.2
 # Ends the names of the nodes, so that people who look at the graph know which is which.
 _NODE = {Part.WHOLE: "", Part.WITHOUT_CAMERAS: "_control", Part.WITHOUT_COMMANDS: "_cameras"}
 
@@ -58,7 +54,7 @@ class RosOperator(Operator):
     Args:
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
         connect_timeout_s: how long ``connect`` waits for drivers to be there and to send.
-        max_age_s: a stream whose last message arrived longer ago is silent, and no frame is made.
+        max_age_s: how long a stream may be silent (``safety.max_age_s``: age of observations).
         max_skew_s: how far the messages of one frame may be apart by their stamps.
         sync_on: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived.
         rate_window_s: for how long ``connect`` counts what arrives; 0 does not count.
@@ -201,7 +197,8 @@ class RosOperator(Operator):
             try:
                 self._subscribe_all(connection)
                 self._connection = connection
-                self._first_reading()
+                read = self.get_frame if self._part.cameras else self.get_state
+                wait_for_reading(read, self.connect_timeout_s)
                 # It may send something, a command that switches the motors on for one.
                 if self._part.commands:
                     self.on_connected(connection)
@@ -337,7 +334,7 @@ class RosOperator(Operator):
         try:
             with self._lock:
                 self.stop()
-                self._flush()
+                wait_for_receipt(self._publishers)
         finally:
             self._connection = None
             # Without the lock: the ROS thread may wait for it, and close waits for the thread.
@@ -374,8 +371,7 @@ class RosOperator(Operator):
 
     def kept(self, name: str) -> tuple[Received, ...]:
         """Deprecated name of :meth:`history`."""
-        message = "RosOperator.kept is deprecated, use history"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        warnings.warn("RosOperator.kept is deprecated, use history", DeprecationWarning, 2)
         return self.history(name)
 
     def newest(self, name: str) -> Received | None:
@@ -415,27 +411,11 @@ class RosOperator(Operator):
             for command in commands
         }
         startup = StartupChecks(connection, self._specs, commands, self._publishers)
-        startup.wait(self.connect_timeout_s)
-        for warning in [*startup.count(self.rate_window_s), *startup.missing_optional()]:
-            log.warning("%s", warning)
+        startup.run(self.connect_timeout_s, self.rate_window_s)
         if not self._part.commands:
             return
         exclusive = [command.topic for command in commands if command.exclusive]
         connection.watch(lambda: self._watch_commanders(connection, exclusive))
-
-    def _first_reading(self) -> None:
-        """Wait until a frame can be read, or a state in the part without cameras."""
-        read = self.get_frame if self._part.cameras else self.get_state
-        until = time.monotonic() + self.connect_timeout_s
-        while True:
-            try:
-                read()
-            except Stale:
-                if time.monotonic() >= until:
-                    raise
-                time.sleep(POLL_S)
-            else:
-                return
 
     def _watch_commanders(self, connection: Connection, topics: Sequence[str]) -> None:
         others = discovery.commanders(connection.node, topics, connection.name)
@@ -482,12 +462,3 @@ class RosOperator(Operator):
     def _hold(self, command: Array) -> bool:
         self._last = command
         return attempt(self.embodiment.name, lambda: self.publish_action(command))
-
-    def _flush(self) -> None:
-        from rclpy.duration import Duration
-
-        for topic, publisher in self._publishers.items():
-            try:
-                publisher.wait_for_all_acked(Duration(seconds=_FLUSH_S))
-            except Exception as error:  # noqa: BLE001 - a broken publisher has nothing to flush
-                log.error("the last message on %s may not have arrived: %s", topic, error)

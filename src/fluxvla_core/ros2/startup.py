@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,9 @@ from fluxvla_core.ros2 import discovery
 from fluxvla_core.ros2.connection import LARGE_FRAMES, Connection
 from fluxvla_core.ros2.messages import type_name
 from fluxvla_core.ros2.qos import BEST_EFFORT, RELIABLE
+from fluxvla_core.ros2.stream_reader import POLL_S
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, CommandSpec, Stream, StreamSpec
+from fluxvla_core.ros2.sync import Stale
 
 log = logging.getLogger("fluxvla.ros2")
 _POLL_S = 0.02
@@ -61,6 +63,16 @@ class StartupChecks:
         self._publishers = publishers
         self._warned: set[str] = set()
         self._since = time.monotonic()
+
+    def run(self, timeout_s: float, rate_window_s: float) -> None:
+        """Wait for everything, count what arrives, and log what somebody should know.
+
+        Raises:
+            NotReady, Rejected, Faulted: as ``wait`` and ``count``.
+        """
+        self.wait(timeout_s)
+        for warning in [*self.count(rate_window_s), *self.missing_optional()]:
+            log.warning("%s", warning)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until all streams have a message, all commands a subscriber and no other publisher.
@@ -201,6 +213,24 @@ class StartupChecks:
 
     def _stream(self, spec: StreamSpec) -> Stream:
         return self._connection.streams[spec.name]
+
+
+def wait_for_reading(read: Callable[[], object], timeout_s: float) -> None:
+    """Wait until a frame or a state can be read.
+
+    Raises:
+        Stale: not within ``timeout_s``.
+    """
+    until = time.monotonic() + timeout_s
+    while True:
+        try:
+            read()
+        except Stale:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(POLL_S)
+        else:
+            return
 
 
 def _size(stream: Stream) -> int:

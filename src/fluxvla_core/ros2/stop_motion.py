@@ -1,4 +1,4 @@
-"""Stop motions: the commands that brake an arm, and the check of actions that are sent.
+"""Stop motions: the commands that brake an arm, and the checks of what is sent.
 
 A stop goes from the last command to the one that holds the arm, within its limits.
 """
@@ -8,7 +8,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,8 @@ PATIENCE_S = 0.25
 _APART_S = 0.25
 # No arm takes as long to come to rest.
 _LONGEST_S = 3.0
+# How long a last command may take to be acknowledged before the connection is given up.
+_RECEIPT_S = 0.2
 
 
 def checked_action(embodiment: EmbodimentSpec, action: npt.ArrayLike) -> Array:
@@ -171,3 +174,18 @@ def attempt(who: str, step: Callable[[], object]) -> bool:
         log.error("%s: stopping failed: %s", who, error)
         return False
     return True
+
+
+def wait_for_receipt(publishers: Mapping[str, Any]) -> None:
+    """Wait until the last messages were acknowledged; what fails is logged, never raised.
+
+    Args:
+        publishers: topic -> publisher.
+    """
+    from rclpy.duration import Duration
+
+    for topic, publisher in publishers.items():
+        try:
+            publisher.wait_for_all_acked(Duration(seconds=_RECEIPT_S))
+        except Exception as error:  # noqa: BLE001 - a broken publisher has nothing to wait for
+            log.error("the last message on %s may not have arrived: %s", topic, error)

@@ -219,3 +219,25 @@ class DividedOperatorChecks:
                 if late:
                     raise
             time.sleep(0.02)
+
+
+def not_followed(spec: EmbodimentSpec, column: int, step: float, moved: Array) -> str:
+    """What a state that did not follow a command to ``step`` of its ``column`` looks like."""
+    name = spec.state_names[column]
+    told = f"send_action() moves {name} by {step:.4g}, and "
+    why = ": the arm is watched by its state, and a policy is asked with it"
+    others = np.abs(moved)
+    others[column] = 0.0
+    furthest = int(others.argmax())
+    if np.abs(moved).max() < abs(step) / 100.0:
+        return f"{told}the state did not change, expected {name} to follow{why}"
+    if others[furthest] > abs(step) / 2.0:
+        return (
+            f"{told}the state of {spec.state_names[furthest]} changed by {moved[furthest]:.4g}, "
+            f"that of {name} by {moved[column]:.4g}; expected {name} alone: are the columns in the "
+            f"order of the joint names, {', '.join(spec.state_names)}"
+            "?"
+        )
+    ratio = moved[column] / step
+    unit = " (degrees for radians?)" if abs(ratio - 180.0 / np.pi) < 10.0 else ""
+    return f"{told}its state changed by {moved[column]:.4g}, {ratio:.3g} times that{unit}{why}"

@@ -33,7 +33,7 @@ from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.files import PLUGIN_FILE
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.testing._operator_parts import STEP, Array, DividedOperatorChecks
+from fluxvla_core.testing._operator_parts import STEP, Array, DividedOperatorChecks, not_followed
 
 # An arm is at rest that moves less than this, in its unit, in the time of so many commands.
 _AT_REST, _STILL = STEP / 10.0, 5
@@ -284,7 +284,7 @@ class OperatorConformance(DividedOperatorChecks):
             near = abs(moved[column] - step) <= abs(step) / 2.0
             return bool(near and (np.abs(others) <= abs(step) / 2.0).all())
 
-        self._until(followed, lambda: _not_followed(spec, column, step, moved))
+        self._until(followed, lambda: not_followed(spec, column, step, moved))
 
         def returned() -> bool:
             # Commands and readings may be under way for a while: only this shows that it is back.
@@ -435,25 +435,3 @@ class OperatorConformance(DividedOperatorChecks):
         assert self._refused(lambda: operator.send_action(middle), OperatorError), (
             "send_action() took a command after close(), expected NotReady: nobody would stop it"
         )
-
-
-def _not_followed(spec: EmbodimentSpec, column: int, step: float, moved: Array) -> str:
-    """What a state that did not follow a command to ``step`` of its ``column`` looks like."""
-    name = spec.state_names[column]
-    told = f"send_action() moves {name} by {step:.4g}, and "
-    why = ": the arm is watched by its state, and a policy is asked with it"
-    others = np.abs(moved)
-    others[column] = 0.0
-    furthest = int(others.argmax())
-    if np.abs(moved).max() < abs(step) / 100.0:
-        return f"{told}the state did not change, expected {name} to follow{why}"
-    if others[furthest] > abs(step) / 2.0:
-        return (
-            f"{told}the state of {spec.state_names[furthest]} changed by {moved[furthest]:.4g}, "
-            f"that of {name} by {moved[column]:.4g}; expected {name} alone: are the columns in the "
-            f"order of the joint names, {', '.join(spec.state_names)}"
-            "?"
-        )
-    ratio = moved[column] / step
-    unit = " (degrees for radians?)" if abs(ratio - 180.0 / np.pi) < 10.0 else ""
-    return f"{told}its state changed by {moved[column]:.4g}, {ratio:.3g} times that{unit}{why}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.robot import events
-from fluxvla_core.robot.control.clamps import Clamp
+from fluxvla_core.robot.control.limits import Clamp
 from fluxvla_core.robot.control.safety import Rule, Trip
 from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.events import (

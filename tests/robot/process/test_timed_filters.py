@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.robot.control.clock import Rate, SimulatedClock
+from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.control.filters import LowPass, SnapGripper, WorkspaceBox
 from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.robot.control.safety import BadCommand, FilterLate, Latch, rule_of
@@ -367,13 +367,13 @@ def test_whatever_filters_do_in_time_or_late_the_limits_hold(told, seed):
             rate.sleep()
 
     sender = CommandSender(
-        execute, Rate(50.0, clock), limiter, Latch(clock.now), filters, one_by_one=True
+        execute, 50.0, clock, limiter, Latch(clock.now), filters, one_by_one=True
     )
     limiter.start([0.0, 0.0])
     stops = 0
     for _ in range(40):
         try:
-            sender.play(rng.uniform(-2, 2, (5, 2)))
+            sender.send_targets(rng.uniform(-2, 2, (5, 2)))
         except FilterLate:
             stops += 1
             sender.brake()
@@ -407,9 +407,9 @@ def test_commands_are_made_when_their_turn_comes(told):
         rate.sleep()
 
     sender = CommandSender(
-        execute, Rate(50.0, clock), limiter, Latch(clock.now), [Noting()], one_by_one=True
+        execute, 50.0, clock, limiter, Latch(clock.now), [Noting()], one_by_one=True
     )
     limiter.start([0.0, 0.0])
-    sender.play(np.zeros((3, 2)))
+    sender.send_targets(np.zeros((3, 2)))
 
     assert order == ["filter", "send"] * 3

@@ -181,7 +181,7 @@ def test_after_a_rearm_a_new_control_process_shows_its_frames(tmp_path, module):
 
     def kill(observation, answer=run.policy.predict_action):
         if len(run.policy.seen) == 4:
-            os.kill(run.runner._session.engine._process.pid, signal.SIGKILL)
+            os.kill(run.runner._engine._process.pid, signal.SIGKILL)
         return answer(observation)
 
     run.policy.predict_action = kill

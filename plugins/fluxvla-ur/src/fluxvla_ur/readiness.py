@@ -1,8 +1,12 @@
-"""Checks of a UR's safety mode and speed scaling: whether it may be commanded."""
+"""Checks of a UR: whether it may be commanded, and whether it still speaks."""
 
 from __future__ import annotations
 
+import math
+import time
+
 from fluxvla_core.errors import Faulted
+from fluxvla_core.ros2 import Stale
 
 PAUSED = 0.01
 """Speed scaling below which the robot counts as paused."""
@@ -53,3 +57,33 @@ def check_safety(mode: int) -> None:
             cause="it hit something, somebody pressed a stop, or a safety limit was reached",
             next="look at the teach pendant, see that the way is free, and clear the stop there",
         )
+
+
+def check_age(name: str, receipt: float | None, max_age_s: float) -> None:
+    """Refuse a stream that fell silent.
+
+    Args:
+        name: of the stream.
+        receipt: when its last reading arrived (monotonic, s); None before any.
+        max_age_s: how long it may be silent.
+
+    Raises:
+        Stale: it was silent for longer.
+    """
+    age = math.inf if receipt is None else time.monotonic() - receipt
+    if age > max_age_s:
+        raise Stale(
+            f"{name} is silent for {age:.2f} s; {max_age_s:g} s is allowed",
+            cause="the connection is gone, the device froze, or this machine is overloaded",
+            next="look at the cable; max_age_s of the operator says how long it may be silent",
+        )
+
+
+def script_ended(watchdog_hz: float) -> Faulted:
+    """The error of a controller on which the program that obeys commands does not run any more."""
+    return Faulted(
+        "the control script on the robot has ended, and nothing obeys commands",
+        cause="a stop, local mode, a broken connection, or this program was silent for longer "
+        f"than 1/watchdog_hz = {1 / watchdog_hz:g} s",
+        next="look at the teach pendant, clear the stop, and start again",
+    )

@@ -16,7 +16,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -25,12 +24,12 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError, Faulted, NotReady
 from fluxvla_core.operators import Camera, Frame, Operator, Part
-from fluxvla_core.ros2 import STATE, Stale, checked_action
+from fluxvla_core.ros2 import STATE, checked_action
 from fluxvla_ur.embodiment import ACCELERATION, JOINTS, RATE_HZ, ur_spec
-from fluxvla_ur.readiness import check_not_paused, check_safety
+from fluxvla_ur.readiness import check_age, check_not_paused, check_safety, script_ended
 from fluxvla_ur.robotiq import PORT as GRIPPER_PORT
 from fluxvla_ur.robotiq import RobotiqGripper
-from fluxvla_ur.rtde_client import disconnect, import_rtde, within
+from fluxvla_ur.rtde_client import Reading, disconnect, import_rtde, wait_for, within
 from fluxvla_ur.video import VideoCamera
 
 Array = npt.NDArray[np.float64]
@@ -53,16 +52,6 @@ _DATA_HZ = 125.0
 # The client waits for the controller's answer for ever: how long that may take while the controller
 # speaks, and once it fell silent.
 _STOP_S, _DISCONNECT_S, _SILENT_S = 2.0, 4.0, 0.3
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """The controller's last message, and when it arrived (monotonic, s)."""
-
-    receipt: float
-    joints: Array
-    safety: int
-    scaling: float
 
 
 class URRTDEOperator(Operator):
@@ -152,7 +141,7 @@ class URRTDEOperator(Operator):
         self._gripper: RobotiqGripper | None = None
         self._cameras: list[VideoCamera] = []
         self._watcher: threading.Thread | None = None
-        self._newest: _Reading | None = None
+        self._newest: Reading | None = None
         self._last: Array | None = None
         self._spoke = 0.0
         self._moving = False
@@ -252,7 +241,8 @@ class URRTDEOperator(Operator):
         images, stamps = {}, {STATE: min(reading.receipt, gripper[0])}
         for camera in self._cameras:
             newest = camera.newest()
-            self._check_age(camera.camera.name, None if newest is None else newest[0])
+            receipt = None if newest is None else newest[0]
+            check_age(camera.camera.name, receipt, self._max_age)
             assert newest is not None
             stamps[camera.camera.name], images[camera.camera.name] = newest[0], newest[1].copy()
         return Frame(np.append(reading.joints, gripper[1]), images, stamps)
@@ -344,12 +334,13 @@ class URRTDEOperator(Operator):
             self._receive = receive.RTDEReceiveInterface(self.robot_ip, _DATA_HZ, _VARIABLES)
             self._watcher = threading.Thread(target=self._watch, name="fluxvla-rtde", daemon=True)
             self._watcher.start()
-            self._wait_for(lambda: self._newest is not None, "the controller sends no data")
+            wait_for(lambda: self._newest is not None, "the controller sends no data", timeout)
             assert self._newest is not None
             if self._part.commands:
                 check_safety(self._newest.safety)
                 self._control = control.RTDEControlInterface(self.robot_ip, _DATA_HZ)
-                self._wait_for(self._control.isProgramRunning, "the control script does not run")
+                running = self._control.isProgramRunning
+                wait_for(running, "the control script does not run", timeout)
         except (OSError, RuntimeError) as error:
             raise NotReady(
                 f"no UR controller can be used at {self.robot_ip}: {error}",
@@ -365,18 +356,13 @@ class URRTDEOperator(Operator):
             self._cameras.append(VideoCamera(camera, self._sources[camera.name]))
             self._cameras[-1].connect()
         for camera in self._cameras:
-            self._wait_for(lambda c=camera: c.newest() is not None, f"{camera.camera.name} is dark")
+            wait_for(
+                lambda c=camera: c.newest() is not None, f"{camera.camera.name} is dark", timeout
+            )
         if self._part.commands:
             # Last: from here on the controller wants to hear from us.
             self._control.setWatchdog(self._watchdog_hz)
             self._spoke = time.monotonic()
-
-    def _wait_for(self, condition: Callable[[], bool], what: str) -> None:
-        until = time.monotonic() + self._connect_timeout
-        while not condition():
-            if time.monotonic() > until:
-                raise NotReady(f"{what} after {self._connect_timeout:g} s")
-            time.sleep(0.01)
 
     def _watch(self) -> None:
         """Keep the newest reading and its receipt; keep the watchdog quiet between commands."""
@@ -387,12 +373,7 @@ class URRTDEOperator(Operator):
                 # A client that lost its controller keeps returning the last state it received.
                 if receive is not None and receive.getTimestamp() != stamp:
                     stamp = receive.getTimestamp()
-                    self._newest = _Reading(
-                        now,
-                        np.array(receive.getActualQ(), dtype=np.float64),
-                        int(receive.getSafetyMode()),
-                        float(np.clip(receive.getSpeedScalingCombined(), 0.0, 1.0)),
-                    )
+                    self._newest = Reading.newest(receive, now)
                 self._kick(now)
             except Exception as error:  # noqa: BLE001 - its silence is what is noticed
                 log.error("%s: reading failed: %s", self.embodiment.name, error)
@@ -410,11 +391,11 @@ class URRTDEOperator(Operator):
             finally:
                 self._lock.release()
 
-    def _reading(self) -> _Reading:
+    def _reading(self) -> Reading:
         if not self._is_open:
             raise NotReady(f"{self.embodiment.name} is not connected", next="call connect() first")
         reading = self._newest
-        self._check_age("controller", None if reading is None else reading.receipt)
+        check_age("controller", None if reading is None else reading.receipt, self._max_age)
         assert reading is not None
         return reading
 
@@ -423,7 +404,7 @@ class URRTDEOperator(Operator):
             last = 1.0 if self._last is None else float(self._last[_ARM])
             return time.monotonic(), last
         position = self._gripper.position()
-        self._check_age("gripper", position[0])
+        check_age("gripper", position[0], self._max_age)
         return position
 
     def _silent(self) -> bool:
@@ -439,15 +420,6 @@ class URRTDEOperator(Operator):
                 "%s: the controller does not answer; its watchdog stops the arm", self.robot_ip
             )
 
-    def _check_age(self, name: str, receipt: float | None) -> None:
-        age = math.inf if receipt is None else time.monotonic() - receipt
-        if age > self._max_age:
-            raise Stale(
-                f"{name} is silent for {age:.2f} s; {self._max_age:g} s is allowed",
-                cause="the connection is gone, the device froze, or this machine is overloaded",
-                next="look at the cable; max_age_s of the operator says how long it may be silent",
-            )
-
     def _listens(self) -> bool:
         """Whether a call reaches the script; without a connection the client would crash."""
         self._broken = self._broken or not self._control.isConnected()
@@ -459,12 +431,7 @@ class URRTDEOperator(Operator):
         time.sleep(2.0 / _DATA_HZ)
         if self._newest is not None:
             check_safety(self._newest.safety)
-        return Faulted(
-            "the control script on the robot has ended, and nothing obeys commands",
-            cause="a stop, local mode, a broken connection, or this program was silent for longer "
-            f"than 1/watchdog_hz = {1 / self._watchdog_hz:g} s",
-            next="look at the teach pendant, clear the stop, and start again",
-        )
+        return script_ended(self._watchdog_hz)
 
     def _release(self) -> None:
         self._closing.set()

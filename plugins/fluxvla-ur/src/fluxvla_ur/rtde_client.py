@@ -1,13 +1,18 @@
-"""The ur-rtde client: importing it, calls with a time limit, disconnecting."""
+"""The ur-rtde client: importing it, its readings, calls with a time limit, disconnecting."""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.errors import LoadFailed
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.errors import LoadFailed, NotReady
 
 log = logging.getLogger("fluxvla.ur")
 
@@ -27,6 +32,46 @@ def import_rtde() -> tuple[Any, Any]:
             next="pip install 'fluxvla-ur[rtde]'",
         ) from error
     return rtde_control, rtde_receive
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The controller's last message.
+
+    Args:
+        receipt: when it arrived (monotonic, s).
+        joints: ``(6,)`` positions, rad.
+        safety: ``safety_mode`` of the RTDE guide.
+        scaling: share of the programmed speed that the robot runs at, 0 to 1.
+    """
+
+    receipt: float
+    joints: npt.NDArray[np.float64]
+    safety: int
+    scaling: float
+
+    @classmethod
+    def newest(cls, receive: Any, receipt: float) -> Reading:
+        """What the client received last."""
+        return cls(
+            receipt,
+            np.array(receive.getActualQ(), dtype=np.float64),
+            int(receive.getSafetyMode()),
+            float(np.clip(receive.getSpeedScalingCombined(), 0.0, 1.0)),
+        )
+
+
+def wait_for(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+    """Wait until ``condition`` holds.
+
+    Raises:
+        NotReady: it does not within ``timeout_s``; the message begins with ``what``.
+    """
+    until = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > until:
+            raise NotReady(f"{what} after {timeout_s:g} s")
+        time.sleep(0.01)
 
 
 def within(seconds: float, call: Callable[[], object]) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from typing import ClassVar
 
 from fluxvla_core.contracts.robot import Clock, Operator
@@ -82,9 +81,6 @@ class Rate:
         clock: source of the time; the monotonic clock by default.
         lead_s: how long before each deadline ``sleep`` returns, less than a period.
 
-    ``on_tick`` is called at each tick, after the wait; what it raises leaves ``sleep``. The runner
-    supervises there, so that a custom loop around ``rate.sleep()`` is supervised too.
-
     ``ticks`` counts those that happened, ``skipped`` those missed; ``late_s`` is how late the last
     one was, or, once ``wait`` was called, how late what was sent at the last deadline.
     """
@@ -102,7 +98,6 @@ class Rate:
         self.clock: Clock = clock or MonotonicClock()
         if not 0.0 <= lead_s < self.period:
             raise ValueError(f"a lead must be shorter than a period, got {lead_s} s at {hz} Hz")
-        self.on_tick: Callable[[], None] | None = None
         self.lead_s = lead_s
         self._lockstep = in_lockstep(self.clock)
         self._keeps = lead_s > 0.0 and type(self.clock) is MonotonicClock
@@ -127,7 +122,7 @@ class Rate:
         """
         if self._lockstep:
             # Time passed with the command; waiting for more of it would let the robot live on.
-            self._tick()
+            self.ticks += 1
             return 0.0
         now = self.clock.now()
         # The first call comes right after the first command: the deadline is a period later.
@@ -152,7 +147,7 @@ class Rate:
             self.late_s = late
         self._due = deadline + self.lead_s
         self._deadline = deadline + self.period
-        self._tick()
+        self.ticks += 1
         return late
 
     def wait(self) -> float:
@@ -170,8 +165,3 @@ class Rate:
                 self.clock.sleep_until(self._due)
             self.late_s = max(0.0, self.clock.now() - self._due)
         return self.late_s
-
-    def _tick(self) -> None:
-        self.ticks += 1
-        if self.on_tick is not None:
-            self.on_tick()

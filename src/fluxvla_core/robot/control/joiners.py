@@ -30,22 +30,6 @@ SCHEDULES = ("exp", "linear", "ones", "zeros")
 SAME_S = 5e-7
 
 
-class Ahead(ABC):
-    """The chunk that is being executed when a policy is asked; immutable."""
-
-    @abstractmethod
-    def seen_at(self, observed: float, horizon: int) -> Continuation | None:
-        """The rest of the current chunk at the times of the next chunk's actions.
-
-        Args:
-            observed: time of the observation that the next chunk answers.
-            horizon: how many actions the next chunk has.
-
-        Returns:
-            None if the current chunk ends before the next one's first action.
-        """
-
-
 class ChunkJoiner(ABC):
     """Chunks in, targets out. All calls come from the thread that sends."""
 
@@ -70,8 +54,8 @@ class ChunkJoiner(ABC):
     def wants_chunk(self, now: float) -> bool:
         """Whether the policy should be asked now, if it is free."""
 
-    def ahead(self) -> Ahead | None:
-        """What the policy has to continue; None for nothing."""
+    def previous_chunk(self) -> PreviousChunk | None:
+        """The chunk that the policy has to continue (real-time chunking); None for none."""
         return None
 
 
@@ -270,15 +254,32 @@ def soft_mask(horizon: int, frozen: int, known: int, schedule: str = "exp") -> A
 
 
 @dataclass(frozen=True)
-class RestOfChunk(Ahead):
-    """The chunk that is being played, and how late the next one is expected."""
+class PreviousChunk:
+    """The chunk that is being executed while the next is computed, as real-time chunking needs it.
+
+    Args:
+        chunk: that is being executed.
+        latency_s: how late after its observation the next chunk is expected.
+        schedule: see ``soft_mask``.
+        max_guidance_weight: see ``RealTime``.
+    """
 
     chunk: Chunk
     latency_s: float
     schedule: str
     max_guidance_weight: float
 
-    def seen_at(self, observed: float, horizon: int) -> Continuation | None:
+    def continuation(self, observed: float, horizon: int) -> Continuation | None:
+        """The prefix that the next chunk has to continue: what is left of this one.
+
+        Args:
+            observed: time of the observation that the next chunk answers.
+            horizon: how many actions the next chunk has.
+
+        Returns:
+            This chunk's actions at the times of the next one's, and how much each of them counts;
+            None if this chunk ends before the next one's first action.
+        """
         chunk = self.chunk
         elapsed = observed - chunk.observed + (np.arange(horizon) + 1.0) / chunk.rate_hz
         known = sum(chunk.reaches(float(seconds)) for seconds in elapsed)
@@ -369,11 +370,11 @@ class RealTime(StreamedJoiner):
                 return chunk.at(at - chunk.observed)
         return None
 
-    def ahead(self) -> Ahead | None:
+    def previous_chunk(self) -> PreviousChunk | None:
         if not self._chunks:
             return None
         newest = self._chunks[-1][0]
-        return RestOfChunk(newest, max(self._latencies), self.schedule, self.max_guidance_weight)
+        return PreviousChunk(newest, max(self._latencies), self.schedule, self.max_guidance_weight)
 
 
 STREAMED: Mapping[str, type[StreamedJoiner]] = {

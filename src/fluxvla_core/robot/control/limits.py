@@ -53,11 +53,12 @@ it, and that such an arm comes to rest within all limits too. A motion that keep
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.clamps import Clamp
 from fluxvla_core.robot.control.safety import BadCommand
 from fluxvla_core.robot.control.smoothing import Smoothing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
@@ -73,6 +74,21 @@ START_SHARE = 0.05
 START_SLACK = 0.05
 # A command that rounding alone keeps from what was wanted, in the joint's unit, is what was wanted.
 SAME = 1e-13
+
+
+@dataclass(frozen=True)
+class Clamp:
+    """One joint of one command that was not sent as wanted.
+
+    ``reason`` is the first rule that the wanted value breaks: ``position`` (it lies beyond a
+    limit), ``velocity`` (it is too far for one period), ``braking`` (going there, the arm could not
+    stop before a limit), ``acceleration``, or ``jerk``. Values are in the joint's unit.
+    """
+
+    joint: str
+    wanted: float
+    given: float
+    reason: str
 
 
 class CommandLimiter:
@@ -240,9 +256,7 @@ class CommandLimiter:
         Raises:
             BadCommand: ``wanted`` has another shape or is not finite; nothing changes then.
         """
-        return self._step_to(self._checked(wanted, "the command"), speed)
-
-    def _step_to(self, target: Array, speed: float) -> tuple[Array, list[Clamp]]:
+        target = self._checked(wanted, "the command")
         self._started()
         before = self._raw
         # The share is of a speed, also where that is the command.
@@ -273,7 +287,7 @@ class CommandLimiter:
         commands = np.empty_like(rows)
         clamps = []
         for index, row in enumerate(rows):
-            commands[index], found = self._step_to(row, speed)
+            commands[index], found = self.step(row, speed)
             clamps.append(found)
         return commands, clamps
 

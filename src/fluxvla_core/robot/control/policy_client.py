@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.robot.control.delays import DelaySource
-from fluxvla_core.robot.control.joiners import Ahead
+from fluxvla_core.robot.control.joiners import PreviousChunk
 from fluxvla_core.robot.control.safety import BadChunk, Rule
 
 Array = npt.NDArray[np.float64]
@@ -89,11 +89,11 @@ class PolicyClient(ABC):
         """
 
     @abstractmethod
-    def ask(self, ahead: Ahead | None) -> Future[Answer]:
+    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
         """Observe, and ask the policy.
 
         Args:
-            ahead: what the policy has to continue; None for nothing.
+            previous: the chunk that the policy has to continue; None for none.
 
         Returns:
             The answer, or what observing or the policy raised.

@@ -1,7 +1,8 @@
 """The one path from a target to a command that is sent: filters, limits, latch, control tick.
 
 ``CommandPipeline`` forms commands, for a robot and for a stepped environment alike;
-``CommandSender`` sends them on a robot at its control rate.
+``CommandSender`` sends them on a robot at its control rate. What sends each one may be a runner's
+own loop around ``rate.sleep()``: ``CommandRate`` is the rate that it is given.
 """
 
 from __future__ import annotations
@@ -13,17 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.contracts.robot import Clock
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.clamps import Clamp, PassThrough
 from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.robot.control.limits import Clamp, CommandLimiter
 from fluxvla_core.robot.control.safety import BadCommand, Latch
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 Filter = Callable[[Array], Array]
-Execute = Callable[[Array, Rate], None]
+ExecuteActions = Callable[[Array, Rate], None]
+"""Sends ``(N, D)`` commands, one at each tick of the rate: a runner's ``_execute_actions``."""
+AfterTick = Callable[["SentCommand | None", float, float], None]
 # How long an arm is led to where it is held, at most. No arm's limits are as low as that.
 _LEAD_S = 3.0
 _THERE = 1e-9  # from a pose that is moved to, in the joints' units
@@ -40,6 +43,33 @@ class SentCommand:
     command: Array
     clamps: tuple[Clamp, ...]
     held: bool = False
+
+
+class PassThrough:
+    """No limits, for actions that are no joint targets: commands are the targets.
+
+    What such an environment does with a value beyond its limits is up to it; it is recorded.
+
+    Args:
+        embodiment: gives the limits that the values are compared with.
+    """
+
+    def __init__(self, embodiment: EmbodimentSpec) -> None:
+        self.embodiment = embodiment
+        self._lower: Array = np.array([joint.lower for joint in embodiment.joints])
+        self._upper: Array = np.array([joint.upper for joint in embodiment.joints])
+
+    def run(self, wanted: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[list[Clamp]]]:
+        """``(N, D)`` targets as they are, and a ``Clamp`` for each value beyond its limits."""
+        rows = np.asarray(wanted, dtype=np.float64)
+        slack = 1e-6 * (self._upper - self._lower)
+        beyond = (rows > self._upper + slack) | (rows < self._lower - slack)
+        return rows, [self._noted(row, found) for row, found in zip(rows, beyond, strict=True)]
+
+    def _noted(self, row: Array, beyond: npt.NDArray[np.bool_]) -> list[Clamp]:
+        names = self.embodiment.joint_names
+        values = [(names[index], float(row[index])) for index in np.flatnonzero(beyond)]
+        return [Clamp(name, value, value, "position") for name, value in values]
 
 
 class CommandPipeline:
@@ -90,54 +120,78 @@ class CommandPipeline:
         return row
 
 
-class CommandSender:
-    """Plays targets on a robot; nothing else in a run sends commands.
-
-    A ``CommandPipeline`` makes commands of targets. They are handed to ``execute`` (a runner's
-    ``_execute_actions``), which sends each and waits with ``rate.sleep()``; at that tick
-    ``on_sent`` is called with the command.
+class CommandRate(Rate):
+    """A rate whose ``sleep()`` also reports the tick, so that any loop around it is supervised.
 
     Args:
-        execute: called with ``(N, D)`` commands and the rate.
-        rate: its ``on_tick`` is taken over.
-        limiter: started before anything is played.
+        hz, clock, lead_s: as ``Rate`` has them.
+        after_tick: called after each wait; what it raises leaves ``sleep()``.
+    """
+
+    def __init__(
+        self, hz: float, clock: Clock, lead_s: float, after_tick: Callable[[], None]
+    ) -> None:
+        super().__init__(hz, clock, lead_s)
+        self._after_tick = after_tick
+
+    def sleep(self) -> float:
+        late = super().sleep()
+        self._after_tick()
+        return late
+
+
+class CommandSender:
+    """Sends commands for targets to a robot; nothing else in a run does.
+
+    A ``CommandPipeline`` makes commands of targets. They are handed to ``execute_actions``, which
+    sends each and waits with ``rate.sleep()``; at that tick ``after_tick`` is called with the
+    command.
+
+    Args:
+        execute_actions: called with ``(N, D)`` commands and ``rate``.
+        rate_hz: commands a second.
+        clock: the robot's.
+        limiter: started before anything is sent.
         latch: while it is tripped only ``brake``, ``send_hold`` and ``rest_at`` send.
         filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
-        on_sent: called at each tick with what was sent, None for a tick without a command.
+        after_tick: called at each tick with what was sent (None for a tick without a command), when
+            the arm had it at the latest (of commands that a loop without ticks sends, when it had
+            the first), and how late the tick was, in seconds.
         speed: tells, before each command, the share of the velocity limits that it may use, in
             (0, 1]: a robot that a person slowed down. None where there is no such thing.
-        one_by_one: make each command when its turn comes, and hand it to ``execute`` alone: filters
+        one_by_one: make each command when its turn comes, and hand it over alone: filters
             that take long then make no command late but their own.
+        lead_s: how long before its deadline a command is made ready, as ``Rate`` has it.
     """
 
     def __init__(
         self,
-        execute: Execute,
-        rate: Rate,
+        execute_actions: ExecuteActions,
+        rate_hz: float,
+        clock: Clock,
         limiter: CommandLimiter,
         latch: Latch,
         filters: Sequence[Filter] = (),
-        on_sent: Callable[[SentCommand | None], None] | None = None,
+        after_tick: AfterTick | None = None,
         speed: Callable[[], float] | None = None,
         one_by_one: bool = False,
+        lead_s: float = 0.0,
     ) -> None:
-        self.rate = rate
+        self.rate = CommandRate(rate_hz, clock, lead_s, self._after_tick)
         self.limiter = limiter
         self.latch = latch
-        self._execute = execute
+        self._execute_actions = execute_actions
         self._pipeline = CommandPipeline(limiter, filters)
-        self._on_sent = on_sent or (lambda sent: None)
+        self._report = after_tick or (lambda sent, sent_at, late_s: None)
         self._speed = speed
         self._one_by_one = one_by_one or speed is not None
         self._rows: deque[SentCommand] = deque()
-        # When the arm had the command that ``on_sent`` gets, at the latest; of those that a loop
-        # with ticks of its own plays, when the first was.
-        self.sent_at = 0.0
         # Commands of a call that were sent, the one that is being sent among them.
-        self._played = 0
-        rate.on_tick = self._tick
+        self._sent_count = 0
 
-    def play(self, targets: npt.ArrayLike, filtered: bool = True, most: float = 1.0) -> None:
+    def send_targets(
+        self, targets: npt.ArrayLike, filtered: bool = True, most: float = 1.0
+    ) -> None:
         """Send one command for each row of ``(N, D)`` targets.
 
         Args:
@@ -156,19 +210,19 @@ class CommandSender:
             rows = wanted[row : row + count]
             shaped = self._pipeline.filtered(rows) if filtered else rows
             share = most if self._speed is None else min(self._speed(), most)
-            self._play(rows, shaped, share)
+            self._send_limited(rows, shaped, share)
 
-    def _play(self, wanted: Array, shaped: Array, speed: float) -> None:
+    def _send_limited(self, wanted: Array, shaped: Array, speed: float) -> None:
         before = self.limiter.snapshot()
-        self._played = 0
+        self._sent_count = 0
         try:
             commands, clamps = self._pipeline.limited(shaped, speed)
             self._send(wanted, commands, clamps)
         finally:
             self._rows.clear()
-            if self._played < len(shaped):
+            if self._sent_count < len(shaped):
                 self.limiter.restore(before)
-                self.limiter.run(shaped[: self._played], speed)
+                self.limiter.run(shaped[: self._sent_count], speed)
 
     def move_along(self, way: Array, most: float) -> None:
         """Move along ``(N, D)`` targets, past the filters, and arrive at the last of them.
@@ -180,10 +234,10 @@ class CommandSender:
         Raises:
             SafetyStop: the latch is tripped.
         """
-        self.play(way, filtered=False, most=most)
+        self.send_targets(way, filtered=False, most=most)
         # An arm that a person slowed down is not there yet; let go, it does not make up for it.
         while len(way) and np.abs(self.limiter.last - way[-1]).max() > _THERE:
-            self.play(way[-1:], filtered=False, most=most)
+            self.send_targets(way[-1:], filtered=False, most=most)
 
     def hold(self) -> None:
         """Send one command of the shortest stop, or the last command again when at rest."""
@@ -229,20 +283,20 @@ class CommandSender:
         self._rows = deque(SentCommand(t, c, tuple(found), held) for t, c, found in rows)
         handed = commands.copy()
         handed.flags.writeable = False
-        ticks, self.sent_at = self.rate.ticks, self.rate.clock.now()
-        self._played = 1
-        self._execute(handed, self.rate)
+        ticks, sent_at = self.rate.ticks, self.rate.clock.now()
+        self._sent_count = 1
+        self._execute_actions(handed, self.rate)
         if self.rate.ticks == ticks:
-            # A loop with ticks of its own: what it was given, it has played.
-            self._played = len(commands)
+            # A loop with ticks of its own: what it was given, it has sent.
+            self._sent_count = len(commands)
             while self._rows:
-                self._on_sent(self._rows.popleft())
-        self._played = len(commands) - len(self._rows)
+                self._report(self._rows.popleft(), sent_at, self.rate.late_s)
+        self._sent_count = len(commands) - len(self._rows)
 
-    def _tick(self) -> None:
-        self.sent_at = self.rate.clock.now()
-        self._on_sent(self._rows.popleft() if self._rows else None)
-        self._played += 1
+    def _after_tick(self) -> None:
+        rate, sent = self.rate, self._rows.popleft() if self._rows else None
+        self._report(sent, rate.clock.now(), rate.late_s)
+        self._sent_count += 1
 
 
 def come_to_rest(

@@ -18,12 +18,12 @@ from fluxvla_core.robot.process.setup import ControlSetup
 
 def main() -> None:
     """Build the robot's commanding side, and serve the main process."""
-    memory, setup, *frames = map(int, sys.argv[1:])
+    memory, setup, *frame_memory = map(int, sys.argv[1:])
     link = Link(memory, control=True)
     with os.fdopen(setup, encoding="utf-8") as pipe:
         text = pipe.read()
     try:
-        channel = FrameChannel(FrameMemory(*frames)) if frames else None
+        channel = FrameChannel(FrameMemory(*frame_memory)) if frame_memory else None
         serve(link, ControlSetup.from_json(text), channel)
     except Exception as error:  # noqa: BLE001 - raised in the main process
         link.send(Kind.FAILED, **error_fields(error))

@@ -47,7 +47,7 @@ class ControlProcess:
         setup: what it is built from.
         robot: reads the cameras in this process.
         interrupts: signals; passed on.
-        frames: shows this process the images of an operator that runs as a whole in the other.
+        remote_operator: the stand-in for an operator that runs as a whole in the other process.
 
     Attributes:
         link: to it.
@@ -64,12 +64,14 @@ class ControlProcess:
         setup: ControlSetup,
         robot: Robot,
         interrupts: Interrupts,
-        frames: RemoteOperator | None,
+        remote_operator: RemoteOperator | None,
     ) -> None:
-        self._interrupts, self._frames = interrupts, frames
+        self._interrupts, self._remote_operator = interrupts, remote_operator
         try:
-            memory = None if frames is None else frames.open(setup.cameras or ())
-            self._process, self.link = launch(setup, memory)
+            frame_memory = None
+            if remote_operator is not None:
+                frame_memory = remote_operator.open(setup.cameras or ())
+            self._process, self.link = launch(setup, frame_memory)
         except OSError as error:
             raise RunFailed(
                 f"the control process could not be started: {error}",
@@ -160,18 +162,18 @@ class ControlProcess:
         self._process.wait()
         self.ended = True
         self.server.close()
-        if self._frames is not None:
-            self._frames.close()
+        if self._remote_operator is not None:
+            self._remote_operator.close()
 
 
 def launch(
-    setup: ControlSetup, frames: FrameMemory | None = None
+    setup: ControlSetup, frame_memory: FrameMemory | None = None
 ) -> tuple[subprocess.Popen[bytes], Link]:
     """Start a control process; it, and this process's end of the memory that both share.
 
     Args:
         setup: what it is built from.
-        frames: for the images of an operator that runs there as a whole; remains open.
+        frame_memory: for the images of an operator that runs there as a whole; remains open.
 
     Raises:
         OSError: the system has no room for it.
@@ -181,8 +183,8 @@ def launch(
     try:
         link = Link(memory, control=False)
         process = subprocess.Popen(
-            [*_COMMAND, *map(str, (memory, reads, *(frames or ())))],
-            pass_fds=(memory, reads, *(frames or ())),
+            [*_COMMAND, *map(str, (memory, reads, *(frame_memory or ())))],
+            pass_fds=(memory, reads, *(frame_memory or ())),
             stdin=subprocess.DEVNULL,
             # Ctrl-C, and a terminal that closes, are for this process alone.
             start_new_session=True,

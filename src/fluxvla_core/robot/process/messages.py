@@ -74,7 +74,7 @@ class Kind(str, Enum):
     RESET = "reset"
     """Reset the policy; REPLY follows."""
     ASK = "ask"
-    """Observe, and ask the policy: ``number``, and what is left of the chunk; ANSWER follows."""
+    """Observe, and ask the policy: ``number``, and the chunk to continue; ANSWER follows."""
     ACCEPTED = "accepted"
     """The chunk of ANSWER ``number`` is executed."""
     REFUSED = "refused"

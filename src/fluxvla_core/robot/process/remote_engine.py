@@ -58,7 +58,7 @@ class RemoteEngine(Engine):
         interrupts: signals; passed on.
         reporter: shows progress and warnings.
         history: of the runner's earlier runs.
-        frames: shows this process the images of an operator that runs as a whole in the other.
+        remote_operator: the stand-in for an operator that runs as a whole in the other process.
     """
 
     def __init__(
@@ -70,10 +70,10 @@ class RemoteEngine(Engine):
         interrupts: Interrupts,
         reporter: Reporter,
         history: RunHistory,
-        frames: RemoteOperator | None = None,
+        remote_operator: RemoteOperator | None = None,
     ) -> None:
         self._setup, self._robot, self._settings = setup, robot, setup.settings
-        self._frames = frames
+        self._remote_operator = remote_operator
         self._make_client = make_client
         self._latch, self._interrupts, self._reporter = latch, interrupts, reporter
         self._history = history
@@ -83,8 +83,6 @@ class RemoteEngine(Engine):
         self._steps = 0
         self._facts: Mapping[str, Any] = {}
 
-    # The contract.
-
     def connect(self) -> None:
         self._start()
         self._robot.connect()
@@ -93,7 +91,7 @@ class RemoteEngine(Engine):
         # So that a policy's threads release the GIL for the one that shows that this process runs.
         return realtime.short_gil_slices()
 
-    def play(
+    def run_episode(
         self,
         task: Task,
         number: int,
@@ -114,7 +112,7 @@ class RemoteEngine(Engine):
             # Compared with commands in the control process.
             tracking = TrackingWatch(self._robot.embodiment, settings.safety)
             self._process.server.begin(self._make_client(task, seed, tracking, self._emit))
-            self._play(task, number, seed, folder)
+            self._await_episode(task, number, seed, folder)
         except ControlProcessGone as gone:
             self._note_gone(gone)
             raise
@@ -158,8 +156,6 @@ class RemoteEngine(Engine):
         failure = self._process.end(END_S) if self._runs else None
         return self._robot.close() or failure
 
-    # Parts.
-
     def _start(self) -> None:
         """Start the process, and let it connect to the robot.
 
@@ -167,7 +163,9 @@ class RemoteEngine(Engine):
             FluxError: its side of the robot cannot be built, or cannot be connected to; or this
                 machine has no room for it.
         """
-        self._started = ControlProcess(self._setup, self._robot, self._interrupts, self._frames)
+        self._started = ControlProcess(
+            self._setup, self._robot, self._interrupts, self._remote_operator
+        )
         try:
             self._await(Kind.READY, _START_S)
             self._order(Kind.CONNECT, None)
@@ -193,7 +191,8 @@ class RemoteEngine(Engine):
         if self._started is not None:
             self._started.holding = False
 
-    def _play(self, task: Task, number: int, seed: int, folder: Path) -> None:
+    def _await_episode(self, task: Task, number: int, seed: int, folder: Path) -> None:
+        """Order an episode, and handle what the control process sends until it is over."""
         problem: BaseException | None = None
         self._process.link.send(
             Kind.PLAY,

@@ -9,7 +9,7 @@ from typing import Any
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.robot.control.chunks import Chunk
 from fluxvla_core.robot.control.delays import DelaySource
-from fluxvla_core.robot.control.joiners import Ahead, RestOfChunk
+from fluxvla_core.robot.control.joiners import PreviousChunk
 from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.process.inbox import Inbox, RemoteAnswer
 from fluxvla_core.robot.process.link import Link
@@ -47,11 +47,11 @@ class RemotePolicyClient(PolicyClient):
     def reset(self) -> None:
         self._request(Kind.RESET, self._patience_s)
 
-    def ask(self, ahead: Ahead | None) -> Future[Answer]:
+    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
         self._asked += 1
         future: Future[Answer] = Future()
         self._inbox.answers[self._asked] = future
-        fields, arrays = _continued(ahead)
+        fields, arrays = _previous_fields(previous)
         self._link.send(Kind.ASK, arrays, number=self._asked, **fields)
         return future
 
@@ -97,27 +97,26 @@ class RemotePolicyClient(PolicyClient):
         return reply
 
 
-def _continued(ahead: Ahead | None) -> tuple[dict[str, Any], tuple[Array, ...]]:
-    if ahead is None:
+def _previous_fields(previous: PreviousChunk | None) -> tuple[dict[str, Any], tuple[Array, ...]]:
+    if previous is None:
         return {}, ()
-    assert isinstance(ahead, RestOfChunk)
     fields = {
-        "rate_hz": ahead.chunk.rate_hz,
-        "observed": ahead.chunk.observed,
-        "latency_s": ahead.latency_s,
-        "schedule": ahead.schedule,
-        "max_guidance_weight": ahead.max_guidance_weight,
+        "rate_hz": previous.chunk.rate_hz,
+        "observed": previous.chunk.observed,
+        "latency_s": previous.latency_s,
+        "schedule": previous.schedule,
+        "max_guidance_weight": previous.max_guidance_weight,
     }
-    return fields, (ahead.chunk.actions, ahead.chunk.anchor)
+    return fields, (previous.chunk.actions, previous.chunk.anchor)
 
 
-def ahead_of(message: Message) -> Ahead | None:
-    """The rest of the chunk in a message ``ASK``, which the policy has to continue."""
+def previous_chunk_of(message: Message) -> PreviousChunk | None:
+    """The chunk in a message ``ASK``, which the policy has to continue."""
     if not message.arrays:
         return None
     actions, anchor = message.arrays
     fields = message.fields
-    return RestOfChunk(
+    return PreviousChunk(
         Chunk(actions, fields["rate_hz"], fields["observed"], anchor),
         fields["latency_s"],
         fields["schedule"],

@@ -98,4 +98,6 @@ def _stored(length: int) -> int:
 
 
 def _checksum(position: int, message: bytes) -> int:
-    return zlib.crc32(message, position & 0xFFFFFFFF)
+    # Of two positions the seeds differ in all their bytes: a record of before that differs from the
+    # new one in a byte has another checksum.
+    return zlib.crc32(message, zlib.crc32(position.to_bytes(8, "little")))

@@ -26,7 +26,7 @@ from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.control.interrupt import Interrupted
 from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.sender import Execute
+from fluxvla_core.robot.control.sender import ExecuteActions
 from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts
@@ -131,13 +131,13 @@ class LinkObserver(EpisodeObserver):
         file.close()
 
 
-def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -> None:
+def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = None) -> None:
     """Carry out the main process's orders until it says ``close``, or is dead.
 
     Args:
         link: this process's end.
         setup: what it is built from.
-        frames: this process's end, for an operator that runs here as a whole.
+        frame_channel: this process's end, for an operator that runs here as a whole.
 
     Raises:
         ConfigError, PluginError: the operator or a filter cannot be built.
@@ -146,13 +146,13 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
     inbox = Inbox(link, setup.settings.safety)
     _take_signals(inbox)
     logging.getLogger().addHandler(LinkLog(link))
-    robot, execute = setup.build_control_side(reporter)
+    robot, execute_actions = setup.build_control_side(reporter)
     if isinstance(robot, UndividedRobot):
-        assert frames is not None, "the main process shares memory for its images"
-        robot.serve(frames, setup.cameras or (), setup.settings.safety.max_age_s)
+        assert frame_channel is not None, "the main process shares memory for its images"
+        robot.serve(frame_channel, setup.cameras or (), setup.settings.safety.max_age_s)
         inbox.watch = robot.check_reading
     observer = LinkObserver(link, inbox)
-    parts = _parts(link, setup, robot, execute, inbox, reporter, observer)
+    parts = _parts(link, setup, robot, execute_actions, inbox, reporter, observer)
     history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
     engine = LocalEngine(parts, setup.settings, history)
     link.send(Kind.READY)
@@ -171,7 +171,7 @@ def serve(link: Link, setup: ControlSetup, frames: FrameChannel | None = None) -
                 elif order.kind == Kind.CLOSE:
                     return
                 else:
-                    _execute(link, inbox, engine, observer, order)
+                    _carry_out(link, inbox, engine, observer, order)
     finally:
         failures = [engine.stop(), engine.close()]
         link.send(Kind.CLOSED, failures=failures)
@@ -203,7 +203,7 @@ def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
         link.send(Kind.RELEASED, **error_fields(error))
 
 
-def _execute(
+def _carry_out(
     link: Link, inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message
 ) -> None:
     orders: Mapping[str, Callable[[], object]] = {
@@ -211,7 +211,7 @@ def _execute(
         Kind.REARM: engine.rearm,
         Kind.RELEASE: engine.release,
         Kind.STOP: engine.stop,
-        Kind.PLAY: lambda: _play(inbox, engine, observer, order),
+        Kind.PLAY: lambda: _run_episode(inbox, engine, observer, order),
     }
     fields: dict[str, Any]
     try:
@@ -234,11 +234,11 @@ def _connect(engine: Engine) -> None:
     gc.freeze()
 
 
-def _play(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
+def _run_episode(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
     inbox.phase = Phase.START
     try:
         task = Task(order["task"], order["instruction"], order["free"])
-        engine.play(task, order["number"], order["seed"], (observer,), Path(order["folder"]))
+        engine.run_episode(task, order["number"], order["seed"], (observer,), Path(order["folder"]))
     finally:
         inbox.phase = Phase.OVER
         gc.collect()
@@ -250,7 +250,7 @@ def _parts(
     link: Link,
     setup: ControlSetup,
     robot: Robot,
-    execute: Execute,
+    execute_actions: ExecuteActions,
     inbox: Inbox,
     reporter: Reporter,
     observer: EpisodeObserver,
@@ -271,7 +271,7 @@ def _parts(
         make_client=make_client,
         filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
         joiner=make_joiner(*setup.joining),
-        execute=execute,
+        execute_actions=execute_actions,
         latch=Latch(robot.clock.now),
         interrupts=inbox,
         reporter=reporter,

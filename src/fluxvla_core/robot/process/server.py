@@ -15,7 +15,7 @@ from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Kind, Message, error_fields
-from fluxvla_core.robot.process.remote_policy_client import ahead_of
+from fluxvla_core.robot.process.remote_policy_client import previous_chunk_of
 from fluxvla_core.robot.robot import Robot
 
 _POLL_S = 0.004
@@ -129,7 +129,7 @@ class LinkServer:
                 arrays = (answer.checked(),)
                 self._link.send(Kind.ANSWER, arrays, number=number, observed=answer.observed)
 
-        client.ask(ahead_of(message)).add_done_callback(answered)
+        client.ask(previous_chunk_of(message)).add_done_callback(answered)
 
     def _reply_delay(self, since: float) -> None:
         late, seconds = self._robot.delays.longest(since)

@@ -24,7 +24,7 @@ from fluxvla_core.contracts.robot import ActionFilter, Operator
 from fluxvla_core.plugins.files import load_plugin_files, plugin_files
 from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RUNNERS
 from fluxvla_core.robot.control.safety import SafetySettings
-from fluxvla_core.robot.control.sender import Execute
+from fluxvla_core.robot.control.sender import ExecuteActions
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.options import build_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
@@ -98,7 +98,7 @@ class ControlSetup:
         """
         return self.build_control_side(reporter)[0]
 
-    def build_control_side(self, reporter: Reporter) -> tuple[Robot, Execute]:
+    def build_control_side(self, reporter: Reporter) -> tuple[Robot, ExecuteActions]:
         """The robot that this process commands, not connected, and what sends the commands.
 
         Raises:
@@ -107,12 +107,12 @@ class ControlSetup:
         self._import_registered()
         if self.runner is not None:
             runner = build_runner_from_cfg(self.runner, self._context(reporter))
-            robot = UndividedRobot(runner.ros_operator, self._spec(), sends=True)
-            execute, observe = runner.control_side(robot, self.cameras or ())
+            robot = UndividedRobot(runner.ros_operator, self._spec(), runner_sends=True)
+            execute_actions, observe = runner.control_side(robot, self.cameras or ())
             robot.observed_by(observe)
-            return robot, execute
+            return robot, execute_actions
         made = self._operators_robot(reporter)
-        return made, made.play
+        return made, made.send_actions
 
     def _operators_robot(self, reporter: Reporter) -> Robot:
         built = build_operator_from_cfg(self.operator, self._context(reporter))

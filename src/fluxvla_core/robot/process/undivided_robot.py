@@ -6,12 +6,13 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.control.safety import BadFrame, BadTiming
+from fluxvla_core.robot.operator_values import as_state, check_frame, is_number
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
     FrameMessage,
@@ -20,11 +21,8 @@ from fluxvla_core.robot.process.frames import (
     message_of_observation,
 )
 from fluxvla_core.robot.process.messages import error_fields
-from fluxvla_core.robot.robot import Robot, StateSample, as_state, is_number
+from fluxvla_core.robot.robot import Observe, Robot, StateSample
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-
-Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
-"""Makes a runner's observation, and returns the frame that it was made of, if there is one."""
 
 
 class UndividedRobot(Robot):
@@ -34,11 +32,13 @@ class UndividedRobot(Robot):
     command. Code in there that holds the GIL does.
 
     Args:
-        operator, embodiment, sends: as ``Robot`` has them.
+        operator, embodiment, runner_sends: as ``Robot`` has them.
     """
 
-    def __init__(self, operator: Any, embodiment: EmbodimentSpec, sends: bool = False) -> None:
-        super().__init__(operator, embodiment, sends)
+    def __init__(
+        self, operator: Any, embodiment: EmbodimentSpec, runner_sends: bool = False
+    ) -> None:
+        super().__init__(operator, embodiment, runner_sends)
         self._observe: Observe | None = None
         self._cameras: tuple[str, ...] = ()
         self._max_age_s = math.inf
@@ -142,8 +142,6 @@ class UndividedRobot(Robot):
         self._states.append(StateSample(state, stamp if timed and stamp else self.clock.now()))
 
     def _too_large(self, message: FrameMessage) -> FluxError:
-        from fluxvla_core.robot.observation import check_frame  # rarely needed
-
         try:
             check_frame(frame_of(message), self.embodiment, self._cameras)
         except BadFrame as error:

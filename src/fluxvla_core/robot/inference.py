@@ -1,26 +1,40 @@
-"""Observations of a robot for its policy: complete, fresh, and as the embodiment describes."""
+"""Inference in an episode: read an observation, check it, query the policy, check its chunk.
+
+On a robot all of it happens in a thread of its own (``PolicyThread``), so that the one that sends
+commands never waits for a camera or a policy. How old an observation may be for the policy
+(``safety.max_age_s``) is checked here, for every kind of operator.
+"""
 
 from __future__ import annotations
 
 import math
 import time
+import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from fluxvla_core.build import RunContext
-from fluxvla_core.contracts.frame import STATE, Frame
+from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.errors import FluxError, NotReady, SpecMismatch
+from fluxvla_core.errors import FluxError, NotReady
+from fluxvla_core.robot.control.chunks import check_chunk
+from fluxvla_core.robot.control.delays import POLICY, DelaySource
 from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.safety import BadFrame, BadTiming, SafetySettings
+from fluxvla_core.robot.control.joiners import PreviousChunk
+from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyFailed
+from fluxvla_core.robot.control.safety import BadChunk, BadFrame, BadTiming, SafetySettings
 from fluxvla_core.robot.control.tracking import TrackingWatch
-from fluxvla_core.robot.events import Event, Observed, Refused, RobotReading
+from fluxvla_core.robot.events import ChunkAccepted, Event, Observed, Refused, RobotReading
+from fluxvla_core.robot.observation_history import ObservationHistory
+from fluxvla_core.robot.operator_values import check_frame, is_number
 from fluxvla_core.robot.policy_thread import PolicyThread
-from fluxvla_core.robot.robot import Robot, as_state, is_number
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.robot.robot import Observe, Robot
+
+Array = npt.NDArray[np.float64]
 
 _READ_TIMEOUT_S = 0.5  # the least time that the first reading is given
 _LONG_S = 0.1  # a reading that takes longer makes its own streams old
@@ -28,8 +42,144 @@ _LONG_S = 0.1  # a reading that takes longer makes its own streams old
 # A stamp may be this far in the future: the reading was taken while its age was computed.
 AHEAD_S = 0.005
 
-Observe = Callable[[], tuple[dict[str, Any], Frame | None]]
-"""Makes an observation of the robot's newest frame; returns the frame as well if it has it."""
+
+@dataclass(frozen=True)
+class PolicyAnswer(Answer):
+    """A policy's answer to a reading, as it came.
+
+    Args:
+        reading: that it was asked with.
+        chunk: as it came.
+        stages: seconds, by stage; ``policy`` is all of it.
+    """
+
+    reading: RobotReading
+    chunk: Any
+    stages: Mapping[str, float]
+
+
+class LocalPolicyClient(PolicyClient):
+    """Observes a robot and queries a policy of this process, in one episode.
+
+    On a robot both happen in the policy's thread. In a lockstep simulation observing happens in the
+    thread that sends commands: renderers are bound to one.
+
+    Args:
+        robot: the connected robot.
+        reader: reads the robot's observations.
+        history: keeps those of before, for a policy that acts on several.
+        policy: answers them with chunks; loaded.
+        seed: the policy's in this episode.
+        thread: the thread in which the policy computes.
+        safety: thresholds of the checks of chunks.
+        emit: takes the events ``ChunkAccepted`` and ``Refused``.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        reader: ObservationReader,
+        history: ObservationHistory,
+        policy: Policy,
+        seed: int,
+        thread: PolicyThread,
+        safety: SafetySettings,
+        emit: Callable[[Event], None],
+    ) -> None:
+        self._robot = robot
+        self._reader = reader
+        self._history = history
+        self._policy = policy
+        self._seed = seed
+        self._thread = thread
+        self._safety = safety
+        self._emit = emit
+
+    def first_state(self) -> Array:
+        return self._reader.first().state
+
+    def reset(self) -> None:
+        try:
+            with self._robot.delays.of(POLICY):
+                self._policy.reset(self._seed)
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise PolicyFailed(
+                f"the policy raised {type(error).__name__} in reset(): {error}"
+            ) from error
+        self._history.reset()
+
+    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
+        if self._robot.lockstep:
+            reading, seen = self._history.read()
+            return self._thread.submit(lambda: self._predict(reading, seen, previous))
+        return self._thread.submit(lambda: self._predict(*self._history.read(), previous))
+
+    def ticked(self) -> None:
+        if not self._history.due():
+            return
+        if self._robot.lockstep:
+            self._history.sample()
+        elif self._thread.idle_within(0.0):
+            # What goes wrong is raised by the next question's own reading.
+            self._thread.submit(self._history.sample)
+
+    def accepted(self, answer: Answer) -> None:
+        assert isinstance(answer, PolicyAnswer)
+        now = self._robot.clock.now()
+        self._emit(ChunkAccepted(now, answer.reading, answer.checked(), answer.stages))
+
+    def refused(self, answer: Answer) -> None:
+        assert isinstance(answer, PolicyAnswer)
+        self._emit(Refused(self._robot.clock.now(), "chunk", {"answer": answer.chunk}))
+
+    def slowest_since(self, since: float) -> tuple[DelaySource, float]:
+        return self._robot.delays.longest(since)
+
+    def _predict(
+        self, reading: RobotReading, seen: Observation, previous: PreviousChunk | None
+    ) -> Answer:
+        """The policy's answer to a reading, its chunk checked; in the policy's thread."""
+        policy: Any = self._policy
+        rest = None if previous is None else previous.continuation(reading.at, policy.horizon)
+        began = time.perf_counter()
+        try:
+            with self._robot.delays.of(POLICY):
+                if rest is None:
+                    chunk = policy.predict_action(seen)
+                else:
+                    chunk = policy.continue_action(seen, rest)
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            if isinstance(error, MemoryError):
+                # What the policy computed with is given back: the record needs some of it.
+                traceback.clear_frames(error.__traceback__)
+            raise PolicyFailed(f"the policy raised {type(error).__name__}: {error}") from error
+        stages = {"policy": time.perf_counter() - began, **policy.stages}
+        # Checked in this thread: for arrays of a chunk's size numpy releases the GIL, and the
+        # thread that sends would have to get it again.
+        try:
+            actions = self._checked(chunk)
+        except BadChunk as error:
+            return PolicyAnswer(reading.at, None, error, reading, chunk, stages)
+        return PolicyAnswer(reading.at, actions, None, reading, chunk, stages)
+
+    def _checked(self, chunk: Any) -> Array:
+        """``(T, D)`` the actions of a chunk, read-only.
+
+        Raises:
+            BadChunk: it is no motion for the robot, or not as long as the policy says.
+        """
+        policy, embodiment = self._policy, self._robot.embodiment
+        actions = check_chunk(chunk, embodiment, policy.action_rate_hz, self._safety).copy()
+        if len(actions) != policy.horizon:
+            raise BadChunk(
+                f"the policy's chunk has {len(actions)} actions; it said {policy.horizon}"
+            )
+        actions.flags.writeable = False
+        return actions
 
 
 class ObservationReader:
@@ -281,104 +431,3 @@ class FreshnessGate:
             )
         self._newest.update({stream: stamps[stream] for stream in ages})
         return ages[oldest]
-
-
-def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]) -> None:
-    """Refuse a frame that is not what the embodiment describes.
-
-    Args:
-        frame: as ``Operator.get_frame`` returns it.
-        embodiment: whose state and cameras are expected.
-        cameras: names of the cameras that are needed.
-
-    Raises:
-        BadFrame: state of another shape or not finite; a camera missing; an image that is not
-            ``(height, width, 3)`` uint8 of the camera's size.
-    """
-    as_state(frame.state, embodiment, "the robot's state")
-    sizes = {camera.name: (camera.height, camera.width, 3) for camera in embodiment.cameras}
-    for name in cameras:
-        image = frame.images.get(name)
-        if image is None:
-            raise BadFrame(
-                f"camera {name} gave no image", cause="it is not connected, or has another name"
-            )
-        if not isinstance(image, np.ndarray):
-            raise BadFrame(f"camera {name} gives a {type(image).__name__}, not an array")
-        if image.dtype != np.uint8 or image.shape != sizes.get(name, image.shape):
-            raise BadFrame(
-                f"camera {name} gives {image.shape} {image.dtype}, "
-                f"the embodiment says {sizes.get(name)} uint8",
-                cause="the camera's mode was changed, or the spec is of another camera",
-            )
-
-
-def fit_cameras(
-    policy: Policy,
-    embodiment: EmbodimentSpec,
-    chosen: tuple[str, ...] | None,
-    context: RunContext,
-) -> tuple[str, ...]:
-    """Check that a policy is for a robot; the names of the cameras to observe.
-
-    Args:
-        policy: loaded.
-        embodiment: the robot's.
-        chosen: the config's ``camera_names``; None for those that the policy looks at.
-        context: of the run; its reporter warns of images that are scaled.
-
-    Raises:
-        SpecMismatch: the policy is for another robot, or for other views.
-        ConfigError: ``camera_names`` does not fit.
-    """
-    looks_at = tuple(policy.cameras)
-    cameras = chosen or looks_at
-    check_match(policy.embodiment, embodiment, "the policy", "the robot", looks_at)
-    known = embodiment.camera_names
-    for name in (*cameras, *looks_at):
-        if name not in known:
-            raise context.error(
-                "camera_names", f"{name!r} is unknown; choose one of {', '.join(known)}"
-            )
-        if name not in cameras:
-            raise context.error("camera_names", f"the policy looks at {name!r} too")
-    for warning in scaled_views(policy.embodiment, embodiment, looks_at):
-        context.reporter.warn(warning)
-    return cameras
-
-
-def scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence[str]) -> list[str]:
-    """Check that a robot's cameras show what the policy was trained on, perhaps larger.
-
-    A camera may have more pixels than in training; it may not show another view.
-
-    Args:
-        trained, here: the embodiments of the policy and of the robot.
-        names: the cameras that the policy looks at.
-
-    Returns:
-        What is to be said of images that are scaled.
-
-    Raises:
-        SpecMismatch: a camera's images have another aspect.
-    """
-    cameras = {camera.name: camera for camera in here.cameras}
-    said = []
-    for then in trained.cameras:
-        now = cameras.get(then.name)
-        if then.name not in names or now is None:
-            continue
-        if (now.height, now.width) == (then.height, then.width):
-            continue
-        sizes = (
-            f"camera {then.name} gives {now.height} x {now.width} images; the policy was "
-            f"trained on {then.height} x {then.width}"
-        )
-        difference = abs(now.width * then.height - then.width * now.height)
-        if difference > 0.01 * now.height * then.width:
-            raise SpecMismatch(
-                f"{sizes}: another view",
-                next="set the camera to the size, or at least the aspect, of the recordings",
-            )
-        said.append(f"{sizes}; they are scaled")
-    return said

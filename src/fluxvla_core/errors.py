@@ -117,8 +117,8 @@ def _rebuild(
 
 
 @contextmanager
-def located(where: str) -> Iterator[None]:
-    """Give errors of the block that name no place the place ``where``."""
+def located(where: str | None) -> Iterator[None]:
+    """Give errors of the block that name no place the place ``where``, if it is known."""
     try:
         yield
     except FluxError as error:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,25 @@ def import_refused(source: Path, words: Sequence[object], capsys: Any) -> str:
     said = refused(["import-checkpoint", source, target, *words], capsys)
     assert not list(source.parent.glob("refused*"))
     return said
+
+
+def checked_with_transformers(version: str, config: Path, folder: Path) -> str:
+    """What ``fluxvla config check`` says where ``version`` of transformers is installed."""
+    info = folder / f"transformers-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: transformers\nVersion: {version}\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "fluxvla_core", "config", "check", str(config)],
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    return done.stderr
 
 
 def change_json(file: Path, change: Callable[[Any], object]) -> None:

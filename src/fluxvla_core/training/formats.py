@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,21 @@ def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
         except PluginError as error:
             failed.append(error)
     return found, failed
+
+
+@contextmanager
+def telling_families(table: Any, model: object) -> Iterator[None]:
+    """Let errors about weights say that the checkpoint's ``model`` table is of another class than
+    ``model``, if it is."""
+    try:
+        yield
+    except CheckpointError as error:
+        kind = table.get("type") if isinstance(table, Mapping) else None
+        theirs, ours = str(kind).rpartition(":")[2], type(model).__name__
+        if kind is not None and theirs != ours:
+            error.cause = f"the checkpoint is of {theirs}, the config's model is {ours}"
+            error.next = f"name a checkpoint of {ours}, or let the config's model be {theirs}"
+        raise
 
 
 def unknown_format(

@@ -145,11 +145,13 @@ def test_states_of_another_width():
         model.state_tokens(states)
 
 
-def test_actions_of_another_shape_than_action_tokens_are_read_as():
+@pytest.mark.parametrize("listed", [False, True])
+def test_actions_of_another_shape_than_action_tokens_are_read_as(listed):
     model = fast_model()
     horizon, dim = model.action_shape
+    actions = torch.zeros(1, horizon, dim + 1)
     with pytest.raises(ConfigError, match=r"PI0FAST: actions are .* the model's chunks"):
-        model(*[torch.zeros(1)] * 5, actions=torch.zeros(1, horizon, dim + 1))
+        model(*[torch.zeros(1)] * 5, actions=list(actions) if listed else actions)
 
 
 def test_lerobots_config_names_the_robot_s_widths(bring, capsys):

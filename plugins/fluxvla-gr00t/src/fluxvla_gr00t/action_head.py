@@ -184,7 +184,7 @@ class GR00TActionHead(nn.Module):
             states: ``(B, S)``; ids: ``(B,)`` int64; actions: ``(B, T, D)`` normalised.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1.
         """
-        check_actions("GR00TActionHead", actions, (self.horizon, self.action_dim))
+        check_actions("GR00TActionHead", tuple(actions.shape[1:]), (self.horizon, self.action_dim))
         repeats = noise.shape[1]
         encoded = self.encode_context(context).repeat_interleave(repeats)
         state = self.encode_states(states, ids).repeat_interleave(repeats, 0)

@@ -8,7 +8,7 @@ is no action expert, and nothing is denoised.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -125,7 +125,7 @@ class PI0FAST(VLA, nn.Module):
         action_tokens: Tensor,
         action_token_masks: Tensor,
         img_masks: Tensor | None = None,
-        actions: Tensor | None = None,
+        actions: Tensor | Sequence[Any] | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -139,13 +139,14 @@ class PI0FAST(VLA, nn.Module):
             action_tokens, action_token_masks: ``(B, M)`` int64 and bool, of
                 ``ProcessActionTokens``.
             img_masks: ``(B, N)``, False for a camera that is not there.
-            actions: ``(B, T, D)``, what the action tokens say; only their shape is looked at.
+            actions: ``(B, T, D)``, or a list of ``(T, D)``, what the action tokens say; only the
+                shape is looked at.
 
         Raises:
             ConfigError: ``actions`` of another shape than the model's chunks.
         """
         if actions is not None:
-            check_actions(type(self).__name__, actions, self.action_shape)
+            check_actions(type(self).__name__, tuple(actions[0].shape), self.action_shape)
         prefix = self._prefix(images, img_masks, lang_tokens, lang_masks)
         said, real = action_tokens[:, :-1], action_token_masks[:, :-1].bool()
         hidden, real = self._joined(prefix.hidden, prefix.real, said, real)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -223,3 +224,30 @@ def test_a_batch_that_the_model_does_not_take_ends_it(
     assert "c.py:" in told.err
     assert "runner.collator: DryVLA.forward takes no 'img_masks'" in told.err
     assert "move what only describes from the collator's keys to meta_keys" in told.err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("norm_type='mean_std'", "norm_type='quantil'", "did you mean 'quantile'?"),
+        ("norm_type='mean_std'", "action_dim=2", "action_dim 2 would cut the data's 3 dimensions"),
+        ("img_keys=['front']", "img_keys=['front', 'top']", "there is no camera 'top'"),
+        ("img_keys=['front']", "img_keys=[]", "ResizeImages needs 'images'; the sample has"),
+    ],
+)
+def test_data_that_the_training_would_refuse_ends_it(
+    old: str, new: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the dataset is here; where it is not, its shapes are assumed, and it is a note."""
+    words = written(tmp_path)
+    config = tmp_path / "c.py"
+    config.write_text(config.read_text().replace(old, new))
+    assert main(words) == 0
+    recorded(tmp_path)
+    capsys.readouterr()
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert re.search(r"c\.py:\d+: train_dataloader\.dataset: ", told)
+    assert said in told
+    if "--set" in told:
+        assert "--set train_dataloader.dataset.transforms.2.action_dim=3" in told

@@ -103,11 +103,13 @@ class Run:
         after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
+            from fluxvla_core.config.hints import whole_options
 
             text, refused = outline(plan, args.log_format, args.nproc)
             say(text)
             if refused is not None:
-                raise refused
+                with whole_options(plan.config.tree, plan.section):
+                    raise refused
             return 0
         if plan.trains:
             ranks.refuse_lost_work_dir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import zlib
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,15 @@ HEIGHT, WIDTH = 480, 640
 """Size of an image, where neither the dataset nor the robot says."""
 INSTRUCTION = "pick up the cube and put it into the box"
 _MARK = re.compile(r"<[^<>\s]+>|\w+|[^\w\s]")
+
+
+class Refused(Exception):
+    """A dataset that is here cannot be built, or its first sample not be made: a training would end
+    with ``error``."""
+
+    def __init__(self, error: FluxError) -> None:
+        super().__init__(str(error))
+        self.error = error
 
 
 @dataclass(frozen=True)
@@ -59,7 +69,8 @@ def example(
         widths: of states and actions, where no robot is known.
 
     Raises:
-        FluxError: the transforms do not take such samples.
+        Refused: the dataset is here, and its first sample cannot be made.
+        FluxError: the transforms do not take the samples that are assumed.
     """
     assumed: list[str] = []
     known = _with_tokenizers(table, assumed)
@@ -67,6 +78,8 @@ def example(
         dataset = Dataset.adapt(build_dataset_from_cfg(known, context))
         sample = dataset.get_sample(0, 0)
     except FluxError as error:
+        if not assumed and _is_here(table):
+            raise Refused(error) from error
         return assumed_example(first_dataset(known), robot, widths, [error.what, *assumed])
     joints = dataset.embodiment
     entry = dataset.statistics.get(dataset.statistic_name or "", {})
@@ -136,6 +149,12 @@ class StandInTokenizer(Tokenizer):
     def encode_actions(self, actions: Any) -> Sequence[int]:
         """A number for every fourth of a chunk's."""
         return [number % 997 for number in range(max(1, np.size(actions) // 4))]
+
+
+def _is_here(table: Mapping[str, Any]) -> bool:
+    place = first_dataset(table).get("data_root_path")
+    places = [place] if isinstance(place, str) else place
+    return isinstance(places, Sequence) and bool(places) and all(map(os.path.isdir, places))
 
 
 def _with_tokenizers(table: Mapping[str, Any], assumed: list[str]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from fluxvla_core.build import (
 )
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.data.example import Example, example
+from fluxvla_core.data.example import Example, Refused, example
 from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training import lora
@@ -265,6 +265,11 @@ def _batch(
             return None
         size = runner.loader_options.per_device_batch_size
         batch: Mapping[str, Any] = runner.collator([rehearsal.data.sample] * size)
+    except Refused as refused:
+        error = refused.error
+        error.where = error.where or context.where("train_dataloader.dataset")
+        rehearsal.refused = error
+        return None
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
         rehearsal.notes.append(f"the batch is not known: {_told(error)}")
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -311,6 +312,17 @@ def test_missing_weights_are_not_drawn_in_silence(folders, tmp_path: Path) -> No
     save_file(tensors, tmp_path / "model.safetensors", {"format": "pt"})
     with pytest.raises(ConfigError, match=r"not all there: layers\.1\.mlp\.up_proj\.weight"):
         Qwen3Backbone(str(tmp_path))
+
+
+def test_weights_of_other_sizes_are_told_with_both(folders: dict[str, str], tmp_path: Path) -> None:
+    folder = tmp_path / "wider"
+    shutil.copytree(folders["qwen3"], folder)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "intermediate_size": 32}))
+    words = r"mlp\.down_proj\.weight \(16, 24\), by config\.json \(16, 32\)"
+    with pytest.raises(ConfigError, match=words) as error:
+        Qwen3Backbone(str(folder))
+    assert error.value.where == str(folder)
 
 
 @pytest.mark.parametrize("make", [halves, whole])

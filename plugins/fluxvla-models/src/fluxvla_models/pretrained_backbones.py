@@ -232,12 +232,14 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
             use_safetensors=True,
             trust_remote_code=False,
             output_loading_info=True,
+            ignore_mismatched_sizes=True,  # they are told below
         )
     except Exception as error:  # whatever damaged files make transformers raise
         raise ConfigError(
             f"its weights cannot be read: {type(error).__name__}: {error}",
             where=str(folder),
-            next="pretrained=False, where a checkpoint has them",
+            cause="the folder was copied or downloaded in part",
+            next="copy or download it again; pretrained=False, where a checkpoint has the weights",
         ) from error
     finally:
         logging.set_verbosity(verbosity)
@@ -246,6 +248,8 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
         raise ConfigError(
             f"its weights are not all there: {', '.join(wrong[:4])}{' …' if wrong[4:] else ''}",
             where=str(folder),
+            cause="config.json is of another model, or the folder was copied in part",
+            next="copy or download it again; pretrained=False, where a checkpoint has the weights",
         )
     return model
 
@@ -281,4 +285,11 @@ def layers_of(model: nn.Module) -> list[nn.Module]:
 
 
 def _listed(info: Mapping[str, Any], kinds: Sequence[str]) -> list[str]:
-    return sorted(str(name) for kind in kinds for name in info.get(kind, ()))
+    """What ``from_pretrained`` says: names, or for sizes that differ ``(name, there, here)``."""
+    found = (entry for kind in kinds for entry in info.get(kind, ()))
+    return sorted(
+        entry
+        if isinstance(entry, str)
+        else f"{entry[0]} {tuple(entry[1])}, by config.json {tuple(entry[2])}"
+        for entry in found
+    )

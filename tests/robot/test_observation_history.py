@@ -126,7 +126,8 @@ def test_what_is_missing_is_waited_for(took):
         clock.time += seconds
 
     read = reader_of(clock, took)
-    history = ObservationHistory(read, read, robot, policy, 0.5, sleep)
+    told: list[Any] = []
+    history = ObservationHistory(read, read, robot, policy, 0.5, told.append, sleep)
 
     def times(seen: Any) -> list[float]:
         return [each["qpos"] for each in (*seen["history"], seen)]
@@ -143,4 +144,7 @@ def test_what_is_missing_is_waited_for(took):
     assert not history.due()
     history.sample()
     clock.time = 9.17
+    assert not told, "questions are events by themselves"
     assert times(history.read()[1]) == pytest.approx([9.0, 9.1, 9.17])
+    assert [event.reading.observation["qpos"] for event in told] == pytest.approx([9.1])
+    assert [event.at for event in told] == pytest.approx([9.1 + took])

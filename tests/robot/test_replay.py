@@ -89,6 +89,39 @@ def test_the_recorded_robot_gives_a_policy_what_it_saw(bench, make_arm):
     assert any("ends here" in line for line in bench.notes.lines)
 
 
+class Rememberer(Looker):
+    """A policy whose answer follows from three observations, of which it keeps sums."""
+
+    n_obs_steps = 3
+
+    def __init__(self, embodiment):
+        super().__init__(embodiment)
+        self.saw = []
+
+    def predict_action(self, observation):
+        shown = [*observation["history"], observation]
+        self.saw.append([(float(s["images"]["front"].sum()), *s["qpos"]) for s in shown])
+        return super().predict_action({**shown[0], "qpos": observation["qpos"]})
+
+
+@pytest.mark.parametrize("joining", ["synchronous", "latest_only"])
+def test_the_recorded_robot_gives_a_policy_the_history_that_it_had(bench, joining):
+    bench.policy = Rememberer(bench.arm.embodiment)
+    settings = {"chunk_joining": joining, "execute_horizon": 4, "max_publish_step": 70}
+    bench.run(record=str(bench.work_dir / "rec"), **settings)
+    path = str(bench.work_dir / "rec" / "001-1")
+    live, bench.policy.saw = bench.policy.saw, []
+    bench.run(
+        record=str(bench.work_dir / "rec"), **settings,
+        operator={"type": "ReplayOperator", "recording": path},
+    )  # fmt: skip
+
+    first, second = open_recording(path), open_recording(bench.work_dir / "rec" / "002-1")
+    assert len({seen for question in live for seen in question}) > len(live) > 3
+    assert bench.policy.saw[: len(live)] == live
+    np.testing.assert_array_equal(first.chunks(), second.chunks()[: len(live)])
+
+
 class Streams:
     """A robot whose state and camera come at rates of their own, the images late.
 

@@ -100,6 +100,16 @@ class Observed(Event):
 
 
 @dataclass(frozen=True)
+class Remembered(Event):
+    """A reading between two questions, now that a policy is asked with it as history.
+
+    ``at`` is when it was made, which is before other events that came first.
+    """
+
+    reading: RobotReading
+
+
+@dataclass(frozen=True)
 class Refused(Event):
     """A ``reading`` or a ``chunk`` (``what``) did not pass its checks; any values."""
 

@@ -264,7 +264,7 @@ class ObservationReader:
 
     def sample(self) -> RobotReading:
         """One between two questions, for a policy's history; checked as ``read`` checks it, but
-        for the arm, and no event."""
+        for the arm. The history says whether a question needed it (``Remembered``)."""
         return self._read()
 
     def _read(self) -> RobotReading:

@@ -318,7 +318,7 @@ class BaseInferenceRunner(Runner):
                 self.options.ready_timeout, tracking, thread, interrupts, emit,
             )  # fmt: skip
             seen = ObservationHistory(
-                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s
+                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s, emit
             )
             return LocalPolicyClient(
                 robot, reader, seen, self.policy, seed, thread, self.safety, emit

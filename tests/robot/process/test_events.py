@@ -22,6 +22,7 @@ from fluxvla_core.robot.events import (
     Observed,
     Phase,
     Refused,
+    Remembered,
     RobotReading,
     Stopped,
     StoppedWhileHeld,
@@ -62,6 +63,7 @@ OWN = [
     EpisodePrepared(0.0, TASK, 7, 50.0),
     EpisodeStarted(0.0, TASK),
     Observed(0.0, READING),
+    Remembered(0.0, READING),
     Refused(0.0, "chunk", {}),
     ChunkAccepted(0.0, READING, POSE[None], {}),
 ]

@@ -190,7 +190,8 @@ class ReplayOperator(Operator):
 
     @cached_property
     def _observations(self) -> list[Event]:
-        found = self.recorded.of(episode_log.OBSERVATION)
+        # A policy's history is recorded with the question that needs it, in the order of that.
+        found = sorted(self.recorded.of(episode_log.OBSERVATION), key=lambda event: event["t"])
         if not found:
             raise DataError(
                 "the recording holds no reading of the robot", where=str(self.recorded.path)

@@ -159,17 +159,24 @@ class BaseInferenceRunner(Runner):
         if self.context.task is not None or self.context.task_file is not None:
             self._task_source()
         if self.policy is None:
-            from fluxvla_core.policies.loading import find_checkpoint, load_policy
+            from fluxvla_core.policies.loading import (
+                find_checkpoint,
+                load_policy,
+                why_not_continued,
+            )
 
             place = find_checkpoint(given.ckpt_path, self.context.work_dir)
             self.context.reporter.info(f"policy: {place}")
+            why = why_not_continued(place) if self._continues_chunks else None
+            if why is not None:
+                raise self.config_error("chunk_joining", f"is {self.chunk_joining!r}, and {why}")
             self.policy = load_policy(
                 place, given.device, given.dataset, given.denormalize_action,
                 given.mixed_precision_dtype, given.execution, given.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
-        if self._joiner().continues and not self.policy.continues:
+        if self._continues_chunks and not self.policy.continues:
             raise self.config_error(
                 "chunk_joining",
                 f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
@@ -382,6 +389,11 @@ class BaseInferenceRunner(Runner):
         domain_id = Operator.adapt(self.ros_operator).domain_id
         topic = self.options.task_topic
         return task_source(self.context, self.task_descriptions, topic, domain_id, self.free_tasks)
+
+    @property
+    def _continues_chunks(self) -> bool:
+        """Whether chunks have to continue those before: real-time chunking."""
+        return make_joiner(self.chunk_joining).continues
 
     def _joiner(self) -> ChunkJoiner:
         return make_joiner(*self._joining())

@@ -181,16 +181,10 @@ class Connection:
         self._thread.start()
 
     def subscribe(
-        self,
-        name: str,
-        topic: str,
-        message: Any,
-        depth: int,
-        latched: bool = False,
-        on_demand: bool = False,
+        self, name: str, topic: str, message: Any, depth: int, latched: bool = False
     ) -> Stream:
-        """A stream that keeps the last ``depth`` messages of class ``message``; see ``Stream``."""
-        stream = Stream(self.node, name, topic, message, depth, latched, on_demand)
+        """A stream that keeps the last ``depth`` messages of class ``message``."""
+        stream = Stream(self.node, name, topic, message, depth, latched)
         self.streams[name] = stream
         return stream
 

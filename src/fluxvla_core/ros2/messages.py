@@ -8,8 +8,6 @@ from __future__ import annotations
 import functools
 import importlib
 import re
-import struct
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import ConfigError, Faulted, LoadFailed
@@ -21,9 +19,6 @@ TWIST = "geometry_msgs.msg:Twist"
 ODOMETRY = "nav_msgs.msg:Odometry"
 FLOAT64 = "std_msgs.msg:Float64"
 FLOAT64_ARRAY = "std_msgs.msg:Float64MultiArray"
-# The beginning of a serialized message with a header: four bytes of encapsulation, of which the
-# second says the byte order, then the stamp (OMG DDS-RTPS 2.3, 10.2: CDR_BE and CDR_LE).
-_STAMPS = (struct.Struct(">xxxxiI"), struct.Struct("<xxxxiI"))
 _TYPE = re.compile(r"(?P<package>\w+)[./](?P<kind>msg|srv|action)[:/](?P<name>\w+)")
 
 
@@ -78,40 +73,3 @@ def stamp_of(message: Any) -> float | None:
         return None
     seconds = float(header.stamp.sec) + header.stamp.nanosec * 1e-9
     return seconds or None
-
-
-def stamp_reader(cls: Any) -> Callable[[bytes], float | None] | None:
-    """A function that reads what ``stamp_of`` says from a serialized message of ``cls``.
-
-    None if it cannot be read without the rest: the message has a header that does not come first.
-    """
-    fields = list(cls.get_fields_and_field_types().items())
-    if fields and fields[0] == ("header", "std_msgs/Header"):
-        return _serialized_stamp
-    return None if any(name == "header" for name, _ in fields) else _no_stamp
-
-
-def _serialized_stamp(data: bytes) -> float | None:
-    if len(data) < _STAMPS[0].size:
-        return None
-    layout = _STAMPS[data[1] & 1]
-    seconds, nanoseconds = layout.unpack_from(data)
-    return float(seconds) + nanoseconds * 1e-9 or None
-
-
-def _no_stamp(data: bytes) -> None:
-    return None
-
-
-def deserialized(data: bytes, cls: Any) -> Any:
-    """The message of class ``cls`` that was serialized as ``data``.
-
-    Raises:
-        BadMessage: it is none.
-    """
-    from rclpy.serialization import deserialize_message
-
-    try:
-        return deserialize_message(data, cls)
-    except Exception as error:  # rclpy's own classes differ between releases
-        raise BadMessage(f"what arrived is no {type_name(cls)} message: {error}") from error

@@ -402,11 +402,7 @@ class RosOperator(Operator):
         commands = tuple(self.commands()) if self._part.commands else ()
         for spec in self._specs:
             message = message_class(spec.message)
-            # An image is read once as a rule, and larger twice.
-            on_demand = spec.kind not in (CAMERA, DEPTH)
-            connection.subscribe(
-                spec.name, spec.topic, message, spec.depth, spec.latched, on_demand
-            )
+            connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
         self._stream_reader = StreamReader(
             connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on
         )

@@ -11,14 +11,7 @@ from functools import cached_property
 from typing import Any
 
 from fluxvla_core.ros2 import qos
-from fluxvla_core.ros2.messages import (
-    COMPRESSED_IMAGE,
-    IMAGE,
-    JOINT_STATE,
-    deserialized,
-    stamp_of,
-    stamp_reader,
-)
+from fluxvla_core.ros2.messages import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, stamp_of
 from fluxvla_core.spec.embodiment import Camera
 
 STATE, CAMERA, DEPTH, AUXILIARY = "state", "camera", "depth", "auxiliary"
@@ -117,28 +110,13 @@ class CommandSpec:
 class Received:
     """One message.
 
-    Args:
-        receipt: seconds on this process's monotonic clock.
-        stamp: seconds on the sender's clock, None if the message has none.
-        content: the message, or its serialized bytes if ``message_type`` says of which class.
-        message_type: a message's class.
+    ``receipt`` is seconds on this process's monotonic clock; ``stamp`` seconds on the sender's
+    clock, None if the message has none.
     """
 
     receipt: float
     stamp: float | None
-    content: Any
-    message_type: Any = None
-
-    @cached_property
-    def message(self) -> Any:
-        """The message.
-
-        Raises:
-            BadMessage: the bytes are no message of this class.
-        """
-        if self.message_type is None:
-            return self.content
-        return deserialized(self.content, self.message_type)
+    message: Any
 
     @cached_property
     def delay_s(self) -> float | None:
@@ -167,10 +145,8 @@ class Ring:
         self.clock_steps = 0
         self.stepped_at: float | None = None
 
-    def add(
-        self, receipt: float, stamp: float | None, content: Any, message_type: Any = None
-    ) -> bool:
-        """Keep the message, given as ``Received`` has it, if it is news; returns whether it is."""
+    def add(self, receipt: float, stamp: float | None, message: Any) -> bool:
+        """Keep the message if it is news; returns whether it is."""
         with self._lock:
             self.received += 1
             before, self._before = self._before, (receipt, stamp)
@@ -187,7 +163,7 @@ class Ring:
                 elif stamp < newest:
                     self.overtaken += 1
                     return False
-            self._items.append(Received(receipt, stamp, content, message_type))
+            self._items.append(Received(receipt, stamp, message))
             return True
 
     def newest(self) -> Received | None:
@@ -213,9 +189,6 @@ class Stream:
     The callback stores and does nothing else, so that one thread serves every stream. Reliability
     is chosen by what publishers offer, and again when that changes (a driver that starts later, or
     comes back with other settings).
-
-    ``on_demand``: keep the serialized messages, and deserialize those that are read. Drivers send
-    states at 100 to 1,000 Hz, and to make a Python message of each costs more than to receive it.
     """
 
     def __init__(
@@ -226,7 +199,6 @@ class Stream:
         message: Any,
         depth: int,
         latched: bool = False,
-        on_demand: bool = False,
     ) -> None:
         self.name = name
         self.topic = topic
@@ -240,7 +212,6 @@ class Stream:
         self._asked: tuple[str, bool] | None = None
         self._node = node
         self._latched = latched
-        self._read_stamp = stamp_reader(message) if on_demand else None
         self._depth = max(depth, _QUEUE)
         self._subscription: Any = None
         self.refresh()
@@ -272,21 +243,14 @@ class Stream:
     def _store(self, message: Any) -> None:
         self.ring.add(time.monotonic(), stamp_of(message), message)
 
-    def _store_serialized(self, data: bytes) -> None:
-        assert self._read_stamp is not None
-        self.ring.add(time.monotonic(), self._read_stamp(data), data, self.message)
-
     def _count_lost(self, event: Any) -> None:
         self.lost += event.total_count_change
 
     def _subscribe(self, reliability: str, latched: bool) -> Any:
-        raw = self._read_stamp is not None
-        store: Callable[[Any], None] = self._store_serialized if raw else self._store
-
         def subscribe(**options: Any) -> Any:
             profile = qos.profile(reliability, self._depth, latched)
             return self._node.create_subscription(
-                self.message, self.topic, store, profile, raw=raw, **options
+                self.message, self.topic, self._store, profile, **options
             )
 
         events, unsupported = _lost_events(self._count_lost)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control.joiners import METHODS
-from fluxvla_core.robot.control.safety import BadTiming
+from fluxvla_core.control.joiners import METHODS
+from fluxvla_core.control.safety import BadTiming
 from fluxvla_core.robot.observation_history import ObservationHistory
 
 STRIDE = 5  # control steps of the arm, at 50 Hz, for an action of the policy, at 10 Hz

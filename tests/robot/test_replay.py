@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import build_operator_from_cfg, build_policy_from_cfg
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import ConfigError, DataError, NotReady, Rejected, SpecMismatch
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.joiners import METHODS
 from fluxvla_core.robot.inference import FreshnessGate
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.replay import RecordingEnded, ReplayOperator, ReplayPolicy

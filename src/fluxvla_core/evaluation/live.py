@@ -26,10 +26,10 @@ from fluxvla_core.contracts.environment import Environment, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.control.clock import MonotonicClock
+from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SafetyStop
 from fluxvla_core.evaluation.stepping import check_step
-from fluxvla_core.robot.control.clock import MonotonicClock
-from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 

@@ -19,6 +19,7 @@ from fluxvla_core.build import RunContext, bind_options, build_environment_from_
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.episodes import (
@@ -59,7 +60,6 @@ from fluxvla_core.evaluation.videos import (
     recorded_videos,
     with_others,
 )
-from fluxvla_core.robot.control.joiners import make_joiner
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.control.safety import Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.robot.control.safety import Trip
-from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]

@@ -1,9 +1,9 @@
-"""``ObservationHistory``: what a policy that acts on several observations saw before.
+"""``ObservationHistory``: earlier observations for a policy that acts on several (``n_obs_steps``).
 
-It wants them one of its actions apart, and is asked less often. So the robot is also read between
-two questions, at the rate of the actions, whenever nothing else is done in the thread that reads
-it. A thread that thinks reads nothing; where an observation is missing then, the question waits
-until as many were made as the policy takes, one action for each.
+The policy takes them one action apart, and is queried less often. So the robot is also read between
+two queries, at the rate of the actions, by the policy's thread. During inference that thread cannot
+read the robot; if an observation is missing after it, the query waits until as many were made as
+the policy takes, one for each action.
 
 An observation of the history is the one that was made nearest to its time, at most 0.6 of an action
 away; in a lockstep simulation whose actions are whole control steps it is that of its time.
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Policy, with_history
-from fluxvla_core.robot.control.safety import BadTiming
+from fluxvla_core.control.safety import BadTiming
 from fluxvla_core.robot.events import Event, Remembered, RobotReading
 from fluxvla_core.robot.robot import Robot
 
@@ -34,7 +34,7 @@ class _Kept:
     at: float
     made: float
     reading: RobotReading
-    told: bool
+    emitted: bool
 
     @property
     def observation(self) -> Observation:
@@ -95,7 +95,7 @@ class ObservationHistory:
             BadFrame, BadTiming: as ``ObservationReader.read``.
         """
         at = self._robot.clock.now()
-        self._keep(at, self._sample(), told=False)
+        self._keep(at, self._sample(), emitted=False)
 
     def read(self) -> tuple[RobotReading, Observation]:
         """What the policy is asked with: the robot's reading, and its observation with the history.
@@ -112,9 +112,9 @@ class ObservationHistory:
             if self.steps == 1:
                 return reading, present
             before = self._before(at)
-            self._keep(at, reading, told=True)
+            self._keep(at, reading, emitted=True)
             if before is not None:
-                self._tell(before)
+                self._emit_used(before)
                 seen = [each.observation for each in before]
                 return reading, with_history(present, self.steps, seen)
             now = self._robot.clock.now()
@@ -122,21 +122,21 @@ class ObservationHistory:
                 raise BadTiming(
                     f"the policy acts on {self.steps} observations {self._apart:.3g} s apart "
                     f"(n_obs_steps), and the robot was not read that often: "
-                    f"{self._robot.reading.name} took {now - at:.2f} s",
+                    f"{self._robot.frame_call.name} took {now - at:.2f} s",
                     cause="the cameras or this machine are too slow for the policy's action rate",
                 )
             self._sleep(max(at + self._apart - now, 0.0))
 
-    def _tell(self, before: list[_Kept]) -> None:
+    def _emit_used(self, before: list[_Kept]) -> None:
         for each in before:
-            if not each.told:
-                each.told = True
+            if not each.emitted:
+                each.emitted = True
                 self._emit(Remembered(each.made, each.reading))
 
-    def _keep(self, at: float, reading: RobotReading, told: bool) -> None:
+    def _keep(self, at: float, reading: RobotReading, emitted: bool) -> None:
         if not self._kept:
             self._first = at
-        self._kept.append(_Kept(at, self._robot.clock.now(), reading, told))
+        self._kept.append(_Kept(at, self._robot.clock.now(), reading, emitted))
         while self._kept[0].at < at - self.steps * self._apart:
             self._kept.popleft()
         if self._next is None or at + self._apart / 2 > self._next:

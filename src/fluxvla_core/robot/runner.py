@@ -27,14 +27,14 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.joiners import ChunkJoiner, make_joiner
+from fluxvla_core.control.safety import Latch, SafetySettings
+from fluxvla_core.control.sender import ExecuteActions, check_pose
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
-from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.control.sender import ExecuteActions, check_pose
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event, HookObserver

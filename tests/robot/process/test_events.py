@@ -7,10 +7,10 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 import pytest
 
+from fluxvla_core.control.limits import Clamp
+from fluxvla_core.control.safety import Rule, Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.robot import events
-from fluxvla_core.robot.control.limits import Clamp
-from fluxvla_core.robot.control.safety import Rule, Trip
-from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.events import (
     ChunkAccepted,
     CommandSent,

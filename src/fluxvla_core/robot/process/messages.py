@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core import errors
+from fluxvla_core.control import policy_client, safety
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import policy_client, safety
 
 Array = npt.NDArray[np.float64]
 _HEADER = struct.Struct("<I")

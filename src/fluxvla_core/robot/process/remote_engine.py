@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.policy_client import PolicyClient
+from fluxvla_core.control.safety import Latch, Rule
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.control.policy_client import PolicyClient
-from fluxvla_core.robot.control.safety import Latch, Rule
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import PolicyClientFactory
 from fluxvla_core.robot.events import (

@@ -214,7 +214,7 @@ class EpisodeRecorder(EpisodeObserver):
             return
         images: Mapping[str, Any] = self._images
         if robot.lockstep and robot.complete:
-            with robot.delays.of(robot.reading):
+            with robot.delays.of(robot.frame_call):
                 frame = robot.frame()
             images = frame.images
             for camera, image in images.items():

@@ -16,9 +16,9 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import STATE, Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.robot import Clock, Operator
+from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
+from fluxvla_core.control.policy_client import PolicyEnded
 from fluxvla_core.errors import ConfigError, DataError, NotReady
-from fluxvla_core.robot.control.clock import MonotonicClock, SimulatedClock
-from fluxvla_core.robot.control.policy_client import PolicyEnded
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.joiners import make_joiner
+from fluxvla_core.control.safety import Latch
+from fluxvla_core.control.sender import ExecuteActions
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.interrupt import Interrupted
-from fluxvla_core.robot.control.joiners import make_joiner
-from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.sender import ExecuteActions
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts
 from fluxvla_core.robot.events import (

@@ -219,6 +219,10 @@ def test_the_same_seed_asks_the_same(tmp_path: Path) -> None:
         (["--peak-tflops", "-1"], "--peak-tflops -1 is no number of operations"),
         (["--calls", "0"], "0 is less than 1"),
         (["--set", "train_dataloader.dataset.transforms=[]"], "no transform of train_dataloader"),
+        (
+            ["--set", 'train_dataloader.dataset.img_keys=["observation.images.nose"]'],
+            "train_dataloader.dataset.img_keys names 'nose'; arm has front, wrist",
+        ),
     ],
 )
 def test_what_does_not_fit(

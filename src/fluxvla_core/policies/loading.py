@@ -22,10 +22,10 @@ from fluxvla_core.contracts.training import InferenceDataset, Transform
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.data.preparation import try_preparation
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, located
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy
-from fluxvla_core.policies.preparation import try_preparation
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 log = logging.getLogger("fluxvla.policies")

@@ -211,7 +211,7 @@ def _carry_out(
         Kind.REARM: engine.rearm,
         Kind.RELEASE: engine.release,
         Kind.STOP: engine.stop,
-        Kind.PLAY: lambda: _run_episode(inbox, engine, observer, order),
+        Kind.RUN_EPISODE: lambda: _run_episode(inbox, engine, observer, order),
     }
     fields: dict[str, Any]
     try:
@@ -220,7 +220,7 @@ def _carry_out(
         fields = {"signal": signal_.number}
     except BaseException as error:  # noqa: BLE001 - raised in the main process
         fields = error_fields(error)
-    if order.kind == Kind.PLAY:
+    if order.kind == Kind.RUN_EPISODE:
         facts = dict(engine.episode_facts())
         failure, holding = engine.stop_failure, engine.holding
         fields |= {"facts": facts, "stop_failure": failure, "holding": holding}

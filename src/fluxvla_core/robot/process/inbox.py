@@ -115,7 +115,7 @@ class Inbox(Interrupts):
             case Kind.FAULT:
                 self._fault = error_of(message.fields)
             case kind:
-                if kind == Kind.PLAY:
+                if kind == Kind.RUN_EPISODE:
                     # Here, not when it is carried out: what comes after it is for this episode.
                     self.forget()
                 self.orders.append(message)

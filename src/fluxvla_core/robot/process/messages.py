@@ -37,7 +37,7 @@ class Kind(str, Enum):
     # Main process -> control process: orders, carried out one after the other. Each is answered by
     # DONE, CLOSE by CLOSED.
     CONNECT = "connect"
-    PLAY = "play"
+    RUN_EPISODE = "run episode"
     """Run an episode: ``task``, ``instruction``, ``free``, ``number``, ``seed``, ``folder``."""
     REARM = "rearm"
     RELEASE = "release"
@@ -61,7 +61,7 @@ class Kind(str, Enum):
     FAILED = "failed"
     """The control process ends: an error."""
     DONE = "done"
-    """``order``, with ``result``, ``signal`` (a number) or an error; after PLAY also ``facts``,
+    """``order``, with ``result``, ``signal`` (a number) or an error; after RUN_EPISODE also ``facts``,
     ``stop_failure`` and ``holding``."""
     CLOSED = "closed"
     """The robot was stopped and disconnected: ``failures``, texts or None."""

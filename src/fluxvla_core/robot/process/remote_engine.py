@@ -195,7 +195,7 @@ class RemoteEngine(Engine):
         """Order an episode, and handle what the control process sends until it is over."""
         problem: BaseException | None = None
         self._process.link.send(
-            Kind.PLAY,
+            Kind.RUN_EPISODE,
             task=task.name,
             instruction=task.instruction,
             free=task.free,
@@ -221,7 +221,7 @@ class RemoteEngine(Engine):
                     self._interrupts.stopping = True
                     self._process.link.send(Kind.FAULT, **_fault(error))
                 continue
-            if done is not None and done["order"] == Kind.PLAY:
+            if done is not None and done["order"] == Kind.RUN_EPISODE:
                 break
         self.stop_failure, self._process.holding = done["stop_failure"], done["holding"]
         self._facts = done["facts"]

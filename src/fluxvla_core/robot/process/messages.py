@@ -61,8 +61,8 @@ class Kind(str, Enum):
     FAILED = "failed"
     """The control process ends: an error."""
     DONE = "done"
-    """``order``, with ``result``, ``signal`` (a number) or an error; after RUN_EPISODE also ``facts``,
-    ``stop_failure`` and ``holding``."""
+    """``order``, with ``result``, ``signal`` (a number) or an error; after RUN_EPISODE ``facts``,
+    ``stop_failure`` and ``holding``, too."""
     CLOSED = "closed"
     """The robot was stopped and disconnected: ``failures``, texts or None."""
     RELEASED = "released"

@@ -16,6 +16,8 @@ sides take turns, each in a process of its own:
   converts what it needs, infers, and sends the chunk's commands itself. Before it starts it waits
   as they wait at their prompt for a task (``--prompt`` seconds), while the queues fill.
 
+* ``rclpy node``: what one Python process takes that only receives these states and sends at 50 Hz,
+  without limits or checks, while the policy thinks in another.
 * ``bare``: nothing but a loop that wakes at 50 Hz with a real-time priority, where it may have one,
   while the cameras send: what this machine gives to anybody.
 
@@ -58,7 +60,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from benchmarks import _results
 from benchmarks._timed_arms import TIMES, TimedAloha, memory_mb
 from fluxvla_core.build import RunContext
-from fluxvla_core.robot.control import realtime
+from fluxvla_core.control import realtime
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.ros2.startup import large_frames_profile
@@ -329,6 +331,20 @@ def bare(seconds: float, prompt: float) -> dict[str, Any]:
     return timings(woke, late)
 
 
+def rclpy_node(seconds: float, prompt: float) -> dict[str, Any]:
+    """The share of a core of ``_rclpy_node``, beside a policy that thinks as ``fluxvla``'s does."""
+    policy = warm_policy()
+    words = ["-m", "benchmarks._rclpy_node", str(seconds)]
+    node = subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True)
+    images = {str(n): np.zeros((480, 640, 3), np.uint8) for n in range(3)}
+    while node.poll() is None:
+        policy.predict_action({"images": images})
+    found, _ = node.communicate()
+    if node.returncode:
+        sys.exit(f"the rclpy node failed with {node.returncode}")
+    return {"core_share": round(float(found), 3)}
+
+
 def _to(queue: deque[Any]) -> Callable[[Any], None]:
     # rclpy asks for the callback's signature, which a built-in method has not.
     return lambda message: queue.append(message)
@@ -363,6 +379,7 @@ SIDES: dict[str, Callable[[float, float], dict[str, Any]]] = {
     "one process, recording": partial(fluxvla, record=True, control_process=False),
     "one process, lock held": partial(fluxvla, kind=LockHolder, control_process=False),
     "upstream": upstream,
+    "rclpy node": rclpy_node,
     "bare": bare,
 }
 
@@ -392,11 +409,19 @@ def summarise(rounds: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
         "jitter": round(median(theirs, "jitter_p99_ms") / median(ours, "jitter_p99_ms"), 2),
         "memory": round(median(theirs, "more_mb") / max(median(ours, "more_mb"), 0.1), 2),
     }
+    alone = median("rclpy node", "core_share")
+    of_node = {name: round(median(name, "control_core_share") / alone, 2) for name in OURS}
     limits = ("late_share", "jitter_p99_ms", "control_mb", "control_core_share")
     met = {name: all(median(s, name) <= GOALS[name] for s in OURS) for name in limits}
     met["copies"] = median(ours, "copies") <= GOALS["copies"]
     met.update({name: ratio >= GOALS[name] for name, ratio in ratios.items()})
-    return {**rounds, "upstream_over_fluxvla": ratios, "goals": GOALS, "goals_met": met}
+    return {
+        **rounds,
+        "upstream_over_fluxvla": ratios,
+        "control_core_share_over_rclpy_node": of_node,
+        "goals": GOALS,
+        "goals_met": met,
+    }
 
 
 def main() -> int:

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from fluxvla_core import Frame
 from fluxvla_core.contracts.policy import Continuation
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.filters import LowPass, SnapGripper
-from fluxvla_core.robot.control.joiners import METHODS
-from fluxvla_core.robot.control.tracking import HOLD_REACH
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.filters import LowPass, SnapGripper
+from fluxvla_core.control.joiners import METHODS
+from fluxvla_core.control.tracking import HOLD_REACH
 from fluxvla_core.ros2.stop_motion import PATIENCE_S, braking_commands, hold_target
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
@@ -304,3 +304,46 @@ SETTINGS = st.fixed_dictionaries(
         "pushes": st.lists(st.sampled_from([0.0, 0.0, 0.1, -0.5]), min_size=1, max_size=3),
     }
 )
+
+# Between them, every setting that hypothesis may leave out of a few examples: which ones it makes
+# depends on what else the process has imported.
+_MIXED = [("sweep", 0.1, 0.1, ""), ("near", 0.1, -0.2, "noise"), ("far", 0.3, 0.2, "pushed")]
+_SCRIPT = [*([*_MIXED, ("rest", 0.0, 0.0, "")] * 9), ("nan", 0.0, 0.0, ""), *_MIXED]
+EXAMPLES: list[tuple[list[tuple[str, float, float, str]], dict[str, Any]]] = [
+    (
+        _SCRIPT,
+        {
+            "safety": LIMITS_ALONE,
+            "execute_horizon": None,
+            "rate": 25.0,
+            "joining": "rtc",
+            "latency": 0.06,
+            "filters": "smooth",
+            "start_pose": None,
+            "shares": [],
+            "follows": 0.5,
+            "readable": True,
+            "droop": 1.0,
+            "tells": True,
+            "pushes": [-0.5],
+        },
+    ),
+    (
+        _SCRIPT,
+        {
+            "safety": {"jump_s": 1e12, "excess": 1e12, "tracking_error": 0.01},
+            "execute_horizon": None,
+            "rate": 25.0,
+            "joining": "synchronous",
+            "latency": 0.0,
+            "filters": "shaken",
+            "start_pose": (0.5, 0.1, 0.2),
+            "shares": [0.3, 1.0],
+            "follows": 2.0,
+            "readable": True,
+            "droop": 0.0,
+            "tells": False,
+            "pushes": [-0.5],
+        },
+    ),
+]

@@ -14,7 +14,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.errors import FluxError
@@ -23,6 +23,7 @@ from fluxvla_core.testing.ros2_driver import Driver
 from tests.ros2.adversarial import (
     ARM,
     CHUNKS,
+    EXAMPLES,
     FILTERS,
     SCRIPTS,
     SETTINGS,
@@ -97,7 +98,7 @@ def heard(ros_domain):
 
 @pytest.mark.parametrize("examples", [20, pytest.param(260, marks=pytest.mark.slow)])
 def test_nothing_beyond_a_limit_arrives(heard, tmp_path, examples):
-    """Some 800 chunks and as many readings here, more than 10,000 of each every night."""
+    """Some 900 chunks and as many readings here, more than 10,000 of each every night."""
     count = Counter()
 
     @settings(
@@ -106,10 +107,12 @@ def test_nothing_beyond_a_limit_arrives(heard, tmp_path, examples):
         derandomize=True,
         database=None,
         # To shrink it, a failing script would be played for minutes.
-        phases=[Phase.generate],
+        phases=[Phase.explicit, Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
     @given(SCRIPTS, SETTINGS)
+    @example(*EXAMPLES[0])
+    @example(*EXAMPLES[1])
     def play(script, case):
         arm = arm_of(heard.send, case)
         policy = Adversary(arm, script, case["rate"])
@@ -161,7 +164,7 @@ def test_nothing_beyond_a_limit_arrives(heard, tmp_path, examples):
 
     play()
 
-    assert count["chunks"] == examples * CHUNKS
+    assert count["chunks"] == (examples + len(EXAMPLES)) * CHUNKS
     assert count["commands"] > count["chunks"], count
     assert count["stops"] > examples, count
     # Every way of using the limits was gone.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import os
 import shlex
@@ -21,10 +22,10 @@ from fluxvla_core.contracts.training import InferenceDataset, Transform
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.data.preparation import try_preparation
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, located
-from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
+from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy
-from fluxvla_core.policies.preparation import try_preparation
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 log = logging.getLogger("fluxvla.policies")
@@ -114,6 +115,27 @@ def load_policy(
         precision=mixed_precision_dtype,
         source=where,
         execution=execution,
+    )
+
+
+def why_not_continued(ckpt_path: str | Path) -> str | None:
+    """Why the model of a checkpoint cannot continue a chunk (``chunk_joining = "rtc"``).
+
+    Found from its class, without its weights; None where nothing speaks against it.
+
+    Raises:
+        CheckpointError: there is no checkpoint, or it is damaged.
+        PluginError: the model is of a plugin that is not installed.
+    """
+    table = Checkpoint.open(ckpt_path).config().get("model")
+    if not isinstance(table, Mapping) or not isinstance(table.get("type"), str):
+        return None
+    predict = VLAS.get(table["type"]).predict_action
+    if "prev_actions" in inspect.signature(predict).parameters:
+        return None
+    return (
+        f"{table['type']} cannot continue a chunk: its predict_action() takes no prev_actions, "
+        "which models of flow matching take"
     )
 
 

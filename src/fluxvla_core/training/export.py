@@ -38,9 +38,9 @@ from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.data.preparation import check_statistics, try_preparation
 from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, UsageError, located
-from fluxvla_core.policies.preparation import check_statistics, try_preparation
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER

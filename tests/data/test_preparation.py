@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core.data import PrivateInferenceDataset
+from fluxvla_core.data.preparation import check_statistics, try_preparation
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.policies.preparation import check_statistics, try_preparation
 
 ROWS = {"mean": [0.0, 1.0], "std": [1.0, 2.0]}
 

@@ -69,9 +69,9 @@ def _check_rows(key: str, rows: Mapping[str, Any], where: str) -> None:
             numbers = np.empty(0)
         wrong = numbers[~np.isfinite(numbers)]
         if not numbers.size or wrong.size:
-            told = f"has {wrong[0]}" if wrong.size else f"is {str(row)[:60]}"
+            found = f"has {wrong[0]}" if wrong.size else f"is {str(row)[:60]}"
             raise CheckpointError(
-                f"the statistics' {name!r} of {key!r} {told}; finite numbers are expected",
+                f"the statistics' {name!r} of {key!r} {found}; finite numbers are expected",
                 where=where,
                 cause="they were computed from data with gaps, or the file is damaged",
                 next="take the statistics of the training's data, or compute them again",

@@ -28,7 +28,7 @@ from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
 from fluxvla_core.training.export import embodiment_in, export_foreign, import_checkpoint
-from fluxvla_core.training.formats import formats, read_foreign
+from fluxvla_core.training.formats import formats, read_foreign, telling_families
 
 ARM = EmbodimentSpec(
     "arm",
@@ -451,3 +451,34 @@ def test_a_typo_never_asks_the_hub(tmp_path):
     with pytest.raises(CheckpointError, match="acme/reach does not exist") as caught:
         import_checkpoint("acme/reach", tmp_path / "ours")
     assert "hf:OWNER/NAME" in str(caught.value)
+
+
+def test_weights_of_another_family_name_both():
+    class OtherVLA:
+        pass
+
+    with (
+        pytest.raises(CheckpointError, match="they differ") as error,
+        telling_families({"type": "fluxvla-reach:ReachVLA"}, OtherVLA()),
+    ):
+        raise CheckpointError("they differ", cause="unknown")
+    assert error.value.cause == "the checkpoint is of ReachVLA, the config's model is OtherVLA"
+    with (
+        pytest.raises(CheckpointError) as error,
+        telling_families({"type": "OtherVLA"}, OtherVLA()),
+    ):
+        raise CheckpointError("they differ", cause="unknown")
+    assert error.value.cause == "unknown"
+
+
+@pytest.mark.parametrize("key", ["runner.init_from", "model.pretrained_name_or_path"])
+def test_a_training_names_the_key_of_what_it_starts_from(tmp_path, key):
+    config = tiny_config({"type": "OneProcessRunner", "max_steps": 1})
+    config["model"] = {"type": "ReachVLA"}
+    section, _, name = key.partition(".")
+    config[section][name] = str(tmp_path / "nowhere")
+    context = RunContext(config, "runner", tmp_path / "run", origins={key: "c.py:3"})
+    runner = build_runner_from_cfg(config["runner"], context)
+    with pytest.raises(CheckpointError, match="there is no checkpoint at") as error:
+        runner.run_setup(4)
+    assert error.value.where == f"c.py:3: {key}"

@@ -35,7 +35,7 @@ FLOW = ("states", "actions", "action_masks", "noise", "time")
 SAID = ("action_tokens", "action_token_masks")
 LEARNED = {"pi0": FLOW, "pi05": FLOW, "pi0_fast": SAID}
 MODELS = {
-    "pi0_fast": {"type": "PI0FAST", **FAST_SIZES, "tokenizer": FAST},
+    "pi0_fast": {"type": "PI0FAST", **FAST_SIZES, "action_dim": ACTIONS, "tokenizer": FAST},
     "pi0": {"type": "PI0FlowMatching", **SIZES, "max_state_dim": STATES},
     "pi05": {"type": "PI05FlowMatching", **SIZES},
 }

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import Any
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import (
+    CONFIG,
     EMA,
     TRAINER,
     Checkpoint,
@@ -43,6 +44,13 @@ HARMLESS = frozenset(
 LENGTH = frozenset({"max_epochs", "max_steps"})
 """And those that may where the learning rate does not follow from them."""
 _UNSET = "not set"
+_LORA_KEYS = {
+    "rank": "r",
+    "alpha": "lora_alpha",
+    "dropout": "lora_dropout",
+    "target_modules": "target_modules",
+    "modules_to_save": "modules_to_save",
+}
 
 
 def check_settings(
@@ -131,13 +139,32 @@ def check_same_adapter(ours: LoraOptions | None, theirs: LoraOptions | None, whe
     Raises:
         CheckpointError: says both.
     """
-    mine, saved = (None if o is None else o.for_peft() for o in (ours, theirs))
-    if mine != saved:
-        raise CheckpointError(
-            f"lora is {_shown(mine)}, the checkpoint's run had {_shown(saved)}",
-            where=where,
-            next=f"set it back; or {_begin_another(where)}",
-        )
+    mine, saved = ({} if o is None else _as_in_config(o) for o in (ours, theirs))
+    changed = [key for key in saved or mine if mine.get(key) != saved.get(key)]
+    if not changed:
+        return
+    if mine and saved:
+        now, before = (_shown(values, changed) for values in (mine, saved))
+        what = f"lora has {now}, the checkpoint's run had {before}"
+    elif mine:
+        what = "lora is set, the checkpoint's run had none"
+    else:
+        what = f"lora is not set, the checkpoint's run had {_shown(saved, ('rank', 'alpha'))}"
+    raise CheckpointError(
+        what,
+        where=where,
+        next=f"set it back as in the checkpoint's {CONFIG}; or {_begin_another(where)}",
+    )
+
+
+def _as_in_config(options: LoraOptions) -> dict[str, Any]:
+    """The settings by their keys in a config; what may be left out there has its value."""
+    peft = options.for_peft()
+    return {key: peft[peft_key] for key, peft_key in _LORA_KEYS.items()}
+
+
+def _shown(settings: Mapping[str, Any], keys: Iterable[str]) -> str:
+    return ", ".join(f"{key}={settings[key]}" for key in keys)
 
 
 def check_same_averages(decay: float | None, checkpoint: Checkpoint) -> None:
@@ -181,13 +208,6 @@ def check_same_statistics(dataset: Any, checkpoint: Checkpoint) -> None:
             "mean something else to the model",
             next=f"set the dataset back; or {_begin_another(str(checkpoint.path))}",
         )
-
-
-def _shown(settings: Mapping[str, Any] | None) -> str:
-    if settings is None:
-        return "not set"
-    named = ("r", "lora_alpha", "lora_dropout", "target_modules", "modules_to_save")
-    return ", ".join(f"{key}={settings[key]}" for key in named)
 
 
 def changed_settings(

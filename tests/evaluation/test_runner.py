@@ -329,7 +329,7 @@ def test_results_say_whether_training_saw_their_seeds(tmp_path, checkpoint, firs
     assert results(tmp_path)["provenance"]["unseen_seeds"] is unseen
 
 
-def test_how_pictures_were_drawn_is_in_the_results(tmp_path, walking):
+def test_how_images_were_drawn_is_in_the_results(tmp_path, walking):
     evaluate(tmp_path, policy={"type": "Thinker"}, tasks=["right"], episodes=1, workers=1)
     images = results(tmp_path)["provenance"]["pictures"]
     assert images == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"

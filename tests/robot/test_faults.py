@@ -586,7 +586,7 @@ def test_a_joint_outside_its_limits_at_the_start(bench):
     assert bench.arm.sent == []
 
 
-def test_a_picture_of_another_size(bench):
+def test_an_image_of_another_size(bench):
     from fluxvla_core.contracts.frame import Frame
 
     good = bench.arm.get_frame

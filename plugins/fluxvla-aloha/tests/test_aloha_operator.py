@@ -293,7 +293,7 @@ class TestBaseDrive:
 
 
 class TestCobotMagic:
-    def test_state_pictures_depth_and_base(self, connect, drivers):
+    def test_state_images_depth_and_base(self, connect, drivers):
         drivers(*robot(depth=True, base=True))
         operator = connect(use_depth_image=True, use_robot_base=True)
         frame = operator.get_frame()

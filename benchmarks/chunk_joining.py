@@ -30,9 +30,9 @@ from fluxvla_sim.operators import AlohaSimOperator
 from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.policy import Continuation
+from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.policies.loading import find_checkpoint, load_policy
-from fluxvla_core.robot.control.joiners import METHODS
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]

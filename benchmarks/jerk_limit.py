@@ -18,7 +18,7 @@ import numpy as np
 from fluxvla_aloha.embodiment import aloha_spec
 
 from benchmarks import _results
-from fluxvla_core.robot.control.limits import CommandLimiter
+from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 HZ = 50.0

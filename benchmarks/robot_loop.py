@@ -60,7 +60,7 @@ from fluxvla_aloha.runner import AlohaInferenceRunner
 from benchmarks import _results
 from benchmarks._timed_arms import TIMES, TimedAloha, memory_mb
 from fluxvla_core.build import RunContext
-from fluxvla_core.robot.control import realtime
+from fluxvla_core.control import realtime
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.ros2.startup import large_frames_profile

@@ -31,11 +31,11 @@ import torch
 from benchmarks import _results
 from benchmarks.chunk_joining import ARM_COLUMNS, HZ, commands, drive
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.control.chunks import Chunk
+from fluxvla_core.control.joiners import STREAMED
 from fluxvla_core.errors import SafetyStop
 from fluxvla_core.evaluation.success_rates import wilson_interval
 from fluxvla_core.policies.loading import find_checkpoint, load_policy
-from fluxvla_core.robot.control.chunks import Chunk
-from fluxvla_core.robot.control.joiners import STREAMED
 
 WAYS = tuple(STREAMED)
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)

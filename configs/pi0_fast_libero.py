@@ -65,12 +65,12 @@ runner = dict(
             "lang_masks",
             "action_tokens",
             "action_token_masks",
+            "actions",  # for their shape
             "sample_ids",
         ],
         # The prompt and the action tokens hold what these say.
         meta_keys=[
             "states",
-            "actions",
             "action_masks",
             "task_description",
             "prompt",

@@ -22,7 +22,8 @@ FluxError                     1
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -113,6 +114,16 @@ def _rebuild(
     cls: type[FluxError], what: str, where: str | None, cause: str | None, next: str | None
 ) -> FluxError:
     return cls(what, where=where, cause=cause, next=next)
+
+
+@contextmanager
+def located(where: str | None) -> Iterator[None]:
+    """Give errors of the block that name no place the place ``where``, if it is known."""
+    try:
+        yield
+    except FluxError as error:
+        error.where = error.where or where
+        raise
 
 
 def printable(text: str) -> str:

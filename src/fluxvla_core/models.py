@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fluxvla_core.build import build_projector_from_cfg as build_projector_from_cfg
     from fluxvla_core.build import build_vision_backbone_from_cfg as build_vision_backbone_from_cfg
     from fluxvla_core.build import build_vlm_backbone_from_cfg as build_vlm_backbone_from_cfg
+    from fluxvla_core.checkpoints.foreign import check_settings as check_settings
     from fluxvla_core.checkpoints.foreign import chosen_robot as chosen_robot
     from fluxvla_core.checkpoints.foreign import foreign_folder as foreign_folder
     from fluxvla_core.checkpoints.foreign import renamed as renamed
@@ -44,6 +45,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "build_vlm_backbone_from_cfg",
         ],
         "fluxvla_core.checkpoints.foreign": [
+            "check_settings",
             "chosen_robot",
             "foreign_folder",
             "renamed",

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.robot import Clock as Clock
     from fluxvla_core.contracts.robot import Operator as Operator
     from fluxvla_core.contracts.robot import Part as Part
-    from fluxvla_core.robot.control.clock import MonotonicClock as MonotonicClock
-    from fluxvla_core.robot.control.clock import SimulatedClock as SimulatedClock
-    from fluxvla_core.robot.control.filters import LowPass as LowPass
-    from fluxvla_core.robot.control.filters import SnapGripper as SnapGripper
-    from fluxvla_core.robot.control.filters import WorkspaceBox as WorkspaceBox
-    from fluxvla_core.robot.control.safety import SafetySettings as SafetySettings
+    from fluxvla_core.control.clock import MonotonicClock as MonotonicClock
+    from fluxvla_core.control.clock import SimulatedClock as SimulatedClock
+    from fluxvla_core.control.filters import LowPass as LowPass
+    from fluxvla_core.control.filters import SnapGripper as SnapGripper
+    from fluxvla_core.control.filters import WorkspaceBox as WorkspaceBox
+    from fluxvla_core.control.safety import SafetySettings as SafetySettings
     from fluxvla_core.robot.recording.trace import EpisodeTrace as EpisodeTrace
     from fluxvla_core.robot.recording.trace import next_folder as next_folder
     from fluxvla_core.robot.runner import BaseInferenceRunner as BaseInferenceRunner
@@ -46,9 +46,9 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.frame": ["Frame", "Observation", "STATE"],
         "fluxvla_core.contracts.policy": ["Continuation", "Policy"],
         "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator", "Part"],
-        "fluxvla_core.robot.control.clock": ["MonotonicClock", "SimulatedClock"],
-        "fluxvla_core.robot.control.filters": ["LowPass", "SnapGripper", "WorkspaceBox"],
-        "fluxvla_core.robot.control.safety": ["SafetySettings"],
+        "fluxvla_core.control.clock": ["MonotonicClock", "SimulatedClock"],
+        "fluxvla_core.control.filters": ["LowPass", "SnapGripper", "WorkspaceBox"],
+        "fluxvla_core.control.safety": ["SafetySettings"],
         "fluxvla_core.robot.recording.trace": ["EpisodeTrace", "next_folder"],
         "fluxvla_core.robot.runner": ["BaseInferenceRunner"],
         "fluxvla_core.robot.tasks": ["Task", "check_descriptions", "task_source", "tasks"],

@@ -13,7 +13,7 @@ from benchmarks import memory
 from benchmarks.rtc import DELAYS, WAYS
 from benchmarks.step_loop import MOST_MS, ONE_LAYER, SMALL
 from fluxvla_core.config.load import load_config
-from fluxvla_core.robot.control.joiners import METHODS
+from fluxvla_core.control.joiners import METHODS
 
 ROOT = Path(__file__).parents[2]
 

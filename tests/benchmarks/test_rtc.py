@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("fluxvla_sim")
 
 from benchmarks import rtc
-from fluxvla_core.robot.control.chunks import Chunk
+from fluxvla_core.control.chunks import Chunk
 
 DIM = 14
 

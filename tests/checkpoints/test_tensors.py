@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from fluxvla_core.checkpoints.shards import StoredTensors
@@ -184,3 +184,23 @@ def test_tensors_in_a_pipe_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(CheckpointError, match="no regular file"):
         read_tensors(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: c[:-8], "it has {} bytes instead of {}"),
+        (lambda c: c[:20], "cannot be read"),
+        (lambda c: b"", "cannot be read"),
+        (lambda c: b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
+    ],
+)
+def test_a_file_that_was_copied_in_part_says_so(tmp_path, change, words):
+    path = tmp_path / "model.safetensors"
+    save_file({"a": torch.zeros(16), "b": torch.ones(3, 2)}, path)
+    content = path.read_bytes()
+    path.write_bytes(change(content))
+    with pytest.raises(CheckpointError) as error:
+        StoredTensors([path])
+    assert words.format(len(content) - 8, len(content)) in error.value.what
+    assert error.value.next == "copy or download it again"

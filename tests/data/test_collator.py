@@ -79,3 +79,9 @@ def test_a_key_that_only_some_samples_have_is_an_error_whichever_comes_first(tur
 def test_no_samples():
     with pytest.raises(DataError, match="there are no samples to make a batch of"):
         DictCollator(["a"])([])
+
+
+def test_images_that_no_transform_has_joined_are_told():
+    sample = {"images": [np.zeros((3, 4, 6), np.uint8), np.zeros((3, 8, 6), np.uint8)]}
+    with pytest.raises(DataError, match=r"still a list, of shapes \(3, 4, 6\), \(3, 8, 6\)"):
+        DictCollator(["images"])([sample])

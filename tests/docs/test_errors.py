@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tomli
 
-from fluxvla_core.robot.control.safety import Rule
+from fluxvla_core.control.safety import Rule
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")

@@ -56,3 +56,13 @@ def test_a_model_cannot_compute_in_unknown_ways(tmp_path, walking, options, text
     with pytest.raises(ConfigError, match=text):
         evaluate(tmp_path, **options)
     assert not (tmp_path / "eval").exists()
+
+
+def test_a_model_that_continues_no_chunks_is_not_loaded_for_it(tmp_path, checkpoint):
+    live = {"chunk_joining": {"method": "rtc", "window": 3}}
+    walk = {**WALK, "limited": True}
+    with pytest.raises(
+        ConfigError, match=r"live has chunk_joining .*, and Strides cannot continue"
+    ):
+        evaluate(tmp_path, walk, policy="checkpoint", ckpt_path=str(checkpoint), live=live)
+    assert not (tmp_path / "eval_live").exists()

@@ -95,6 +95,8 @@ def test_what_cannot_be_live_is_refused(tmp_path, walking):
         evaluate(tmp_path, instruction_swap=True)
     with pytest.raises(ConfigError, match="live takes no speed; it takes action_chunk, "):
         evaluate(tmp_path, live={"speed": 3})
+    with pytest.raises(ConfigError, match="live has chunk_joining 'rtc', and the policy cannot"):
+        evaluate(tmp_path, live={"chunk_joining": "rtc"})
     assert live_options({}) == live_options(True) == {"chunk_joining": "latest_only"}
     assert live_options(False) is None
 

@@ -9,11 +9,11 @@ import pytest
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import ConfigError, RunFailed, SafetyStop, UsageError
 from fluxvla_core.evaluation.robot import RobotEvalRunner
 from fluxvla_core.operators import EpisodeTrace
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
-from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 

@@ -183,3 +183,31 @@ def test_the_table_of_first_party_names_equals_their_pyproject_files():
         d: {r: tuple(sorted(n)) for r, n in t.items()} for d, t in first_party.FIRST_PARTY.items()
     }
     assert table == stated
+
+
+@pytest.mark.parametrize("version", ["4.40.0", "6.1"])
+def test_a_version_of_transformers_that_is_not_exact_is_refused_before_import(install, version):
+    """Two of its versions may give other numbers of the same weights."""
+    install("transformers", version=version)
+    install(
+        "fluxvla-old",
+        entry_points=entry("Old", "mod_old:Old"),
+        files={"mod_old.py": "raise RuntimeError('imported')"},
+        requires=("fluxvla-core>=0.1", "numpy<0", "transformers<6,>=5.5"),
+    )
+    with pytest.raises(
+        IncompatiblePlugin, match=rf"fluxvla-old 1\.0 needs transformers>=5\.5,<6, but {version} is"
+    ) as error:
+        OPERATORS.get("Old")
+    assert error.value.next == "pip install 'transformers>=5.5,<6'"
+
+
+def test_a_version_of_transformers_that_is_exact_is_not_looked_at_twice(install):
+    install("transformers", version="5.7.1")
+    install(
+        "fluxvla-a",
+        entry_points=entry("A", "mod_a:A"),
+        files={"mod_a.py": OPERATOR.format(name="A")},
+        requires=("transformers>=5.5,<6",),
+    )
+    assert OPERATORS.get("A").__name__ == "A"

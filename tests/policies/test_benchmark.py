@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fluxvla_core.cli.bench_command import table
 from fluxvla_core.cli.main import main
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
@@ -100,12 +101,36 @@ def test_each_stage_of_each_mode(tmp_path: Path, capsys: pytest.CaptureFixture[s
     shown = capsys.readouterr().out
     assert "StepVLA: 0.0 M parameters, float32" in shown
     lines = shown.splitlines()
-    assert [line.split()[0] for line in lines[3:8]] == [
+    head = [line.split() for line in lines].index(["ms", "eager", "compiled"])
+    assert [line.split()[0] for line in lines[head + 2 : head + 7]] == [
         "preprocess", "transfer", "forward", "postprocess", "total",
     ]  # fmt: skip
-    assert lines[1].split() == ["ms", "eager", "compiled"]
     assert "peak: 0.5 TFLOP/s (given)" in shown
-    assert max(map(len, lines[1:11])) <= 57
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize(("columns", "beside"), [(30, 1), (60, 2), (78, 2), (80, 3), (200, 3)])
+def test_the_table_fits_the_terminal(columns: int, beside: int) -> None:
+    taken = {f"p{percent}_ms": 123456.7 for percent in (50, 95, 99)}
+    mode = dict.fromkeys(("preprocess", "forward", "total"), taken)
+    mode |= {"hz": 69.21, "first_call_s": 83.35, "memory_mb": 484.0, "share_of_peak": 0.025}
+    figures = {
+        "model": "DiffusionPolicy", "parameters": 5e8, "precision": "float32", "gflops": 0.021,
+        "device": "NVIDIA H200", "threads": 1, "versions": {"torch": "2.13.0+cpu", "numpy": None},
+        "modes": {name: {**mode, "apart": 1e-6} for name in ("eager", "compiled", "graph")},
+        "floor_ms": {"forward": 0.252}, "peak_tflops": 989.0, "peak_is": "its data sheet",
+        "bandwidth_gb_s": 4800.0, "bandwidth_is": "its data sheet", "seed": 0,
+        "inputs_sha256": "9" * 64, "answers_sha256": "d" * 64,
+    }  # fmt: skip
+    lines = table(figures, columns)
+
+    heads = [line.split()[1:] for line in lines if line.startswith("ms ")]
+    names = ["eager", "compiled", "graph"]
+    assert heads == [names[first : first + beside] for first in range(0, 3, beside)]
+    assert max(map(len, lines)) <= max(columns, 13 + 22)
+    said = " ".join(line.strip() for line in lines)
+    assert "GFLOP an answer; NVIDIA H200, 1 thread ms" in said
+    assert said.endswith(f"seed 0, inputs {'9' * 12}, answers {'d' * 12}; torch 2.13.0+cpu")
 
 
 def test_a_graph_without_a_gpu_is_no_column(
@@ -194,6 +219,10 @@ def test_the_same_seed_asks_the_same(tmp_path: Path) -> None:
         (["--peak-tflops", "-1"], "--peak-tflops -1 is no number of operations"),
         (["--calls", "0"], "0 is less than 1"),
         (["--set", "train_dataloader.dataset.transforms=[]"], "no transform of train_dataloader"),
+        (
+            ["--set", 'train_dataloader.dataset.img_keys=["observation.images.nose"]'],
+            "train_dataloader.dataset.img_keys names 'nose'; arm has front, wrist",
+        ),
     ],
 )
 def test_what_does_not_fit(

@@ -13,7 +13,7 @@ import pytest
 from fluxvla_core.build import RunContext
 from fluxvla_core.commands import SilentReporter
 from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.robot.control.clock import SimulatedClock
+from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.ros2 import RobotFrame
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint

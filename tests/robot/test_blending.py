@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fluxvla_core.robot.control.chunks import Chunk
-from fluxvla_core.robot.control.joiners import STREAMED, Overlap, TemporalEnsemble, make_joiner
+from fluxvla_core.control.chunks import Chunk
+from fluxvla_core.control.joiners import STREAMED, Overlap, TemporalEnsemble, make_joiner
 
 RATE = 10.0
 

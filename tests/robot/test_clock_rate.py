@@ -8,14 +8,14 @@ import time
 import pytest
 
 from fluxvla_core.contracts.robot import Operator
-from fluxvla_core.robot.control.clock import (
+from fluxvla_core.control.clock import (
     MonotonicClock,
     Rate,
     SimulatedClock,
     clock_of,
     in_lockstep,
 )
-from fluxvla_core.robot.control.sender import CommandRate
+from fluxvla_core.control.sender import CommandRate
 
 
 class Stepped:

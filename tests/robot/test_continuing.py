@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fluxvla_core.contracts.policy import Continuation
+from fluxvla_core.control.joiners import soft_mask
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.policies.local import scaling_of
-from fluxvla_core.robot.control.joiners import soft_mask
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")

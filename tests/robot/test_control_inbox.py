@@ -7,8 +7,8 @@ import signal
 
 import pytest
 
-from fluxvla_core.robot.control.interrupt import Interrupted
-from fluxvla_core.robot.control.safety import SafetySettings
+from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.robot.process.inbox import Inbox
 from fluxvla_core.robot.process.link import Link, make_memory
 

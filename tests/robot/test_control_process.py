@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from fluxvla_core import OPERATORS, BaseInferenceRunner, RunContext
+from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.operators import Camera, EmbodimentSpec, Frame, Joint, Operator
-from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.recording.recorded import open_recording
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from fluxvla_core.robot.control.delays import MACHINE, POLICY, DelayMonitor, robot_call
+from fluxvla_core.control.delays import MACHINE, POLICY, DelayMonitor, robot_call
 
 FRAME = robot_call("Arm.get_frame()")
 

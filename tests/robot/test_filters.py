@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluxvla_core.control.filters import LowPass, SnapGripper
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.filters import LowPass, SnapGripper
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 

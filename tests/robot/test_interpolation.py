@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control.chunks import interpolate, sample
+from fluxvla_core.control.chunks import interpolate, sample
 
 
 def test_five_commands_lead_to_each_action():

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fluxvla_core.control.joiners import METHODS
+from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.control.joiners import METHODS
-from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.ros2.stop_motion import braking_commands
 
 JERK = 120.0

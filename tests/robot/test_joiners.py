@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.joiners import (
+from fluxvla_core.control.joiners import (
     METHODS,
     LatestOnly,
     Overlap,
@@ -14,6 +13,7 @@ from fluxvla_core.robot.control.joiners import (
     TemporalEnsemble,
     make_joiner,
 )
+from fluxvla_core.errors import ConfigError
 
 
 @pytest.mark.parametrize(

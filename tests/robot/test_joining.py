@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control.chunks import Chunk, sample
-from fluxvla_core.robot.control.joiners import LatestOnly, Synchronous
+from fluxvla_core.control.chunks import Chunk, sample
+from fluxvla_core.control.joiners import LatestOnly, Synchronous
 
 
 def chunk(values, observed=0.0, anchor=0.0, rate=10.0):

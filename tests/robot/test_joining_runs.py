@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control.joiners import METHODS, STREAMED
+from fluxvla_core.control.joiners import METHODS, STREAMED
 from fluxvla_core.robot.runner import BaseInferenceRunner
 
 

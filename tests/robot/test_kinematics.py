@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fluxvla_core.control.kinematics import Chain, Link
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.kinematics import Chain, Link
 
 PLANAR = Chain([Link(), Link(xyz=(0.5, 0, 0))], tool=(0.25, 0, 0))
 UR5E_LIKE = [

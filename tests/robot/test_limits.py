@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fluxvla_core.control.limits import Clamp, CommandLimiter, braking_speed
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.robot.control.limits import Clamp, CommandLimiter, braking_speed
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 JOINTS = (

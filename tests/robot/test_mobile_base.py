@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fluxvla_core.control.limits import Clamp, CommandLimiter
+from fluxvla_core.control.sender import check_pose, ramp
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.robot.control.limits import Clamp, CommandLimiter
-from fluxvla_core.robot.control.sender import check_pose, ramp
 from fluxvla_core.ros2.stop_motion import braking_commands, hold_target
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 from tests.robot.conftest import ARM, HOME, Arm

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control.joiners import METHODS
-from fluxvla_core.robot.control.safety import BadTiming
+from fluxvla_core.control.joiners import METHODS
+from fluxvla_core.control.safety import BadTiming
 from fluxvla_core.robot.observation_history import ObservationHistory
+from fluxvla_core.robot.recording.recorded import open_recording
 
 STRIDE = 5  # control steps of the arm, at 50 Hz, for an action of the policy, at 10 Hz
 
@@ -86,6 +87,28 @@ def test_an_arm_in_real_time_is_looked_at_between_two_questions(bench, make_arm,
             assert abs(step - max(last - back * STRIDE, 0)) <= 4
 
 
+@pytest.mark.parametrize("thinks_s", [0.0, 0.15])
+def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make_arm, thinks_s):
+    pytest.importorskip("rosbags")
+    bench.arm = make_arm(realtime=True)
+    bench.policy = looking = Looking(bench.policy, thinks_s)
+    root = str(bench.work_dir / "rec")
+    settings = {"chunk_joining": "latest_only", "execute_horizon": 3, "control_process": False}
+    bench.run(record=root, max_publish_step=60, **settings)
+
+    found, seen = open_recording(root), {step for steps in looking.seen for step in steps}
+    times = [event["t"] for event in found.of("observation")]
+    assert len(set(times)) == len(times) > len(found.chunks())
+    recorded = {
+        int(found.images["front"].read(found.images["front"].newest(at))[0, 0, 0]) for at in times
+    }
+    assert seen <= recorded
+    table = {"type": "ReplayOperator", "recording": f"{root}/001-1"}
+    bench.run(operator=table, max_publish_step=1000, **{**settings, "control_process": None})
+    assert bench.episode()["outcome"] == "done"
+    assert {step for steps in looking.seen for step in steps} <= recorded
+
+
 def test_a_policy_that_thinks_all_the_time_waits_for_what_it_needs(bench, make_arm):
     """Asked again as soon as it has answered, it has seen nothing of the time in between."""
     bench.arm = make_arm(realtime=True)
@@ -126,7 +149,8 @@ def test_what_is_missing_is_waited_for(took):
         clock.time += seconds
 
     read = reader_of(clock, took)
-    history = ObservationHistory(read, read, robot, policy, 0.5, sleep)
+    told: list[Any] = []
+    history = ObservationHistory(read, read, robot, policy, 0.5, told.append, sleep)
 
     def times(seen: Any) -> list[float]:
         return [each["qpos"] for each in (*seen["history"], seen)]
@@ -143,4 +167,7 @@ def test_what_is_missing_is_waited_for(took):
     assert not history.due()
     history.sample()
     clock.time = 9.17
+    assert not told, "questions are events by themselves"
     assert times(history.read()[1]) == pytest.approx([9.0, 9.1, 9.17])
+    assert [event.reading.observation["qpos"] for event in told] == pytest.approx([9.1])
+    assert [event.at for event in told] == pytest.approx([9.1 + took])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.safety import SafetySettings
+from fluxvla_core.control.sender import ramp
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.safety import SafetySettings
-from fluxvla_core.robot.control.sender import ramp
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fluxvla_core.robot.control.chunks import Chunk
-from fluxvla_core.robot.control.joiners import LatestOnly, RealTime, soft_mask
+from fluxvla_core.control.chunks import Chunk
+from fluxvla_core.control.joiners import LatestOnly, RealTime, soft_mask
 
 RATE = 10.0
 HORIZON = 10

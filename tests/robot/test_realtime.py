@@ -12,12 +12,12 @@ import time
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.chunks import Chunk, check_beginning
-from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.safety import SafetySettings
-from fluxvla_core.robot.control.tracking import TrackingWatch
+from fluxvla_core.control import realtime
+from fluxvla_core.control.chunks import Chunk, check_beginning
+from fluxvla_core.control.clock import Rate
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.safety import SafetySettings
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 on_linux = pytest.mark.skipif(
@@ -35,7 +35,7 @@ def state():
 
 def inside(code: str) -> list[str]:
     """What a process prints; its whole surroundings are its own."""
-    begin = "import os, sys, gc; from fluxvla_core.robot.control import realtime\n"
+    begin = "import os, sys, gc; from fluxvla_core.control import realtime\n"
     done = subprocess.run([sys.executable, "-c", begin + code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fluxvla_core.control.safety import BadChunk
 from fluxvla_core.errors import DataError, RunFailed
-from fluxvla_core.robot.control.safety import BadChunk
 from fluxvla_core.robot.recording.recorded import (
     find_recordings,
     finish_recording,
@@ -189,7 +189,7 @@ def test_what_fits_nothing_is_recorded_as_text(bench):
 
 
 def test_a_reading_that_was_refused_is_recorded(bench):
-    from fluxvla_core.robot.control.safety import BadFrame
+    from fluxvla_core.control.safety import BadFrame
 
     def fault():
         if len(bench.arm.sent) > 3:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import build_operator_from_cfg, build_policy_from_cfg
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import ConfigError, DataError, NotReady, Rejected, SpecMismatch
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.joiners import METHODS
 from fluxvla_core.robot.inference import FreshnessGate
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.replay import RecordingEnded, ReplayOperator, ReplayPolicy
@@ -87,6 +87,39 @@ def test_the_recorded_robot_gives_a_policy_what_it_saw(bench, make_arm):
     assert second.summary()["outcome"] == "done"
     assert second.success is None or second.success is False
     assert any("ends here" in line for line in bench.notes.lines)
+
+
+class Rememberer(Looker):
+    """A policy whose answer follows from three observations, of which it keeps sums."""
+
+    n_obs_steps = 3
+
+    def __init__(self, embodiment):
+        super().__init__(embodiment)
+        self.saw = []
+
+    def predict_action(self, observation):
+        shown = [*observation["history"], observation]
+        self.saw.append([(float(s["images"]["front"].sum()), *s["qpos"]) for s in shown])
+        return super().predict_action({**shown[0], "qpos": observation["qpos"]})
+
+
+@pytest.mark.parametrize("joining", ["synchronous", "latest_only"])
+def test_the_recorded_robot_gives_a_policy_the_history_that_it_had(bench, joining):
+    bench.policy = Rememberer(bench.arm.embodiment)
+    settings = {"chunk_joining": joining, "execute_horizon": 4, "max_publish_step": 70}
+    bench.run(record=str(bench.work_dir / "rec"), **settings)
+    path = str(bench.work_dir / "rec" / "001-1")
+    live, bench.policy.saw = bench.policy.saw, []
+    bench.run(
+        record=str(bench.work_dir / "rec"), **settings,
+        operator={"type": "ReplayOperator", "recording": path},
+    )  # fmt: skip
+
+    first, second = open_recording(path), open_recording(bench.work_dir / "rec" / "002-1")
+    assert len({seen for question in live for seen in question}) > len(live) > 3
+    assert bench.policy.saw[: len(live)] == live
+    np.testing.assert_array_equal(first.chunks(), second.chunks()[: len(live)])
 
 
 class Streams:

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
+from fluxvla_core.control.filters import LowPass
 from fluxvla_core.errors import ConfigError, FluxError, UsageError
-from fluxvla_core.robot.control.filters import LowPass
 
 
 def test_an_episode_runs_to_its_bound_and_ends_in_hold(bench):

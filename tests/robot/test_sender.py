@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.safety import Latch
+from fluxvla_core.control.sender import CommandSender
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.sender import CommandSender
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ONE = EmbodimentSpec("one", (Joint("j", "rad", -1.0, 1.0, 2.0, 10.0),), (), 50.0)

@@ -295,7 +295,7 @@ def test_signals_while_the_record_is_finished_wait_until_it_is_complete(bench, m
 
     monkeypatch.setattr(EpisodeRecorder, "_finish", interrupted)
     # However long the first has been waiting by then.
-    monkeypatch.setattr("fluxvla_core.robot.control.interrupt.IMPATIENT_S", 0.0)
+    monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 0.0)
 
     with pytest.raises(KeyboardInterrupt):
         bench.run(max_publish_step=5)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ELBOW = Joint("elbow", "rad", -1.0, 1.5, 2.0, 10.0, jerk=100.0)

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 
+from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import (
     Faulted,
     LoadFailed,
@@ -15,7 +16,6 @@ from fluxvla_core.errors import (
     SafetyStop,
     SpecMismatch,
 )
-from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 
 

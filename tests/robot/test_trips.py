@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fluxvla_core.control.chunks import check_beginning, check_chunk
+from fluxvla_core.control.safety import Latch, SafetySettings, Trip
+from fluxvla_core.control.tracking import TrackingWatch, action_columns
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.robot.control.chunks import check_beginning, check_chunk
-from fluxvla_core.robot.control.safety import Latch, SafetySettings, Trip
-from fluxvla_core.robot.control.tracking import TrackingWatch, action_columns
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(

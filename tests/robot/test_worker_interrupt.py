@@ -9,8 +9,8 @@ import time
 
 import pytest
 
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.robot.policy_thread import PolicyThread
 
 
@@ -71,13 +71,13 @@ def test_a_second_signal_does_not_wait_where_no_beat_comes(monkeypatch):
     with Interrupts() as interrupts:
         interrupts.deferred = True
         send(signal.SIGTERM)
-        monkeypatch.setattr("fluxvla_core.robot.control.interrupt.IMPATIENT_S", 0.0)
+        monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 0.0)
         with pytest.raises(Interrupted, match="SIGINT"):
             send(signal.SIGINT)
 
 
 def test_signals_that_come_together_cut_no_command_in_half(monkeypatch):
-    monkeypatch.setattr("fluxvla_core.robot.control.interrupt.IMPATIENT_S", 3600.0)
+    monkeypatch.setattr("fluxvla_core.control.interrupt.IMPATIENT_S", 3600.0)
     with Interrupts() as interrupts:
         interrupts.deferred = True
         send(signal.SIGHUP)

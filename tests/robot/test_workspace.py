@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fluxvla_core.control.filters import WorkspaceBox
+from fluxvla_core.control.kinematics import Chain
+from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.robot.control.filters import WorkspaceBox
-from fluxvla_core.robot.control.kinematics import Chain
-from fluxvla_core.robot.control.limits import CommandLimiter
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 NAMES = ("pan", "lift", "elbow")

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from fluxvla_core import Frame
 from fluxvla_core.contracts.policy import Continuation
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.filters import LowPass, SnapGripper
-from fluxvla_core.robot.control.joiners import METHODS
-from fluxvla_core.robot.control.tracking import HOLD_REACH
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.filters import LowPass, SnapGripper
+from fluxvla_core.control.joiners import METHODS
+from fluxvla_core.control.tracking import HOLD_REACH
 from fluxvla_core.ros2.stop_motion import PATIENCE_S, braking_commands, hold_target
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 

@@ -18,9 +18,9 @@ import numpy as np
 from benchmarks._process_program import ProgramArm
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.contracts.policy import Continuation
+from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import FluxError
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control.joiners import METHODS
 from tests.ros2.adversarial import ARM, LIMITS_ALONE, MOVES, chunk_of
 
 CHUNKS = "chunks"

@@ -23,7 +23,7 @@ AT_HOME = {
     "torch": {"checkpoints", "training", "data", "testing"},
     "numpy": {
         *("data", "policies", "robot", "evaluation", "testing"),
-        *("training", "ros2"),
+        *("training", "ros2", "control"),
     },
     "av": {"data", "robot"},
     "pyarrow": {"data"},

@@ -12,8 +12,9 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.checkpoints.foreign import check_settings
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
+from fluxvla_core.errors import CheckpointError, IncompatiblePlugin, SpecMismatch, UsageError
 from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
@@ -27,6 +28,7 @@ from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
 from fluxvla_core.training.export import embodiment_in, export_foreign, import_checkpoint
+from fluxvla_core.training.formats import formats, read_foreign
 
 ARM = EmbodimentSpec(
     "arm",
@@ -188,8 +190,49 @@ def test_what_no_format_recognises(tmp_path, capsys):
     (tmp_path / "theirs").mkdir()
     assert main(["import-checkpoint", str(tmp_path / "theirs"), str(tmp_path / "ours")]) == 2
     text = capsys.readouterr().err
-    assert "no installed format recognises the checkpoint" in text
+    assert "no installed format recognises the checkpoint: it has no config.json" in text
     assert "reach (ReachVLA)" in text
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('{"type": "pi09"}', "its config.json says type 'pi09'"),
+        ('{"model_type": "gr00t_n9"}', "its config.json says model_type 'gr00t_n9'"),
+        ("{}", "its config.json says neither type nor model_type"),
+        ('{"type":', "its config.json cannot be read: invalid JSON"),
+    ],
+)
+def test_what_is_not_recognised_is_called_as_it_calls_itself(tmp_path, content, words):
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(CheckpointError, match=words):
+        read_foreign(tmp_path)
+
+
+def test_formats_that_cannot_be_loaded_are_told_once_a_reason(tmp_path, monkeypatch):
+    why = "fluxvla-x 1.0 needs transformers>=5,<6, but 4.40.0 is installed"
+    broken = [
+        IncompatiblePlugin(f"fluxvla.checkpoint_formats:{name}: {why}", next="pip install it")
+        for name in ("A", "B")
+    ]
+    known, _ = formats()
+    monkeypatch.setattr("fluxvla_core.training.formats.formats", lambda: (known, broken))
+    with pytest.raises(CheckpointError) as error:
+        read_foreign(tmp_path)
+    assert error.value.cause.count(why) == 1
+    assert error.value.next == "pip install it"
+    with pytest.raises(UsageError, match=f"there is no checkpoint format 'x'.*{why}"):
+        read_foreign(tmp_path, "x")
+
+
+@pytest.mark.parametrize("value", [True, 30.0, "tanh", [1], {"a": 1}])
+def test_a_setting_that_nobody_knows_is_refused_with_its_value(value):
+    settings = {"horizon": 5, "_private": True, "off": False, "none": None, "cap": value}
+    with pytest.raises(CheckpointError, match=r"cap is .*no setting of that name") as error:
+        check_settings(settings, {"horizon"}, "/theirs/config.json")
+    assert str(value) in error.value.what
+    assert error.value.where == "/theirs/config.json"
+    check_settings({**settings, "cap": 0}, {"horizon"}, "/theirs/config.json")
 
 
 def test_two_formats_that_recognise_it_are_told_apart_by_name(tmp_path):

@@ -8,7 +8,7 @@ import torch
 from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.guidance import Guide
 
-from fluxvla_core.robot.control.joiners import soft_mask
+from fluxvla_core.control.joiners import soft_mask
 
 T, D, STEPS = 5, 2, 4
 

@@ -29,6 +29,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.policy_server import PolicyServer, ServedPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.models import load_policy
+from fluxvla_core.policies.loading import why_not_continued
 from fluxvla_core.spec.embodiment import Camera, Joint
 from fluxvla_core.training.export import import_checkpoint
 from tests.oracles import fill
@@ -262,6 +263,9 @@ def test_a_question_without_its_history_is_refused(tmp_path: Path) -> None:
     policy = load_policy(found)
     with pytest.raises(ConfigError, match=r"acts on 2 observations \(n_obs_steps\).*with 1"):
         policy.predict_action(observation(policy.cameras))
+    why = why_not_continued(found)
+    assert why is not None
+    assert why.startswith("DiffusionPolicy cannot continue a chunk: its predict_action() takes no")
     trained_on = Checkpoint.open(found).config()["train_dataloader"]["dataset"]
     assert (trained_on["n_obs_steps"], trained_on["past_actions"]) == (2, 1)
 

@@ -17,6 +17,7 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.testing.training import OneProcessRunner, differences, run_ranks
+from tests.training.held_memory import check_held
 
 JOINTS, HORIZON = 3, 4
 SEEN = {"state_dim": JOINTS, "action_dim": JOINTS, "horizon": HORIZON, "num_cameras": 2}
@@ -97,12 +98,11 @@ class Samples:
         return {key: value for key, value in sample.items() if key in self.keys}
 
 
-def run(
-    name: str, table: dict[str, Any], runner: str, batch: int, work_dir: Path, **more: Any
-) -> None:
-    resume = more.pop("resume", None)
-    collator = {"type": "DictCollator", "keys": [*ALWAYS, *KEYS[name]]}
-    config = {
+def config_of(
+    name: str, table: dict[str, Any], runner: str, batch: int, **more: Any
+) -> dict[str, Any]:
+    """Of a training of four steps."""
+    return {
         "model": table,
         "train_dataloader": {"per_device_batch_size": batch},
         "runner": {
@@ -114,10 +114,17 @@ def run(
             "learning_rate": 0.01,
             "max_grad_norm": 1.0,
             "enable_mixed_precision_training": False,
-            "collator": collator,
+            "collator": {"type": "DictCollator", "keys": [*ALWAYS, *KEYS[name]]},
             **more,
         },
     }
+
+
+def run(
+    name: str, table: dict[str, Any], runner: str, batch: int, work_dir: Path, **more: Any
+) -> None:
+    resume = more.pop("resume", None)
+    config = config_of(name, table, runner, batch, **more)
     context = RunContext(
         config=config,
         section="runner",
@@ -196,6 +203,13 @@ def test_two_processes_train_as_one(name: str, tables, trained: Path, tmp_path: 
         assert together.keys() == alone.keys()
         assert farthest(together, alone)[0] < 1e-5, farthest(together, alone)
     assert farthest(before, alone)[0] > 2e-4
+
+
+@pytest.mark.parametrize("name", ["act", "diffusion_of_two"])
+def test_a_process_holds_what_a_dry_run_says(name: str, tmp_path: Path) -> None:
+    adam = {"type": "AdamW"}
+    config = config_of(name, TABLES[name], "FSDPTrainRunner", 4, optimizer=adam)
+    assert run_ranks(2, check_held, tmp_path, config, Samples(name), 4) == [0, 0]
 
 
 def farthest(

@@ -223,7 +223,7 @@ def test_an_unknown_unnorm_key_lists_the_known_ones():
         ({"stats": {"action": ROW}}, "statistics of 'proprio' lack q01, q99, min, max"),
         (
             {"stats": {**STATS, "action": {**ROW, "mask": [True]}}},
-            "'action' have 3 dimensions, the mask 1",
+            "'action' are not rows of one length: 3 in 'q01', .* 1 in 'mask'",
         ),
         (
             {"stats": {**STATS, "action": {**ROW, "relative": [1, 1, 0]}}},

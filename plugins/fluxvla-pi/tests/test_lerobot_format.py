@@ -15,10 +15,11 @@ from safetensors.torch import load_file, save_file
 from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
-from fluxvla_core.errors import CheckpointError, UsageError
+from fluxvla_core.errors import CheckpointError, ConfigError, UsageError
 from fluxvla_core.models import load_policy
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner
+from fluxvla_core.training.export import export_foreign
 from fluxvla_core.training.formats import read_foreign
 from tests.policies.benched import DIVIDED, stages_of
 
@@ -176,14 +177,21 @@ def test_a_camera_that_the_robot_lacks(tmp_path, bring, capsys):
         read_foreign(tmp_path / "theirs", "lerobot", robot="x")
 
 
-def test_a_base_model_without_statistics(tmp_path):
+def test_a_base_model_without_statistics_drives_nothing(tmp_path, bring, monkeypatch):
     source = lerobot_folder(tmp_path / "theirs", "pi05")
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         changed(source / name, lambda c: [step.pop("state_file", None) for step in c["steps"]])
     read = LeRobotPiFormat().read(source)
-    assert "it is a base model, to be fine-tuned" in read.notes[0]
-    assert read.transforms[2]["norm_type"] == read.transforms[2]["state_norm_type"] == "none"
-    assert read.statistics["private"]["action"]["std"] == [1.0] * pi_inputs.ROBOT_ACTIONS
+    assert "it is a base model, to be fine-tuned; it drives no robot" in read.notes[0]
+    out = bring(source)
+    with pytest.raises(ConfigError, match=r"the statistics have no entry 'proprio'.*nothing") as no:
+        load_policy(out)
+    assert no.value.where == str(out)
+    sizes = {key: read.model[key] for key in ("variant", "expert_variant", "vision_variant")}
+    monkeypatch.setattr(lerobot_format, "_VARIANTS", sizes)
+    monkeypatch.setattr(lerobot_format, "VOCABULARY", pi_inputs.VOCABULARY)
+    with pytest.raises(CheckpointError, match="has no statistics of proprio, action"):
+        export_foreign(out, tmp_path / "back", "lerobot")
 
 
 def changed(file, change):

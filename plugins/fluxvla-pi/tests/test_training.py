@@ -12,6 +12,7 @@ from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner, checkpoint_differences, run_ranks
+from tests.training.held_memory import check_held
 
 from .oracles.pi_inputs import (
     ACTION_WORDS,
@@ -71,10 +72,10 @@ class Samples:
         return sample
 
 
-def train(work_dir, family, runner, batch, resume=None):
-    """One run of four steps."""
+def config_of(family, runner, batch):
+    """Of a run of four steps."""
     learned = LEARNED[family]
-    config = {
+    return {
         "model": MODELS[family],
         "train_dataloader": {"per_device_batch_size": batch},
         "runner": {
@@ -94,6 +95,10 @@ def train(work_dir, family, runner, batch, resume=None):
             **runner,
         },
     }
+
+
+def train(work_dir, family, runner, batch, resume=None):
+    config = config_of(family, runner, batch)
     context = RunContext(config=config, section="runner", work_dir=work_dir, resume=resume)
     built = build_runner_from_cfg(config["runner"], context)
     built.run_setup(len(Samples()))
@@ -141,6 +146,11 @@ def test_two_processes_train_as_one(trained, name):
         if not key.endswith("self_attn.k_proj.bias")
     }
     assert max(gaps.values()) < 1e-5, max(gaps, key=gaps.get)
+
+
+def test_a_process_holds_what_a_dry_run_says(tmp_path):
+    config = config_of("pi05", STRATEGIES["fsdp"], 4)
+    assert run_ranks(2, check_held, tmp_path, config, Samples(), 4) == [0, 0]
 
 
 def test_it_goes_on_bit_for_bit(trained):

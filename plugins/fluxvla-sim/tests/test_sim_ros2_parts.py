@@ -18,8 +18,8 @@ from fluxvla_sim.ros2.operators import AlohaSimROSOperator, SlowedClock, URSimRO
 from fluxvla_sim.ros2.settings import NodeSettings, stream_latency, timed_fault
 from fluxvla_ur.embodiment import JOINTS
 
+from fluxvla_core.control.clock import in_lockstep
 from fluxvla_core.errors import ConfigError, NotReady, UsageError
-from fluxvla_core.robot.control.clock import in_lockstep
 from fluxvla_core.ros2 import BadMessage, Fault
 from fluxvla_core.testing.ros2 import ros_domain
 

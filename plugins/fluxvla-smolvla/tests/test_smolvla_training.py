@@ -14,6 +14,7 @@ from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import checkpoint_differences, run_ranks
+from tests.training.held_memory import check_held
 
 from .tiny import ACTION, HORIZON, SIZES, STATE, WIDTH, lerobot_folder, published_weights
 
@@ -59,8 +60,8 @@ class Samples:
         }
 
 
-def learn(work_dir, runner="OneProcessRunner", batch=4, resume=None, model=None, **settings):
-    """One training; gives the work dir."""
+def config_of(runner, batch, model=None, **settings):
+    """Of a training of four steps."""
     table = {
         "type": runner,
         "learning_rate": 1e-4,
@@ -69,13 +70,18 @@ def learn(work_dir, runner="OneProcessRunner", batch=4, resume=None, model=None,
         "collator": {"type": "DictCollator", "keys": KEYS},
         **settings,
     }
-    config = {
+    return {
         "model": {"type": "SmolVLA", **SIZES, "loss_mean": "all", **(model or {})},
         "train_dataloader": {"per_device_batch_size": batch},
         "runner": table,
     }
+
+
+def learn(work_dir, runner="OneProcessRunner", batch=4, resume=None, model=None, **settings):
+    """One training; gives the work dir."""
+    config = config_of(runner, batch, model, **settings)
     context = RunContext(config=config, section="runner", work_dir=work_dir, resume=resume)
-    made = build_runner_from_cfg(table, context)
+    made = build_runner_from_cfg(config["runner"], context)
     made.run_setup(10)
     made.run(Samples())
     return work_dir
@@ -132,6 +138,12 @@ def test_two_processes_train_as_one_does(two, tmp_path, part, runner):
     assert ours.keys() == theirs.keys()
     worst = max(ours, key=lambda name: float((ours[name] - theirs[name]).abs().max()))
     assert float((ours[worst] - theirs[worst]).abs().max()) < 1e-5, worst
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_process_holds_what_a_dry_run_says(tmp_path, part):
+    config = config_of("FSDPTrainRunner", 4, PARTS[part])
+    assert run_ranks(2, check_held, tmp_path, config, Samples(), 4) == [0, 0]
 
 
 def test_in_bf16_the_losses_are_about_the_same(two, tmp_path):

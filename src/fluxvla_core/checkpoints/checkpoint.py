@@ -37,6 +37,7 @@ from fluxvla_core.checkpoints.manifest import (
     step_of,
 )
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.config.load import FORMAT
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.untrusted import parse_json, read_bytes
 
@@ -68,6 +69,7 @@ _UNREADABLE = "its permissions, or a disk or mount that fails"
 class _ResolvedConfig:
     config: dict[str, Any]
     origins: dict[str, str] = field(default_factory=dict)
+    format: str = FORMAT
 
 
 @dataclass(frozen=True)
@@ -173,8 +175,20 @@ class Checkpoint:
         return value
 
     def config(self) -> dict[str, Any]:
-        """The resolved config tree of the run that saved it: data, never executed."""
-        tree: dict[str, Any] = self.json(CONFIG, _ResolvedConfig)["config"]
+        """The resolved config tree of the run that saved it: data, never executed.
+
+        Raises:
+            CheckpointError: it is missing, damaged, or of another format.
+        """
+        content = self.json(CONFIG, _ResolvedConfig)
+        if content.get("format", FORMAT) != FORMAT:
+            raise CheckpointError(
+                f"the config has format {content['format']!r}; this version reads {FORMAT!r}",
+                where=str(self.path / CONFIG),
+                cause="it was written by another version of FluxVLA",
+                next="pip install --upgrade fluxvla-core",
+            )
+        tree: dict[str, Any] = content["config"]
         return tree
 
     def statistics(self) -> dict[str, Any]:

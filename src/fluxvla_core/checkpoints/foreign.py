@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -70,6 +70,38 @@ def torch_table(file: Path) -> dict[str, Any]:
     return content
 
 
+def check_settings(settings: Mapping[str, Any], known: Collection[str], where: str) -> None:
+    """Refuse settings of another project's config that nobody here has heard of.
+
+    A newer version, or a fork, may compute something else by them from the same weights. One that
+    is off (null, false, 0, empty) is as if it were not there; names with ``_`` first are private.
+
+    Args:
+        known: every name that is read, or known to change no number.
+        where: the file, for messages.
+
+    Raises:
+        CheckpointError: names the first such setting and its value.
+    """
+    unknown = [
+        name
+        for name, value in settings.items()
+        if value and name not in known and not name.startswith("_")
+    ]
+    if unknown:
+        name = unknown[0]
+        close = nearest(name, known)
+        raise CheckpointError(
+            f"{name} is {str(settings[name])[:80]!r}, and no setting of that name is known here"
+            + (f"; the nearest is {close!r}" if close else ""),
+            where=where,
+            cause="the checkpoint is of a newer version of its project, or of a fork, and may "
+            "compute something else from the same weights",
+            next="upgrade the plugin; or take the setting out of the file, if it changes nothing "
+            "of what the model computes",
+        )
+
+
 class Renamed(Mapping[str, "Tensor | Stored"]):
     """``tensors`` under the names of ``names``: this project's -> the other's.
 
@@ -130,7 +162,7 @@ def chosen_robot(known: Iterable[str], robot: str | None, where: str) -> str | N
         return names[0] if len(names) == 1 else None
     if robot not in names:
         close = nearest(robot, names)
-        meant = f"; did you mean {close!r}?" if close else ""
+        meant = f"; did you mean {close!r}?" if close else "."
         raise UsageError(
             f"--robot {robot}: the checkpoint knows no such robot{meant} It knows "
             f"{', '.join(names) or 'none by name'}",

@@ -108,6 +108,7 @@ def read_manifest(folder: Path) -> Manifest:
             f"the checkpoint has format {written[:80]!r}; this version reads {FORMAT!r}",
             where=str(path),
             cause="it was written by another version of FluxVLA",
+            next="pip install --upgrade fluxvla-core",
         )
     try:
         body = parse_json(content, _Body, CheckpointError, str(path))

@@ -219,6 +219,8 @@ class StoredTensors(Mapping[str, Stored]):
 # optimizer's state twice as many; a mixture of 10,000 experts still fits.
 _LARGEST_HEADER = 16 << 20
 _MOST_TENSORS = 100_000
+_LFS = b"version "
+"""The first bytes of what Git leaves in the place of a large file."""
 
 
 def open_tensors(path: Path) -> Any:
@@ -241,7 +243,36 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, ValueError, TypeError, SafetensorError) as error:
-        raise CheckpointError(f"{path.name} cannot be read: {error}", where=str(path)) from error
+        raise CheckpointError(
+            f"{path.name} cannot be read: {_shortfall(path) or error}",
+            where=str(path),
+            cause="it was copied or downloaded in part, or not as a safetensors file",
+            next="copy or download it again",
+        ) from error
+
+
+def _shortfall(path: Path) -> str | None:
+    """How many bytes a file has and how many its header tells of; None if they agree, or there is
+    no header."""
+    try:
+        _check_header(path)
+        with path.open("rb") as file:
+            (length,) = struct.unpack("<Q", file.read(8))
+            header = json.loads(file.read(length))
+        tensors = (entry for name, entry in header.items() if name != "__metadata__")
+        told = 8 + length + max((entry["data_offsets"][1] for entry in tensors), default=0)
+        size = path.stat().st_size
+    except (
+        LookupError,
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        struct.error,
+    ):
+        return None  # no header of that format
+    return None if size == told else f"it has {size} bytes instead of {told}"
 
 
 def _check_header(path: Path) -> None:
@@ -249,7 +280,10 @@ def _check_header(path: Path) -> None:
     if not os.path.isfile(path):
         raise ValueError("it is missing, or no regular file")
     with path.open("rb") as file:
-        (length,) = struct.unpack("<Q", file.read(8).ljust(8, b"\0"))
+        begin = file.read(8).ljust(8, b"\0")
+        if begin == _LFS:
+            raise ValueError("it is a pointer of Git LFS, not the file itself: git lfs pull")
+        (length,) = struct.unpack("<Q", begin)
         if length > _LARGEST_HEADER:
             raise ValueError(
                 f"its header of {length} bytes is larger than {_LARGEST_HEADER >> 20} MiB"

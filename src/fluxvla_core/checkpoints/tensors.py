@@ -193,9 +193,13 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def check_names(
-    found: Mapping[str, Tensor | Stored], wanted: Mapping[str, Tensor], what: str, where: str
+    found: Mapping[str, Tensor | Stored],
+    wanted: Mapping[str, Tensor],
+    what: str,
+    where: str,
+    next: str = "resume with the config that made it: config.resolved.json in its folder",
 ) -> None:
-    """Refuse tensors that are not those of this model.
+    """Refuse tensors that are not those of this model; ``next`` is what to do about it.
 
     Raises:
         CheckpointError: lists missing, unexpected and mis-sized names, a few of each.
@@ -221,5 +225,5 @@ def check_names(
             f"{what} of the checkpoint are not this model's:\n" + "\n".join(lines),
             where=where,
             cause="it was made by another model, or by another version of this one",
-            next="resume with the config that made it: config.resolved.json in its folder",
+            next=next,
         )

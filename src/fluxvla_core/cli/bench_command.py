@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy
 
 _MODES = ("eager", "compiled", "graph")
-_WIDTH = 13
+_WIDTH, _COLUMN = 13, 22
 
 
 class BenchPolicy:
@@ -95,7 +97,7 @@ class BenchPolicy:
         with heartbeat("building the policy"):
             policy, config = _policy(args)
         figures, arrays = _figures(policy, modes, args)
-        for line in table(figures):
+        for line in table(figures, shutil.get_terminal_size().columns):
             say(line)
         if args.json is not None:
             path = Path(args.json)
@@ -218,18 +220,38 @@ def _keep(
     say(f"the fixture is in {folder}")
 
 
-def table(figures: Mapping[str, Any]) -> list[str]:
-    """The figures for people: a line a stage, the modes side by side; 80 columns hold three."""
-    from fluxvla_core.policies.benchmark import STAGES
-
+def table(figures: Mapping[str, Any], columns: int = 80) -> list[str]:
+    """The figures for people: a line a stage, the modes side by side, or below where they are more
+    than ``columns`` hold (80 hold three)."""
     versions = ", ".join(f"{n} {v}" for n, v in figures["versions"].items() if v is not None)
-    modes = figures["modes"]
-    run = {name: found for name, found in modes.items() if "not_run" not in found}
-    lines = [
+    modes, threads = figures["modes"], figures["threads"]
+    run = [name for name, found in modes.items() if "not_run" not in found]
+    beside = max(1, (columns - _WIDTH) // _COLUMN)
+    before = [
         f"{figures['model']}: {figures['parameters'] / 1e6:.1f} M parameters, "
         f"{figures['precision']}, {figures['gflops']:g} GFLOP an answer; "
-        f"{figures['device']}, {figures['threads']} threads",
-        f"{'ms':{_WIDTH}}" + "".join(f"{mode:>22}" for mode in run),
+        f"{figures['device']}, {threads} thread{'s' * (threads != 1)}"
+    ]
+    rows: list[str] = []
+    for first in range(0, len(run), beside):
+        rows += _columns({name: modes[name] for name in run[first : first + beside]})
+    floor = ", ".join(f"{stage} {ms:g} ms" for stage, ms in figures["floor_ms"].items())
+    after = [f"{name}: not run: {f['not_run']}" for name, f in modes.items() if "not_run" in f]
+    after += [
+        f"peak: {figures['peak_tflops']:g} TFLOP/s ({figures['peak_is']}), "
+        f"{figures['bandwidth_gb_s']:g} GB/s ({figures['bandwidth_is']}); at that: {floor}",
+        f"fixture: seed {figures['seed']}, inputs {figures['inputs_sha256'][:12]}, answers "
+        f"{figures['answers_sha256'][:12]}; {versions}",
+    ]
+    return [*_wrapped(before, columns), *rows, *_wrapped(after, columns)]
+
+
+def _columns(run: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Modes side by side."""
+    from fluxvla_core.policies.benchmark import STAGES
+
+    lines = [
+        f"{'ms':{_WIDTH}}" + "".join(f"{mode:>{_COLUMN}}" for mode in run),
         " " * _WIDTH + f"{'p50':>8}{'p95':>7}{'p99':>7}" * len(run),
     ]
     for stage in STAGES:
@@ -244,20 +266,28 @@ def table(figures: Mapping[str, Any]) -> list[str]:
         "apart": lambda found: f"{found['apart']:.1e}",
     }
     for name, said in summary.items():
-        lines.append(f"{name:{_WIDTH}}" + "".join(f"{said(found):>22}" for found in run.values()))
-    lines += [f"{name}: not run: {f['not_run']}" for name, f in modes.items() if "not_run" in f]
-    floor = ", ".join(f"{stage} {ms:g} ms" for stage, ms in figures["floor_ms"].items())
-    lines += [
-        f"peak: {figures['peak_tflops']:g} TFLOP/s ({figures['peak_is']}), "
-        f"{figures['bandwidth_gb_s']:g} GB/s ({figures['bandwidth_is']}); at that: {floor}",
-        f"fixture: seed {figures['seed']}, inputs {figures['inputs_sha256'][:12]}, answers "
-        f"{figures['answers_sha256'][:12]}; {versions}",
-    ]
+        cells = (f"{said(found):>{_COLUMN}}" for found in run.values())
+        lines.append(f"{name:{_WIDTH}}" + "".join(cells))
     return lines
 
 
+def _wrapped(lines: Sequence[str], columns: int) -> list[str]:
+    """Each of ``lines`` in as many as it needs, broken between words."""
+    return [
+        part
+        for line in lines
+        for part in textwrap.wrap(
+            line,
+            columns,
+            subsequent_indent="  ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    ]
+
+
 def _row(stage: Mapping[str, float]) -> str:
-    """p50, p95 and p99 in 22 columns."""
+    """p50, p95 and p99 in ``_COLUMN`` characters."""
     p50, p95, p99 = (
         f"{ms:.2f}" if ms < 1000 else f"{ms:.0f}"
         for ms in (stage["p50_ms"], stage["p95_ms"], stage["p99_ms"])

@@ -110,8 +110,10 @@ def _driven(plan: Plan, build: Any, context: Any, own_records: bool) -> tuple[An
         runner.run_setup()
         return runner.run(), 0
     from fluxvla_core.build import build_dataset_from_cfg
+    from fluxvla_core.errors import located
 
-    dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
+    with located(context.where("train_dataloader.dataset")):
+        dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
     try:
         runner.run_setup(n_train_examples=len(dataset))
         ranks.mark_started(plan.work_dir)

@@ -142,8 +142,8 @@ class ImportCheckpoint:
         )
         say(
             f"{path}: {checkpoint.model['type']}, {len(checkpoint.tensors)} tensors; cameras "
-            f"{', '.join(checkpoint.img_keys)}; chunks of {checkpoint.horizon} actions at {rate}; "
-            f"{name}"
+            f"{', '.join(checkpoint.img_keys) or 'none'}; chunks of {checkpoint.horizon} actions "
+            f"at {rate}; {name}"
         )
         for note in checkpoint.notes:
             say(f"note: {note}")

@@ -20,7 +20,7 @@ from fluxvla_core.errors import (
 )
 from fluxvla_core.plugins import first_party
 from fluxvla_core.plugins._metadata import Plugin
-from fluxvla_core.plugins.load import LIST, core_provides, find, locate, not_read, unmet
+from fluxvla_core.plugins.load import LIST, core_provides, find, locate, not_read, unmet, upgrade
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import PREFIX, check_api
 
@@ -127,7 +127,7 @@ def installed(plugin: Plugin) -> Found:
     registry = plugin.group.removeprefix(PREFIX)
     why = unmet(plugin)
     if why:
-        raise IncompatiblePlugin(why)
+        raise IncompatiblePlugin(why, next=upgrade(plugin))
     signature = read_signature(plugin)
     if signature is None:
         if locate(plugin.module) is None:

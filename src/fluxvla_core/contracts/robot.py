@@ -98,8 +98,8 @@ class Operator(Contract):
 
         None if it has none, or one of somebody else's. Where this is defined episodes begin from
         there: an arm lags behind what holds it, and a gripper presses, and neither is to be let go.
-        After a stop, a joint further from it than ``HOLD_REACH`` (``robot.control``) was moved, and
-        begins where it is.
+        After a stop, a joint further from it than ``HOLD_REACH`` (``control.tracking``) was moved,
+        and begins where it is.
         """
         return None
 

@@ -75,7 +75,7 @@ class VLA(Contract):
     @attribute
     def past_actions(self) -> int:
         """Actions of a chunk that come before the present one's: they are trained on, and left out
-        of what a policy answers."""
+        of what a policy answers. A policy whose chunks have some continues none (``rtc``)."""
         return 0
 
     @attribute

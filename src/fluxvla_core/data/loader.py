@@ -269,6 +269,13 @@ def _stack(key: str, values: list[Any]) -> Any:
         raise DataError(
             f"sample key {key!r} cannot be stacked: shapes {', '.join(shapes)} ({error})"
         ) from error
+    if key == "images" and isinstance(first, list):
+        shapes = sorted({str(tuple(np.shape(image))) for image in first})
+        raise DataError(
+            f"the images of a sample are still a list, of shapes {', '.join(shapes)}",
+            next="put a transform that makes one array of them (ResizeImages, NormalizeImages, the "
+            "model family's own) into the dataset's transforms",
+        )
     raise DataError(
         f"sample key {key!r} is listed in keys, but {type(first).__name__} cannot be stacked",
         next=f"move {key!r} to the collator's meta_keys",

@@ -158,11 +158,16 @@ def _load(folder: Path, config: dict[str, Any]) -> Any:
             lower = bool(config.get("do_lower_case", True))
             return tokenizers.BertWordPieceTokenizer(str(vocab), lowercase=lower)
     except Exception as error:
-        raise ConfigError(f"no tokenizer can be read from {folder}: {error}") from error
-    present = sorted(p.name for p in folder.iterdir())[:8]
+        raise ConfigError(
+            f"no tokenizer can be read from {folder}: {error}",
+            cause="the file was copied or downloaded in part, or is not of the tokenizers library",
+            next="copy or download it again",
+        ) from error
+    present = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
     raise ConfigError(
-        f"{folder} holds neither tokenizer.json nor vocab.txt; it holds {', '.join(present)}",
+        f"{folder} holds neither tokenizer.json nor vocab.txt; it holds {present}",
         cause="the folder is not the one that the model's tokenizer was saved in",
+        next="copy tokenizer.json of the model into it, or name the folder that has it",
     )
 
 

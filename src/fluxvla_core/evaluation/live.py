@@ -26,9 +26,10 @@ from fluxvla_core.contracts.environment import Environment, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
 from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.control.clock import MonotonicClock
+from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SafetyStop
 from fluxvla_core.evaluation.stepping import check_step
-from fluxvla_core.robot.control.clock import MonotonicClock
 from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
 
@@ -277,6 +278,12 @@ def run_live(
     shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was cut short
     operator = EnvironmentOperator(environment, actor, task, seed, cameras, max_steps)
     policy = _TimedPolicy(actor, environment, cameras)
+    joining = live.options.get("chunk_joining")
+    if make_joiner(joining).continues and not policy.continues:
+        raise ConfigError(
+            f"live has chunk_joining {joining!r}, and the policy cannot continue a chunk: neither "
+            "it nor its model takes what is left of the last one"
+        )
     runner = BaseInferenceRunner(
         context=RunContext(work_dir=folder, task=task.name),
         seed=policy_seed,

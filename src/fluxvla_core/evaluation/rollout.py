@@ -32,6 +32,7 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.environment import Environment, TaskSpec
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor, with_history
+from fluxvla_core.control.chunks import not_finite
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
 from fluxvla_core.evaluation.live import LiveSettings, run_live
@@ -45,7 +46,6 @@ from fluxvla_core.evaluation.stepping import (
     shaped,
 )
 from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
-from fluxvla_core.robot.control.chunks import not_finite
 from fluxvla_core.spec.embodiment import Camera
 
 Array = npt.NDArray[np.float64]

@@ -19,6 +19,7 @@ from fluxvla_core.build import RunContext, bind_options, build_environment_from_
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.episodes import (
@@ -153,6 +154,8 @@ class EvalRunner(Runner):
             self._checkpoint = chosen_checkpoint(given.ckpt_path, Path(self.context.work_dir))
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]
+        if path is not None:
+            self._check_joining(path)
         sources = {POLICY: given.source(policy, path)}
         if given.baseline:
             sources[UNTRAINED] = given.source(UNTRAINED, path)
@@ -318,6 +321,17 @@ class EvalRunner(Runner):
             options.setdefault("execute_horizon", self.options.replan_every)
         fps = self.options.video_fps if self.options.record_videos else None
         return LiveSettings(options, str(self.folder / RECORDS), fps)
+
+    def _check_joining(self, path: str) -> None:
+        """Refuse a checkpoint whose model cannot act as ``live`` says, before it is loaded."""
+        if self._live is None or not make_joiner(self._live["chunk_joining"]).continues:
+            return
+        from fluxvla_core.policies.loading import why_not_continued
+
+        why = why_not_continued(path)
+        if why is not None:
+            given = self._live["chunk_joining"]
+            raise self.config_error("live", f"has chunk_joining {given!r}, and {why}")
 
     def _ready(self) -> tuple[EnvironmentSpec, Settings]:
         assert self._spec is not None, "run_setup() comes first"

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.policy import Actor
+from fluxvla_core.control.chunks import interpolate
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.sender import CommandPipeline, PassThrough
+from fluxvla_core.control.tracking import action_columns, action_values
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.robot.control.chunks import interpolate
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.sender import CommandPipeline, PassThrough
-from fluxvla_core.robot.control.tracking import action_columns, action_values
 
 Array = npt.NDArray[np.float64]
 

@@ -125,19 +125,46 @@ def unread_group(plugin: Plugin) -> str:
     return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"
 
 
+EXACT: Final = frozenset({"transformers"})
+"""Distributions whose modules models are made of: with another version than a plugin declares, the
+same weights may give other numbers, and nobody would notice."""
+
+
 def unmet(plugin: Plugin) -> str | None:
-    """Why the plugin's own requirement on the core does not hold, or None.
+    """Why the plugin's own requirement on the core, or on one of ``EXACT``, does not hold, or None.
 
     ``pip install --no-deps``, conda and ROS overlays go past pip's check, so it is made again.
     """
+    found = _first_unmet(plugin)
+    return None if found is None else found[0]
+
+
+def upgrade(plugin: Plugin) -> str:
+    """The command after which :func:`unmet` holds no more."""
+    found = _first_unmet(plugin)
+    wanted = "" if found is None else found[1]
+    return f"pip install {wanted}" if wanted else f"pip install --upgrade {plugin.dist} {CORE}"
+
+
+def _first_unmet(plugin: Plugin) -> tuple[str, str] | None:
     if is_core(plugin):
         return None
-    return _unmet(plugin.origin, plugin.requires, _metadata.version(CORE))
+    named = (re.match(r"[\w.-]+", text) for text in plugin.requires)
+    names = {canonical(name[0]) for name in named if name is not None}
+    for name in (CORE, *sorted(EXACT & names)):
+        found = _unmet(plugin.origin, plugin.requires, name, _metadata.version(name))
+        if found is not None:
+            return found
+    return None
 
 
 @functools.cache  # a distribution has many plugins
-def _unmet(origin: str, requires: tuple[str, ...], have: str | None) -> str | None:
-    if have and _certainly_met(requires, have):
+def _unmet(
+    origin: str, requires: tuple[str, ...], name: str, have: str | None
+) -> tuple[str, str] | None:
+    """Why ``have`` of the distribution ``name`` is not enough, and what pip should install; the
+    latter is empty for the core, which several plugins require."""
+    if have and _certainly_met(requires, name, have):
         return None
     from packaging.requirements import InvalidRequirement, Requirement
 
@@ -145,20 +172,21 @@ def _unmet(origin: str, requires: tuple[str, ...], have: str | None) -> str | No
         try:
             requirement = Requirement(text)
         except InvalidRequirement as error:
-            return f"{origin} has a requirement that cannot be read: {error}"
-        if canonical(requirement.name) != CORE:
+            return f"{origin} has a requirement that cannot be read: {error}", ""
+        if canonical(requirement.name) != name:
             continue
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         if have and not requirement.specifier.contains(have, prereleases=True):
-            return (
-                f"{origin} needs {requirement.name}{requirement.specifier}, but {have} is installed"
-            )
+            ranges = sorted(map(str, requirement.specifier), reverse=True)  # ">=5,<6"
+            wanted = f"{requirement.name}{','.join(ranges)}"
+            why = f"{origin} needs {wanted}, but {have} is installed"
+            return why, "" if name == CORE else f"'{wanted}'"
     return None
 
 
-def _certainly_met(requires: tuple[str, ...], have: str) -> bool:
-    """Whether ``have`` fulfils plain ranges such as ``fluxvla-core>=0.1,<0.2``.
+def _certainly_met(requires: tuple[str, ...], dist: str, have: str) -> bool:
+    """Whether ``have`` of ``dist`` fulfils plain ranges such as ``fluxvla-core>=0.1,<0.2``.
 
     Importing ``packaging`` takes a third of ``fluxvla config check``; it decides about all else.
     """
@@ -167,7 +195,7 @@ def _certainly_met(requires: tuple[str, ...], have: str) -> bool:
         return False
     for text in requires:
         name = re.match(r"[\w.-]+", text)
-        if name is not None and canonical(name[0]) != CORE:
+        if name is not None and canonical(name[0]) != dist:
             continue
         stated = re.fullmatch(r"[\w.-]+(?:\[[\w, -]*\])?\s*(?P<ranges>[\d.,<>= ]*)", text)
         if stated is None:
@@ -188,14 +216,14 @@ def load(plugin: Plugin) -> Any:
     """Import the module that the entry point names and return its object.
 
     Raises:
-        IncompatiblePlugin: the plugin requires another core.
+        IncompatiblePlugin: the plugin needs another version of the core, or of one of ``EXACT``.
         LoadFailed: the import fails; the message names the distribution and the reason.
     """
     why = unmet(plugin)
     if why:
         raise IncompatiblePlugin(
             f"{plugin.group}:{plugin.name}: {why}",
-            next=f"pip install --upgrade {plugin.dist} {CORE}",
+            next=upgrade(plugin),
         )
     provides = f"{plugin.origin} provides {plugin.name!r} but"
     module = plugin.module

@@ -139,7 +139,8 @@ def untrained_policy(
         embodiment: the robot; by default that of ``inference.operator``.
 
     Raises:
-        ConfigError: the config lacks the model, its dataset's transforms, or the robot.
+        ConfigError: the config lacks the model, its dataset's transforms, or the robot; or the
+            robot lacks a camera.
     """
     if "model" not in config:
         raise ConfigError("the config has no section 'model'")
@@ -150,6 +151,15 @@ def untrained_policy(
         raise ConfigError(
             f"train_dataloader.dataset has no {', '.join(missing)}: how observations are prepared "
             "is unknown"
+        )
+    cameras = tuple(camera_name(key) for key in dataset["img_keys"])
+    absent = [camera for camera in cameras if camera not in robot.camera_names]
+    if absent:
+        raise ConfigError(
+            f"train_dataloader.dataset.img_keys names {', '.join(map(repr, absent))}; "
+            f"{robot.name} has {', '.join(robot.camera_names) or 'no cameras'}",
+            next="the operator's camera_names, or --embodiment, has to have every camera that the "
+            "policy looks at",
         )
     name = dataset.get("statistic_name", "private")
     statistics = {
@@ -180,7 +190,7 @@ def untrained_policy(
         prepare=prepare,
         denormalize=normalizers[0].denormalizer(statistics, name),
         embodiment=robot,
-        cameras=tuple(camera_name(key) for key in dataset["img_keys"]),
+        cameras=cameras,
         action_rate_hz=robot.rate_hz,
         horizon=horizon,
         device=device,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import os
 import shlex
@@ -21,9 +22,11 @@ from fluxvla_core.contracts.training import InferenceDataset, Transform
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
-from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch
-from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, Registry
+from fluxvla_core.data.preparation import try_preparation
+from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, located
+from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy
+from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 log = logging.getLogger("fluxvla.policies")
 
@@ -85,8 +88,15 @@ def load_policy(
             where=where,
             next="train with relative_actions=True, whose chunks come out absolute",
         )
-    prepare = _prepare(dataset, trained_on, checkpoint)
-    denormalize = _denormalize(denormalize_action, prepare, checkpoint)
+    with located(where):
+        prepare = _prepare(dataset, trained_on, checkpoint)
+        denormalize = _denormalize(denormalize_action, prepare, checkpoint)
+    own_objects = any(
+        given is not None and not isinstance(given, Mapping)
+        for given in (dataset, denormalize_action)
+    )
+    if not own_objects:  # somebody's own may count what they are asked
+        _try(prepare, denormalize, embodiment, int(facts["horizon"]), where)
     if device == "cuda":
         import torch
 
@@ -105,6 +115,27 @@ def load_policy(
         precision=mixed_precision_dtype,
         source=where,
         execution=execution,
+    )
+
+
+def why_not_continued(ckpt_path: str | Path) -> str | None:
+    """Why the model of a checkpoint cannot continue a chunk (``chunk_joining = "rtc"``).
+
+    Found from its class, without its weights; None where nothing speaks against it.
+
+    Raises:
+        CheckpointError: there is no checkpoint, or it is damaged.
+        PluginError: the model is of a plugin that is not installed.
+    """
+    table = Checkpoint.open(ckpt_path).config().get("model")
+    if not isinstance(table, Mapping) or not isinstance(table.get("type"), str):
+        return None
+    predict = VLAS.get(table["type"]).predict_action
+    if "prev_actions" in inspect.signature(predict).parameters:
+        return None
+    return (
+        f"{table['type']} cannot continue a chunk: its predict_action() takes no prev_actions, "
+        "which models of flow matching take"
     )
 
 
@@ -154,6 +185,14 @@ def _model(checkpoint: Checkpoint, device: str) -> Any:
     model = model_of(checkpoint)
     load_for_inference(model, checkpoint)
     return model.to(device).eval()
+
+
+def _try(prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str) -> None:
+    """Try them before weights are read; cameras that the robot lacks are told by what drives it."""
+    sizes = {camera.name: (camera.height, camera.width) for camera in robot.cameras}
+    keys = getattr(prepare, "img_keys", ())
+    if all(camera_name(key) in sizes for key in keys):
+        try_preparation(prepare, denormalize, sizes, robot.state_dim, (horizon, robot.dim), where)
 
 
 def _prepare(dataset: Any, trained_on: Mapping[str, Any], checkpoint: Checkpoint) -> Any:

@@ -1,7 +1,8 @@
 """An episode's control loop (``ControlLoop``), and its checks at each tick (``Supervisor``).
 
-The loop asks the policy, joins its chunks and plays them, until the episode is over. The thread
-that calls ``run`` alone sends commands, on the absolute deadlines of the control rate.
+The loop asks the policy, joins its chunks and plays them, until the episode is over. Only the
+thread that calls ``run`` sends commands, on the absolute deadlines of the control rate; the one
+exception is the operator's own ``stop``, which has a thread and a time limit of its own.
 On a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
 policy never keeps a command from being sent: without a chunk the arm brakes and holds, and after
 ``safety.starvation_s`` the motion is stopped. In a lockstep simulation, where time stands still
@@ -24,14 +25,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control.chunks import Chunk, check_beginning
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.joiners import ChunkJoiner
+from fluxvla_core.control.policy_client import Answer, PolicyClient, PolicyEnded
+from fluxvla_core.control.safety import BadChunk, SafetySettings, Starved
+from fluxvla_core.control.sender import CommandSender, SentCommand
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control.chunks import Chunk, check_beginning
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.joiners import ChunkJoiner
-from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyEnded
-from fluxvla_core.robot.control.safety import BadChunk, SafetySettings, Starved
-from fluxvla_core.robot.control.sender import CommandSender, SentCommand
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import CommandSent, Event, Phase
 from fluxvla_core.robot.robot import Robot
 
@@ -296,7 +297,7 @@ class Supervisor:
         """The policy's motion begins, or continues."""
         self.phase = Phase.RUN
 
-    def after_tick(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
+    def check(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
         """The tick after each command: reported always, supervised while it may still stop.
 
         Args:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.robot.control import realtime
+from fluxvla_core.control import realtime
 from fluxvla_core.robot.episode import Episode, EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import EpisodeObserver
 from fluxvla_core.robot.tasks import Task

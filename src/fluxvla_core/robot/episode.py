@@ -15,22 +15,22 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.delays import MACHINE
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.control.joiners import ChunkJoiner
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.policy_client import PolicyClient
-from fluxvla_core.robot.control.safety import Latch, Rule, SafetySettings, rule_of
-from fluxvla_core.robot.control.sender import (
+from fluxvla_core.control.clock import Rate
+from fluxvla_core.control.delays import MACHINE
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.joiners import ChunkJoiner
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.policy_client import PolicyClient
+from fluxvla_core.control.safety import Latch, Rule, SafetySettings, rule_of
+from fluxvla_core.control.sender import (
     CommandSender,
     ExecuteActions,
     SentCommand,
     come_to_rest,
     ramp,
 )
-from fluxvla_core.robot.control.tracking import TrackingWatch
+from fluxvla_core.control.tracking import TrackingWatch
+from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.robot.control_loop import ControlLoop, Supervisor
 from fluxvla_core.robot.events import (
     EpisodeEnded,
@@ -159,7 +159,7 @@ class Episode:
         )  # fmt: skip
         self._sender = CommandSender(
             self._execute_actions, settings.rate_hz, robot.clock, self._limiter, parts.latch,
-            parts.filters, self._after_tick, robot.speed, parts.one_by_one, lead_s,
+            parts.filters, self._on_sent, robot.speed, parts.one_by_one, lead_s,
         )  # fmt: skip
         self._rate = self._sender.rate
         self._client = parts.make_client(task, seed, self._tracking, self._emit)
@@ -305,8 +305,8 @@ class Episode:
         self._parts.execute_actions(actions, rate)
         self._executing = False
 
-    def _after_tick(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
-        self._supervisor.after_tick(sent, sent_at, late_s)
+    def _on_sent(self, sent: SentCommand | None, sent_at: float, late_s: float) -> None:
+        self._supervisor.check(sent, sent_at, late_s)
         if self._supervisor.phase is Phase.RUN:
             self._client.ticked()
 

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
+from fluxvla_core.control.safety import Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.robot.control.safety import Trip
-from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.tasks import Task
 
 Array = npt.NDArray[np.float64]
@@ -95,6 +95,16 @@ class EpisodeStarted(Event):
 @dataclass(frozen=True)
 class Observed(Event):
     """A reading of the robot that passed its checks."""
+
+    reading: RobotReading
+
+
+@dataclass(frozen=True)
+class Remembered(Event):
+    """A reading between two questions, now that a policy is asked with it as history.
+
+    ``at`` is when it was made, which is before other events that came first.
+    """
 
     reading: RobotReading
 

@@ -20,14 +20,14 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Policy
+from fluxvla_core.control.chunks import check_chunk
+from fluxvla_core.control.delays import POLICY, DelaySource
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.joiners import PreviousChunk
+from fluxvla_core.control.policy_client import Answer, PolicyClient, PolicyFailed
+from fluxvla_core.control.safety import BadChunk, BadFrame, BadTiming, SafetySettings
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError, NotReady
-from fluxvla_core.robot.control.chunks import check_chunk
-from fluxvla_core.robot.control.delays import POLICY, DelaySource
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.joiners import PreviousChunk
-from fluxvla_core.robot.control.policy_client import Answer, PolicyClient, PolicyFailed
-from fluxvla_core.robot.control.safety import BadChunk, BadFrame, BadTiming, SafetySettings
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.events import ChunkAccepted, Event, Observed, Refused, RobotReading
 from fluxvla_core.robot.observation_history import ObservationHistory
 from fluxvla_core.robot.operator_values import check_frame, is_number
@@ -264,7 +264,7 @@ class ObservationReader:
 
     def sample(self) -> RobotReading:
         """One between two questions, for a policy's history; checked as ``read`` checks it, but
-        for the arm, and no event."""
+        for the arm. The history says whether a question needed it (``Remembered``)."""
         return self._read()
 
     def _read(self) -> RobotReading:
@@ -279,7 +279,7 @@ class ObservationReader:
             if frame is not None and seconds["sync"] > _LONG_S:
                 last = max(frame.stamps, key=frame.stamps.__getitem__)
                 error.cause = (
-                    f"{self._robot.reading.name} took {seconds['sync']:.2f} s; "
+                    f"{self._robot.frame_call.name} took {seconds['sync']:.2f} s; "
                     f"{last} came last in it"
                 )
             raise
@@ -305,13 +305,13 @@ class ObservationReader:
         """
         robot = self._robot
         try:
-            with robot.delays.of(robot.reading):
+            with robot.delays.of(robot.frame_call):
                 observation, frame = self._observe()
         except FluxError:
             raise
         except (Exception, SystemExit) as error:
             raise BadFrame(
-                f"{robot.reading.name}, or what the runner makes of it, "
+                f"{robot.frame_call.name}, or what the runner makes of it, "
                 f"raised {type(error).__name__}: {error}"
             ) from error
         if not isinstance(observation, Mapping) or not isinstance(

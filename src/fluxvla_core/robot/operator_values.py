@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
-from fluxvla_core.robot.control.safety import BadFrame
+from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 

@@ -10,9 +10,9 @@ from typing import Any
 from fluxvla_core.build import RunContext, build_action_filter_from_cfg
 from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.control.filters import SnapGripper
+from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SpecMismatch
-from fluxvla_core.robot.control.filters import SnapGripper
-from fluxvla_core.robot.control.joiners import make_joiner
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
 
@@ -82,7 +82,7 @@ class InferenceOptions:
     async_execution: bool = False
     """think while moving: short for ``chunk_joining="latest_only"``."""
     chunk_joining: str | Mapping[str, Any] | None = None
-    """how chunks become one motion: a name of ``METHODS`` in ``robot.control.joiners``, or a table
+    """how chunks become one motion: a name of ``METHODS`` in ``control.joiners``, or a table
     with ``method = '<name>'`` and its parameters. ``synchronous`` by default."""
     simulated_latency: float = 0.0
     """seconds from an observation to its chunk, in a simulation whose time stands still while the

@@ -15,8 +15,8 @@ from typing import Any, TypeAlias
 from fluxvla_core.build import RunContext, parameters
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.control.clock import MonotonicClock, clock_of, in_lockstep
 from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS, RUNNERS
-from fluxvla_core.robot.control.clock import MonotonicClock, clock_of, in_lockstep
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import import_path, not_plain
 from fluxvla_core.robot.robot import Robot
@@ -159,7 +159,7 @@ def choose_layout(
         or _obstacle(tables, config)
         or (overrides.why_single_process if overrides.sends else None)
     )
-    # What is not there is an error of ``build``.
+    # ``build`` reports unknown operators.
     name: str = "" if obstacle else tables.operator.get("type", "")
     cls = OPERATORS.get(name) if name in OPERATORS else None
     known = None if cls is None else _embodiment_before_connect(cls, embodiment)

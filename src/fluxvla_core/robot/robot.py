@@ -22,10 +22,10 @@ from fluxvla_core.contracts.check import check_operator, missing_operator_method
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.control.clock import Rate, clock_of, in_lockstep
+from fluxvla_core.control.delays import DelayMonitor, robot_call
+from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.robot.control.clock import Rate, clock_of, in_lockstep
-from fluxvla_core.robot.control.delays import DelayMonitor, robot_call
-from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.robot.operator_values import as_action, as_frame, as_number, as_state
 from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
@@ -99,7 +99,7 @@ class Robot:
         self.clock = clock_of(self._operator)
         self.lockstep = in_lockstep(self.clock)
         self.delays = DelayMonitor()
-        self.reading = robot_call(f"{self.name}.get_frame()")
+        self.frame_call = robot_call(f"{self.name}.get_frame()")
         self._sending = robot_call(f"{self.name}.send_action()")
         self._measuring = robot_call(f"{self.name}.get_state()")
 
@@ -140,7 +140,7 @@ class Robot:
             BadFrame: it is none, or something was raised that is no error of a robot's.
             OperatorError: what the operator raised.
         """
-        return as_frame(self._ask("get_frame", self._operator.get_frame), self.reading.name)
+        return as_frame(self._ask("get_frame", self._operator.get_frame), self.frame_call.name)
 
     def state(self) -> StateSample | None:
         """The state alone, from an operator that has ``get_state``; else None.

@@ -27,14 +27,14 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.joiners import ChunkJoiner, make_joiner
+from fluxvla_core.control.safety import Latch, SafetySettings
+from fluxvla_core.control.sender import ExecuteActions, check_pose
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.control.joiners import ChunkJoiner, make_joiner
-from fluxvla_core.robot.control.safety import Latch, SafetySettings
-from fluxvla_core.robot.control.sender import ExecuteActions, check_pose
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event, HookObserver
@@ -159,17 +159,24 @@ class BaseInferenceRunner(Runner):
         if self.context.task is not None or self.context.task_file is not None:
             self._task_source()
         if self.policy is None:
-            from fluxvla_core.policies.loading import find_checkpoint, load_policy
+            from fluxvla_core.policies.loading import (
+                find_checkpoint,
+                load_policy,
+                why_not_continued,
+            )
 
             place = find_checkpoint(given.ckpt_path, self.context.work_dir)
             self.context.reporter.info(f"policy: {place}")
+            why = why_not_continued(place) if self._continues_chunks else None
+            if why is not None:
+                raise self.config_error("chunk_joining", f"is {self.chunk_joining!r}, and {why}")
             self.policy = load_policy(
                 place, given.device, given.dataset, given.denormalize_action,
                 given.mixed_precision_dtype, given.execution, given.quantization,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
-        if self._joiner().continues and not self.policy.continues:
+        if self._continues_chunks and not self.policy.continues:
             raise self.config_error(
                 "chunk_joining",
                 f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
@@ -318,7 +325,7 @@ class BaseInferenceRunner(Runner):
                 self.options.ready_timeout, tracking, thread, interrupts, emit,
             )  # fmt: skip
             seen = ObservationHistory(
-                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s
+                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s, emit
             )
             return LocalPolicyClient(
                 robot, reader, seen, self.policy, seed, thread, self.safety, emit
@@ -382,6 +389,11 @@ class BaseInferenceRunner(Runner):
         domain_id = Operator.adapt(self.ros_operator).domain_id
         topic = self.options.task_topic
         return task_source(self.context, self.task_descriptions, topic, domain_id, self.free_tasks)
+
+    @property
+    def _continues_chunks(self) -> bool:
+        """Whether chunks have to continue those before: real-time chunking."""
+        return make_joiner(self.chunk_joining).continues
 
     def _joiner(self) -> ChunkJoiner:
         return make_joiner(*self._joining())

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.policy_client import PolicyFailed
+from fluxvla_core.control.safety import Latch
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.policy_client import PolicyFailed
-from fluxvla_core.robot.control.safety import Latch
 from fluxvla_core.robot.engine import Engine
 from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks

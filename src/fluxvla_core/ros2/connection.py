@@ -24,8 +24,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from fluxvla_core.control import realtime
 from fluxvla_core.errors import ConfigError, Faulted, LoadFailed
-from fluxvla_core.robot.control import realtime
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.streams import Stream
 

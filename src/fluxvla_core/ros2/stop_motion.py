@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.tracking import HOLD_REACH
 from fluxvla_core.errors import Rejected
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.tracking import HOLD_REACH
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import Operator
+from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import NotReady
-from fluxvla_core.robot.control.clock import SimulatedClock
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]

@@ -20,7 +20,7 @@ from fluxvla_core.build import (
     build_tokenizer_from_cfg,
     build_vla_from_cfg,
 )
-from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.errors import ConfigError, RunFailed, located
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.training.options import LoaderOptions, TrainOptions
 from fluxvla_core.training.strategy import Strategy
@@ -175,12 +175,16 @@ class BaseTrainRunner(Strategy):
                 next="model = dict(type='CompactVLA', …); fluxvla plugins list has what there is",
             )
         seed_all(self.options.seed)
-        vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
+        with located(self.context.where("model")):
+            vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self.resume_checkpoint
         init_from = options.init_from or VLA.adapt(vla).pretrained_name_or_path
+        own = options.init_from is None
+        asked = "model.pretrained_name_or_path" if own else f"{self.context.section}.init_from"
         if init_from is None and before is None:
             put_parts(vla, VLA.adapt(vla).part_weights)
-        start_training_from(vla, init_from, before, self.lora is not None, self.world)
+        with located(self.context.where(asked)):
+            start_training_from(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = base_to_note(before, init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))

@@ -33,12 +33,14 @@ from fluxvla_core.config.load import FORMAT
 from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.contract import implements
-from fluxvla_core.contracts.training import VLA
+from fluxvla_core.contracts.training import VLA, Transform
+from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
 from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
+from fluxvla_core.data.preparation import check_statistics, try_preparation
 from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
-from fluxvla_core.errors import CheckpointError, SpecMismatch, UsageError
+from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, UsageError, located
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER
@@ -115,6 +117,10 @@ def _verified(checkpoint: Checkpoint, name: str) -> bytes:
 
 
 _ORIGIN = "import-checkpoint"
+_OTHER_VERSION = (
+    "copy the checkpoint again if it is incomplete; another version of its project needs another "
+    "version of the plugin"
+)
 _PRESENT_ONLY = {"n_obs_steps": 1, "past_actions": 0}
 
 
@@ -158,6 +164,8 @@ def import_checkpoint(
         embodiment=embodiment or found.embodiment,
     )
     _check_robot(found, str(source))
+    check_statistics(found.statistics, str(source))
+    pipeline = _prepared(found, str(source), tokenizer)
     with torch.device("meta"):  # its weights may be larger than memory
         model = build_vla_from_cfg(found.model)
     tensors = _as_model_has_them(model, found, str(source))
@@ -181,7 +189,6 @@ def import_checkpoint(
         writer.write_json(ckpt.POLICY, {"action_rate_hz": rate, "horizon": found.horizon})
         if found.embodiment is not None:
             writer.write_json(ckpt.EMBODIMENT, found.embodiment.to_dict())
-        pipeline = Pipeline(found.transforms)
         writer.write_folder(ckpt.PROCESSORS, pipeline.save_pretrained)
         writer.add_folder(ckpt.PROCESSORS)
         return writer.commit(), found
@@ -200,11 +207,11 @@ def export_foreign(source: str | Path, target: str | Path, format: str) -> Path:
     checkpoint.verify()
     found = _as_foreign(checkpoint)
     kind = str(found.model.get("type")).rpartition(":")[2]
-    known = formats()[0]
+    known, failed = formats()
     able = [f for f in known if f.name == format and implements(f, CheckpointFormat, "write")]
     writers = [f for f in able if kind in f.model_types]
     if not able:
-        raise UsageError(unknown_format(format, known))
+        raise UsageError(unknown_format(format, known, failed))
     if not writers:
         types = ", ".join(sorted({t for f in able for t in f.model_types}))
         raise UsageError(f"format {format!r} holds no {kind}; it holds {types}")
@@ -225,7 +232,7 @@ def export_foreign(source: str | Path, target: str | Path, format: str) -> Path:
 def _as_model_has_them(model: nn.Module, found: ForeignCheckpoint, where: str) -> dict[str, Tensor]:
     """Every tensor of the model, of the sizes that it has; tied ones are one object."""
     wanted = weights_by_name(model)
-    check_names(found.tensors, wanted, "the weights", where)
+    check_names(found.tensors, wanted, "the weights", where, _OTHER_VERSION)
     owner: dict[int, Tensor] = {}
     tensors: dict[str, Tensor] = {}
     for name, own in wanted.items():
@@ -284,6 +291,39 @@ def _config(found: ForeignCheckpoint, model: VLA) -> dict[str, Any]:
     return {"format": FORMAT, "config": tree, "origins": dict.fromkeys(tree, _ORIGIN)}
 
 
+_UNKNOWN_SIZE = (480, 640)
+
+
+def _prepared(found: ForeignCheckpoint, where: str, tokenizer: str | None) -> Pipeline:
+    """Its transforms, which have been tried if the statistics of one robot are known.
+
+    Raises:
+        FluxError: a tokenizer is missing, or they and the statistics do not fit together.
+    """
+    try:
+        pipeline = Pipeline(found.transforms)
+    except ConfigError as error:
+        if tokenizer is None and any("tokenizer" in table for table in found.transforms):
+            error.next = "--tokenizer DIR, the folder of its tokenizer, which it does not bring"
+        error.where = error.where or where
+        raise
+    entries = found.statistics.get("private", {})
+    states, actions = (_width(entries.get(key, {})) for key in ("proprio", "action"))
+    if not found.transforms or states is None or actions is None:
+        return pipeline
+    prepare = PrivateInferenceDataset(found.img_keys, pipeline.transforms, found.statistics)
+    undo = next((t for t in pipeline.transforms if implements(t, Transform, "denormalizer")), None)
+    if undo is None:
+        return pipeline
+    robot = found.embodiment
+    known = {} if robot is None else {c.name: (c.height, c.width) for c in robot.cameras}
+    cameras = {n: known.get(n, _UNKNOWN_SIZE) for n in map(camera_name, found.img_keys)}
+    with located(where):
+        denormalize = undo.denormalizer(found.statistics, "private")
+    try_preparation(prepare, denormalize, cameras, states, (found.horizon, actions), where)
+    return pipeline
+
+
 def _renamed_cameras(keys: Sequence[str], cameras: Mapping[str, str]) -> tuple[str, ...]:
     have = [camera_name(key) for key in keys]
     unknown = [name for name in cameras if name not in have]
@@ -323,6 +363,8 @@ def _check_robot(found: ForeignCheckpoint, where: str) -> None:
                 f"{robot.name} has {joints}",
                 where=where,
                 cause="it was trained for another robot",
+                next="--embodiment FILE with the robot that it was trained for, or none: it can be "
+                "trained on for this one",
             )
 
 

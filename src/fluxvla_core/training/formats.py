@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,10 @@ from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.checkpoints.foreign import HUB, foreign_folder
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
-from fluxvla_core.errors import CheckpointError, PluginError, UsageError, nearest
+from fluxvla_core.errors import CheckpointError, PluginError, UsageError, located, nearest
 from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS
+from fluxvla_core.registries import PREFIX
+from fluxvla_core.untrusted import read_json
 
 
 def read_foreign(
@@ -34,7 +38,7 @@ def read_foreign(
     folder = foreign_folder(source)
     known, failed = formats()
     if format is not None and format not in {f.name for f in known}:
-        raise UsageError(unknown_format(format, known))
+        raise UsageError(unknown_format(format, known, failed))
     asked = [f for f in known if format in (None, f.name)]
     able = [f for f in asked if f.recognizes(folder)]
     if len(able) == 1:
@@ -46,14 +50,7 @@ def read_foreign(
             where=str(folder),
             next="choose one: --format NAME",
         )
-    listed = ", ".join(sorted(f"{f.name} ({', '.join(f.model_types)})" for f in asked))
-    broken = "".join(f"; cannot be loaded: {error.what}" for error in failed)
-    raise CheckpointError(
-        "no installed format recognises the checkpoint",
-        where=str(folder),
-        cause=f"formats that were tried: {listed or 'none'}{broken}",
-        next="install the plugin of its model family; fluxvla plugins list has what is installed",
-    )
+    raise _unrecognized(folder, asked, failed)
 
 
 def _read(
@@ -79,7 +76,8 @@ def _read(
             next="give it another camera's: --camera THEIRS=OURS",
         )
     choices: dict[str, Any] = {"robot": robot, "absent": absent}
-    return chosen.read(folder, tokenizer, **{k: v for k, v in choices.items() if k in able})
+    with located(str(folder)):
+        return chosen.read(folder, tokenizer, **{k: v for k, v in choices.items() if k in able})
 
 
 def is_foreign(place: str | Path) -> bool:
@@ -105,9 +103,66 @@ def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
     return found, failed
 
 
-def unknown_format(name: str, known: list[CheckpointFormat]) -> str:
-    """Says that no format is called ``name``, and what there is."""
+@contextmanager
+def telling_families(table: Any, model: object) -> Iterator[None]:
+    """Let errors about weights say that the checkpoint's ``model`` table is of another class than
+    ``model``, if it is."""
+    try:
+        yield
+    except CheckpointError as error:
+        kind = table.get("type") if isinstance(table, Mapping) else None
+        theirs, ours = str(kind).rpartition(":")[2], type(model).__name__
+        if kind is not None and theirs != ours:
+            error.cause = f"the checkpoint is of {theirs}, the config's model is {ours}"
+            error.next = f"name a checkpoint of {ours}, or let the config's model be {theirs}"
+        raise
+
+
+def unknown_format(
+    name: str, known: Sequence[CheckpointFormat], failed: Sequence[PluginError] = ()
+) -> str:
+    """Says that no format is called ``name``, what there is, and what cannot be loaded."""
     names = sorted({f.name for f in known})
     close = nearest(name, names)
-    meant = f"; did you mean {close!r}?" if close else ""
-    return f"there is no checkpoint format {name!r}{meant} Installed: {', '.join(names) or 'none'}"
+    meant = f"; did you mean {close!r}?" if close else "."
+    return (
+        f"there is no checkpoint format {name!r}{meant} Installed: {', '.join(names) or 'none'}"
+        f"{_broken(failed)}"
+    )
+
+
+def _unrecognized(
+    folder: Path, asked: Sequence[CheckpointFormat], failed: Sequence[PluginError]
+) -> CheckpointError:
+    tried = sorted({f"{f.name} ({', '.join(f.model_types)})" for f in asked})
+    return CheckpointError(
+        f"no installed format recognises the checkpoint: {_stated(folder)}",
+        where=str(folder),
+        cause="it is of another family or of a newer version than the formats that were tried: "
+        f"{', '.join(tried) or 'none'}{_broken(failed)}",
+        next=next((error.next for error in failed if error.next), None)
+        or "install the plugin of its model family; fluxvla plugins list has what is installed",
+    )
+
+
+def _broken(failed: Sequence[PluginError]) -> str:
+    """Why formats cannot be loaded; those of one distribution mostly for one reason."""
+    prefix = f"{PREFIX}{CHECKPOINT_FORMATS.name}:"
+    reasons = (
+        error.what.partition(": ")[2] if error.what.startswith(prefix) else error.what
+        for error in failed
+    )
+    return "".join(f"; cannot be loaded: {reason}" for reason in dict.fromkeys(reasons))
+
+
+def _stated(folder: Path) -> str:
+    """What ``config.json`` in ``folder`` says that it is of."""
+    file = folder / "config.json"
+    if not os.path.lexists(file):
+        return "it has no config.json"
+    try:
+        config = read_json(file, dict[str, Any], CheckpointError)
+    except CheckpointError as error:
+        return f"its config.json cannot be read: {error.what}"
+    kinds = [f"{key} {config[key]!r}" for key in ("type", "model_type") if key in config]
+    return f"its config.json says {' and '.join(kinds) or 'neither type nor model_type'}"

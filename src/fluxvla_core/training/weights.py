@@ -26,7 +26,7 @@ from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, run_on_rank0
-from fluxvla_core.training.formats import is_foreign, read_foreign
+from fluxvla_core.training.formats import is_foreign, read_foreign, telling_families
 from fluxvla_core.training.model import frozen_sources, set_frozen_source
 
 
@@ -286,13 +286,15 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
         CheckpointError: there is nothing there, it is damaged, or it is of another model.
     """
     if is_foreign(place):
-        tensors: Mapping[str, Tensor | Stored] = read_foreign(place).tensors
-        return _put_all(model, tensors, foreign_folder(place).resolve())
+        theirs = read_foreign(place)
+        with telling_families(theirs.model, model):
+            return _put_all(model, theirs.tensors, foreign_folder(place).resolve())
     path = Path(os.path.realpath(place))
     if path.suffix != ".safetensors":
         checkpoint = Checkpoint.open(path)
         checkpoint.verify()
-        load_for_inference(model, checkpoint)
+        with telling_families(checkpoint.config().get("model"), model):
+            load_for_inference(model, checkpoint)
         return checkpoint.path
     if not path.is_file():
         raise CheckpointError(f"there are no weights at {path}")

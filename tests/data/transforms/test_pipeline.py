@@ -259,3 +259,25 @@ def test_a_pretrained_tokenizer_with_marks_makes_the_chat(tmp_path):
     said = tokenizer.decode(out["lang_tokens"][out["lang_masks"]])
     assert said.startswith("system\nYou are a helpful assistant.\nuser\n<image 1>")
     assert said.endswith("<image 3>lift it\nassistant\n")
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "cause"),
+    [
+        ({"type": "ResizeImages", "height": 4, "width": 4}, "images", "img_keys names no camera"),
+        ({"type": "NormalizeStatesAndActions"}, "states", "has no state"),
+    ],
+)
+def test_what_a_sample_lacks_is_told_with_who_needs_it(table, key, cause):
+    stats = {name: {"mean": [0.0], "std": [1.0]} for name in ("proprio", "action")}
+    with pytest.raises(ConfigError, match=f"{table['type']} needs '{key}'; the sample has") as no:
+        Pipeline([table])({"stats": stats, "info": 1})
+    assert cause in no.value.cause
+
+
+def test_a_key_error_of_a_transform_s_own_stays_what_it_is():
+    def lookup(sample):
+        return {}["mine"]
+
+    with pytest.raises(KeyError, match="mine"):
+        Pipeline([lookup])({"images": []})

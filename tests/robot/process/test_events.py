@@ -7,10 +7,10 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 import pytest
 
+from fluxvla_core.control.limits import Clamp
+from fluxvla_core.control.safety import Rule, Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.robot import events
-from fluxvla_core.robot.control.limits import Clamp
-from fluxvla_core.robot.control.safety import Rule, Trip
-from fluxvla_core.robot.control.sender import SentCommand
 from fluxvla_core.robot.events import (
     ChunkAccepted,
     CommandSent,
@@ -22,6 +22,7 @@ from fluxvla_core.robot.events import (
     Observed,
     Phase,
     Refused,
+    Remembered,
     RobotReading,
     Stopped,
     StoppedWhileHeld,
@@ -62,6 +63,7 @@ OWN = [
     EpisodePrepared(0.0, TASK, 7, 50.0),
     EpisodeStarted(0.0, TASK),
     Observed(0.0, READING),
+    Remembered(0.0, READING),
     Refused(0.0, "chunk", {}),
     ChunkAccepted(0.0, READING, POSE[None], {}),
 ]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core.contracts.frame import Frame, RobotFrame
+from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.errors import FluxError, NotReady, Rejected
-from fluxvla_core.robot.control.safety import BadFrame
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
     FrameMessage,

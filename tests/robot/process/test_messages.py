@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from fluxvla_core import errors
+from fluxvla_core.control import policy_client, safety
+from fluxvla_core.control.safety import RuleStop, rule_of
 from fluxvla_core.errors import Faulted, FluxError, RunFailed
-from fluxvla_core.robot.control import policy_client, safety
-from fluxvla_core.robot.control.safety import RuleStop, rule_of
 from fluxvla_core.robot.process.messages import (
     Kind,
     Message,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.robot.control.clock import SimulatedClock
-from fluxvla_core.robot.control.filters import LowPass, SnapGripper, WorkspaceBox
-from fluxvla_core.robot.control.limits import CommandLimiter
-from fluxvla_core.robot.control.safety import BadCommand, FilterLate, Latch, rule_of
-from fluxvla_core.robot.control.sender import CommandSender
+from fluxvla_core.control.clock import SimulatedClock
+from fluxvla_core.control.filters import LowPass, SnapGripper, WorkspaceBox
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.safety import BadCommand, FilterLate, Latch, rule_of
+from fluxvla_core.control.sender import CommandSender
 from fluxvla_core.robot.process.timed_filters import (
     MOST_LATE,
     RESET_S,

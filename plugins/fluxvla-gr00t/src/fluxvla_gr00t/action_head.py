@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from fluxvla_models.guidance import Guide
+from fluxvla_models.widths import check_actions, check_states
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -135,6 +136,7 @@ class GR00TActionHead(nn.Module):
 
     def encode_states(self, states: Tensor, ids: Tensor) -> Tensor:
         """``(B, S)`` and ``ids`` ``(B,)`` -> tokens ``(B, 1, W)``."""
+        check_states("GR00TActionHead", "state_dim", states, self.state_dim)
         tokens = self.state_encoder(states[:, None], ids)
         if self.training and self.state_dropout > 0:
             keep = torch.rand(len(tokens), 1, 1, device=tokens.device) >= self.state_dropout
@@ -182,6 +184,7 @@ class GR00TActionHead(nn.Module):
             states: ``(B, S)``; ids: ``(B,)`` int64; actions: ``(B, T, D)`` normalised.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1.
         """
+        check_actions("GR00TActionHead", actions, (self.horizon, self.action_dim))
         repeats = noise.shape[1]
         encoded = self.encode_context(context).repeat_interleave(repeats)
         state = self.encode_states(states, ids).repeat_interleave(repeats, 0)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.errors import CheckpointError, FluxError
-from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
+from fluxvla_core.models import (
+    CheckpointFormat,
+    ForeignCheckpoint,
+    check_settings,
+    safetensors_in,
+)
 from fluxvla_core.results import read_json
 from fluxvla_gr00t.robots import fewer_cameras, n15_robot, n17_robot
 from fluxvla_gr00t.tables import (
@@ -32,7 +37,83 @@ _FIXED_DIT = {
     "norm_type": "ada_norm",
     "positional_embeddings": None,
     "interleave_self_attention": True,
+    "activation_fn": "gelu-approximate",
+    "attention_bias": True,
+    "norm_eps": 1e-5,
 }
+_DIT = (
+    *_FIXED_DIT,
+    "num_layers",
+    "num_attention_heads",
+    "attention_head_dim",
+    "output_dim",
+    "cross_attention_dim",
+    "dropout",
+    "final_dropout",
+    "num_embeds_ada_norm",
+    "max_num_positional_embeddings",
+    "compute_dtype",
+)
+_TRAINING = ("tune_", "noise_", "load_", "use_flash_attention", "model_dtype", "compute_dtype")
+"""How names of settings begin that say how it is trained, or in which dtype."""
+_HEAD = (
+    *_FIXED,
+    "diffusion_model_cfg",
+    "vl_self_attention_cfg",
+    "hidden_size",
+    "input_embedding_dim",
+    "backbone_embedding_dim",
+    "action_horizon",
+    "action_dim",
+    "max_action_dim",
+    "max_state_dim",
+    "max_num_embodiments",
+    "max_seq_len",
+    "num_inference_timesteps",
+    "num_target_vision_tokens",
+    "detection_coeff",
+)
+_SAVED = (
+    "model_type",
+    "architectures",
+    "auto_map",
+    "attn_implementation",
+    "dtype",
+    "torch_dtype",
+    "transformers_version",
+)
+"""What transformers writes into any model's config."""
+_N15 = (*_SAVED, "action_dim", "action_head_cfg", "action_horizon", "backbone_cfg", "hidden_size")
+_N15_BACKBONE = ("eagle_path", "project_to_dim", "select_layer")
+_N17 = (
+    *_SAVED,
+    *_HEAD,
+    "model_name",
+    "model_revision",
+    "backbone_model_type",
+    "backbone_trainable_params_fp32",
+    "select_layer",
+    "image_crop_size",
+    "image_target_size",
+    "shortest_image_edge",
+    "crop_fraction",
+    "letter_box_transform",
+    "random_rotation_angle",
+    "color_jitter_params",
+    "extra_augmentation_config",
+    "use_albumentations",
+    "use_albumentations_transforms",
+    "formalize_language",
+    "use_percentiles",
+    "use_relative_action",
+    "use_mean_std",
+    "clip_outliers",
+    "attn_dropout",
+    "use_alternate_vl_dit",
+    "attend_text_every_n_blocks",
+    "state_dropout_prob",
+    "rtc_config",
+)
 
 
 class GR00TN15Format(CheckpointFormat):
@@ -68,6 +149,9 @@ class GR00TN15Format(CheckpointFormat):
         chosen = fewer_cameras(n15_robot(folder, robot), absent, str(folder))
         settings = _Settings(config.get("action_head_cfg"), str(file))
         backbone = _Settings(config.get("backbone_cfg"), str(file))
+        _Settings(config, str(file)).check(_N15)
+        settings.check(_HEAD)
+        backbone.check(_N15_BACKBONE)
         if backbone.get("project_to_dim") is not None:
             raise CheckpointError(
                 f"backbone_cfg.project_to_dim is {backbone.get('project_to_dim')}, None is known",
@@ -114,6 +198,7 @@ class GR00TN17Format(CheckpointFormat):
         """
         file = folder / "config.json"
         settings = _Settings(read_json(file, dict[str, Any], CheckpointError), str(file))
+        settings.check(_N17)
         processing = folder / "processor_config.json"
         kwargs: Mapping[str, Any] = {"modality_configs": {}}
         if processing.is_file():
@@ -166,6 +251,11 @@ class _Settings:
     def table(self, name: str) -> _Settings:
         return _Settings(self.values.get(name), self.where)
 
+    def check(self, known: Collection[str]) -> None:
+        """Refuse settings that are neither ``known`` nor of training alone."""
+        rest = {n: value for n, value in self.values.items() if not n.startswith(_TRAINING)}
+        check_settings(rest, known, self.where)
+
     def require(self, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
             found = self.values.get(name, value)
@@ -181,6 +271,8 @@ def _head(settings: _Settings) -> dict[str, Any]:
     """Settings of the head that both versions name alike."""
     dit, context = settings.table("diffusion_model_cfg"), settings.table("vl_self_attention_cfg")
     settings.require(_FIXED)
+    dit.check(_DIT)
+    context.check(_DIT)
     dit.require({**_FIXED_DIT, "output_dim": settings.count("hidden_size")})
     context.require({"positional_embeddings": None, "dropout": dit.get("dropout")})
     return {

@@ -16,6 +16,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     Step,
+    check_policy_settings,
     policy_type,
     read_steps,
     whole,
@@ -64,6 +65,49 @@ HEADS: dict[str, dict[str, Any]] = {
         "state_dropout": 0.2,
     },
 }
+_SETTINGS = (
+    "max_state_dim",
+    "max_action_dim",
+    "image_size",
+    "base_model_path",
+    "tokenizer_assets_repo",
+    "embodiment_tag",
+    "model_version",
+    "action_decode_transform",
+    "num_inference_timesteps",
+    "rtc_ramp_rate",
+    "rtc_config",
+    "use_relative_actions",
+    "relative_exclude_joints",
+    "action_feature_names",
+    "color_jitter_params",
+    "tune_llm",
+    "tune_visual",
+    "tune_projector",
+    "tune_diffusion_model",
+    "tune_vlln",
+    "tune_top_llm_layers",
+    "lora_rank",
+    "lora_alpha",
+    "lora_dropout",
+    "lora_full_model",
+    "warmup_ratio",
+    "use_bf16",
+    "use_flash_attention",
+    "model_params_fp32",
+    "video_backend",
+    "balance_dataset_weights",
+    "balance_trajectory_weights",
+    "dataset_paths",
+    "output_dir",
+    "save_steps",
+    "max_steps",
+    "batch_size",
+    "dataloader_num_workers",
+    "report_to",
+    "resume",
+)
+"""Its own names of settings in LeRobot's config of GR00T."""
 _PREFIX = "_groot_model."
 _IMAGES = "observation.images."
 _PRE = f"{PREPROCESSOR}.json"
@@ -93,6 +137,7 @@ class LeRobotGR00TFormat(CheckpointFormat):
             UsageError: it has no such camera.
         """
         config = read_json(folder / "config.json", dict[str, Any], CheckpointError)
+        check_policy_settings(config, _SETTINGS, str(folder / "config.json"))
         steps, packing, version = _preprocessor(folder)
         pack = packing.config
         chosen = fewer_cameras(_robot(folder, steps, packing, config), absent, str(folder))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fluxvla_models.lerobot_files import check_both
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import chosen_robot, without_cameras
@@ -94,7 +95,7 @@ def n15_robot(folder: Path, wanted: str | None = None) -> Robot:
         tag=tag,
         embodiment_id=_number(N15_EMBODIMENTS, tag, where),
         img_keys=tuple(cameras),
-        statistics={key: _widened(entry, ("min", "max")) for key, entry in entries.items()},
+        statistics={k: _widened(k, entry, ("min", "max"), where) for k, entry in entries.items()},
         rate=rates.pop() or None if len(rates) == 1 else None,
         notes=(
             "its groups of joints are in the order of metadata.json; a data config of NVIDIA's "
@@ -181,8 +182,9 @@ def grouped_robot(
             )
             return replace(robot, notes=(refusal,))
         entries["action"]["relative"] = flags
-    used = {"quantile": ("q01", "q99"), "min_max": ("min", "max")}.get(robot.norm_type, ())
-    widened = {key: _widened(entry, used) if used else entry for key, entry in entries.items()}
+    used = {"quantile": ("q01", "q99"), "min_max": ("min", "max")}.get(robot.norm_type)
+    needed = used or ("mean", "std")
+    widened = {key: _widened(key, entry, needed, where) for key, entry in entries.items()}
     return replace(robot, statistics=widened)
 
 
@@ -201,13 +203,14 @@ def flat_robot(tag: str, number: int, values: Mapping[str, Any], where: str) -> 
         if feature in tables:
             tables[feature][statistic] = numbers
     robot = Robot(tag=tag, embodiment_id=number)
-    if not all(tables.values()):
+    if not any(tables.values()):
         return replace(robot, notes=(_NO_STATISTICS,))
+    check_both(tables, where)
     entries = {
         "proprio": _joined([_group(tables, "observation.state", where)], where),
         "action": _joined([_group(tables, "action", where)], where),
     }
-    widened = {key: _widened(entry, ("min", "max")) for key, entry in entries.items()}
+    widened = {k: _widened(k, entry, ("min", "max"), where) for k, entry in entries.items()}
     return replace(robot, statistics=widened)
 
 
@@ -382,8 +385,22 @@ def _joined(groups: Sequence[Mapping[str, Any]], where: str) -> Entry:
     return joined
 
 
-def _widened(entry: Entry, names: Sequence[str]) -> Entry:
-    """A range of 0 becomes one of 2 around its value, so that it normalises to 0 and goes back."""
+def _widened(key: str, entry: Entry, names: tuple[str, str], where: str) -> Entry:
+    """A range of 0 becomes one of 2 around its value, so that it normalises to 0 and goes back.
+
+    Raises:
+        CheckpointError: one of the statistics ``names`` is not there.
+    """
+    missing = [name for name in names if name not in entry]
+    if missing:
+        raise CheckpointError(
+            f"the statistics of {key!r} are needed for {' and '.join(names)}, and not all groups "
+            f"have {missing[0]!r}; they have {', '.join(entry) or 'nothing'}",
+            where=where,
+            cause="they were computed by another version, or the file was changed",
+        )
+    if names == ("mean", "std"):
+        return entry
     low, high = (np.asarray(entry[name]) for name in names)
     still = low == high
     return {

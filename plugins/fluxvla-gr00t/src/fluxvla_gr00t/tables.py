@@ -141,6 +141,15 @@ def checkpoint(
         notes.append(
             f"of the {horizon} actions of a chunk {robot.horizon} were trained: execute no more"
         )
+    for key, dim in (("proprio", "state_dim"), ("action", "action_dim")):
+        width = _width(robot.statistics[key]["mean"]) if key in robot.statistics else 0
+        if width > int(model["vla_head"][dim]):
+            raise CheckpointError(
+                f"the statistics of {key!r} have {width} dimensions, {dim} of the model is "
+                f"{model['vla_head'][dim]}",
+                where=where,
+                cause="the statistics are of another robot or model",
+            )
     statistics = {key: _padded(entry, horizon) for key, entry in robot.statistics.items()}
     with torch.device("meta"):
         own = build_vla_from_cfg(model).state_dict()

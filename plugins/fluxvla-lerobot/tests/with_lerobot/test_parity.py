@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from fluxvla_lerobot.policy import LeRobotPolicy
 
 from fluxvla_core import EmbodimentSpec
 from fluxvla_core.cli.main import main
+from fluxvla_core.contracts.policy import with_history
 from fluxvla_core.models import load_policy
 
 from .tiny import CAMERAS, ROBOT, observation, save
@@ -80,6 +82,34 @@ def test_diffusion(tmp_path, monkeypatch):
         theirs.reset(0)
         expected, found = theirs.predict_action(seen), ours.predict_action(seen)
         assert np.abs(found[: len(expected)] - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("n_obs_steps", [2, 3])
+def test_a_rollout_of_a_diffusion_policy_of_several_observations(
+    tmp_path, monkeypatch, n_obs_steps
+):
+    """LeRobot keeps its last observations itself; ours is given them with each question."""
+    settings = {"n_obs_steps": n_obs_steps, "n_action_steps": 4}
+    folder = save(tmp_path / "theirs", "diffusion", CAMERAS[:1], **settings)
+    robot = replace(ROBOT, cameras=ROBOT.cameras[:1])
+    theirs = LeRobotPolicy(str(folder), embodiment=robot.to_dict(), rate_hz=10.0)
+    ours = imported(folder, robot)
+    assert (ours.n_obs_steps, ours.horizon, theirs.horizon) == (n_obs_steps, 9 - n_obs_steps, 1)
+    noise = torch.from_numpy(ours_noise(ours.model.action_shape))
+    monkeypatch.setattr(ours, "_noise", lambda seed, call: noise.numpy())
+    monkeypatch.setattr(torch, "randn", lambda *_, **__: noise.clone())
+    seen = [observation(number, CAMERAS[:1]) for number in range(11)]
+    theirs.reset(0)
+    ours.reset(0)
+    expected = np.concatenate([theirs.predict_action(each) for each in seen])
+
+    found = []
+    for step in range(0, 11, 4):
+        asked = with_history(seen[step], n_obs_steps, seen[:step])
+        found.append(ours.predict_action(asked)[:4])
+    commands = np.concatenate(found)[:11]
+    assert np.abs(commands - expected).max() < 1e-5 * np.abs(expected).max()
+    assert np.abs(found[0] - found[1]).max() > 1e-3  # they look at what they are shown
 
 
 def ours_noise(shape):

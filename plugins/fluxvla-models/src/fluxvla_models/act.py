@@ -16,6 +16,7 @@ from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA, PartWeights
 from fluxvla_models.resnet import ResNet, published
 from fluxvla_models.transformer import Decoder, Encoder, positions_1d, positions_2d
+from fluxvla_models.widths import check_states
 
 
 class ACT(VLA, nn.Module):
@@ -75,6 +76,7 @@ class ACT(VLA, nn.Module):
                 f"ACT: dim_model {dim_model} must be a multiple of n_heads {n_heads} and of 4, "
                 "for the sines and cosines of rows and columns"
             )
+        self.state_dim = state_dim
         self.horizon, self.action_dim, self.num_cameras = horizon, action_dim, num_cameras
         self.use_vae, self.latent_dim = use_vae, latent_dim
         self.kl_weight, self.masked_mean = kl_weight, masked_mean
@@ -172,6 +174,7 @@ class ACT(VLA, nn.Module):
         self, states: Tensor, actions: Tensor, inside: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """A sample of the latent ``(B, L)`` and its divergence from the prior ``(B,)``."""
+        check_states("ACT", "state_dim", states, self.state_dim)
         batch = len(states)
         if noise is None or noise.shape != (batch, self.latent_dim):
             got = "none" if noise is None else f"one of shape {tuple(noise.shape)}"
@@ -197,6 +200,7 @@ class ACT(VLA, nn.Module):
 
     def _decode(self, images: Tensor, states: Tensor, latent: Tensor) -> Tensor:
         """The chunk ``(B, T, D)``."""
+        check_states("ACT", "state_dim", states, self.state_dim)
         batch, planes = images.shape[:2]
         if planes != 3 * self.num_cameras:
             raise ConfigError(

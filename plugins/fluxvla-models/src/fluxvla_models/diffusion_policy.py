@@ -19,6 +19,7 @@ from fluxvla_models.conditional_unet import ConditionalUNet
 from fluxvla_models.diffusion_schedule import DiffusionSchedule
 from fluxvla_models.keypoint_encoder import KeypointEncoder
 from fluxvla_models.resnet import published
+from fluxvla_models.widths import check_states
 
 
 class DiffusionPolicy(VLA, nn.Module):
@@ -121,6 +122,7 @@ class DiffusionPolicy(VLA, nn.Module):
         if backbone_weights is not None:
             inside = [f"rgb_encoders.{i}.backbone." for i in range(len(self.rgb_encoders))]
             self.part_weights = (published(backbone_weights, inside, backbone_norm),)
+        self.state_dim = state_dim
         seen = state_dim + 2 * keypoints * num_cameras
         self.unet = ConditionalUNet(
             action_dim,
@@ -263,6 +265,7 @@ class DiffusionPolicy(VLA, nn.Module):
                 f"DiffusionPolicy: n_obs_steps is {steps}, states are {tuple(states.shape)}",
                 next="the dataset's n_obs_steps is the model's",
             )
+        check_states("DiffusionPolicy", "state_dim", states, self.state_dim)
         batch, _, planes = images.shape[:3]
         if planes != 3 * self.num_cameras:
             raise ConfigError(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from fluxvla_models.widths import check_states
+
 
 class FiLMProjector(nn.Module):
     """Visual features scaled and shifted by the instruction, joined with state and instruction.
@@ -26,7 +28,7 @@ class FiLMProjector(nn.Module):
         super().__init__()
         if vision_dim is None or text_dim is None or state_dim is None:
             raise ValueError("FiLMProjector needs vision_dim, text_dim and state_dim")
-        self.out_dim = width
+        self.out_dim, self.state_dim = width, state_dim
         self.vision = nn.Sequential(nn.LayerNorm(vision_dim), nn.Linear(vision_dim, width))
         self.state = nn.Sequential(nn.Linear(state_dim, width), nn.GELU(), nn.Linear(width, width))
         self.text = nn.Linear(text_dim, width)
@@ -40,6 +42,7 @@ class FiLMProjector(nn.Module):
 
     def forward(self, vision: Tensor, text: Tensor, states: Tensor) -> Tensor:
         """``(B, vision_dim)``, ``(B, text_dim)``, ``(B, state_dim)`` -> ``(B, width)``."""
+        check_states("FiLMProjector", "state_dim", states, self.state_dim)
         scale, shift = self.film(text).chunk(2, dim=-1)
         seen = self.vision(vision) * (1 + scale) + shift
         return self.mix(torch.cat([seen, self.state(states), self.text(text)], dim=-1))

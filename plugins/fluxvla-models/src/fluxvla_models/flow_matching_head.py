@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fluxvla_models.guidance import Guide
+from fluxvla_models.widths import check_actions
 
 
 class FlowBlock(nn.Module):
@@ -100,6 +101,7 @@ class FlowMatchingHead(nn.Module):
             masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)`` standard normal; ``time``: ``(B, K)`` in 0..1.
         """
+        check_actions("FlowMatchingHead", actions, (self.horizon, self.action_dim))
         repeats = noise.shape[1]
         clean = actions[:, None].expand(-1, repeats, -1, -1)
         mixed = torch.lerp(noise, clean, time[..., None, None])

@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_core.models import Stored, check_settings, safetensors_in
 from fluxvla_core.results import read_json
 
 CONFIG = "config.json"
@@ -29,6 +29,64 @@ BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 EPS = 1e-8
 """What LeRobot adds to a standard deviation, and puts in place of a range of 0."""
 _SUFFIX = ".safetensors"
+
+
+_OF_EVERY_POLICY = {
+    "type",
+    "n_obs_steps",
+    "input_features",
+    "output_features",
+    "normalization_mapping",
+    "device",
+    "use_amp",
+    "use_peft",
+    "push_to_hub",
+    "repo_id",
+    "private",
+    "tags",
+    "license",
+    "pretrained_path",
+    "pretrained_revision",
+    "chunk_size",
+    "n_action_steps",
+    "gradient_checkpointing",
+    "compile_model",
+    "compile_mode",
+}
+"""Settings that LeRobot's policies share; those that say how they are trained have a prefix."""
+_TRAINING = ("optimizer_", "scheduler_", "freeze_", "train_", "time_sampling_")
+
+
+def check_policy_settings(config: Mapping[str, Any], known: Collection[str], where: str) -> None:
+    """Refuse settings of a policy's ``config.json`` that are not known; see ``check_settings``.
+
+    Args:
+        known: those of this kind of policy, besides the ones of every policy and of training.
+    """
+    settings = {name: v for name, v in config.items() if not name.startswith(_TRAINING)}
+    check_settings(settings, {*_OF_EVERY_POLICY, *known}, where)
+
+
+def check_both(statistics: Mapping[str, Any], where: str | None = None) -> None:
+    """Refuse statistics of the state without those of the action, or the reverse.
+
+    A base model has neither and is trained on; one that has half of them was copied in part.
+
+    Args:
+        statistics: feature -> its statistics; empty where it has none.
+
+    Raises:
+        CheckpointError: names the feature without statistics, and what there is.
+    """
+    have = [feature for feature, rows in statistics.items() if rows]
+    lacks = [feature for feature, rows in statistics.items() if not rows]
+    if have and lacks:
+        raise CheckpointError(
+            f"there are statistics of {', '.join(have)}, and none of {', '.join(lacks)}",
+            where=where,
+            cause="they were copied in part, or are of another dataset",
+            next="copy the folder again with all of its files",
+        )
 
 
 @dataclass(frozen=True)

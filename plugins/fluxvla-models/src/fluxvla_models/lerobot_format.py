@@ -10,10 +10,49 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, renamed, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    CONFIG,
+    STATE,
+    check_policy_settings,
+    policy_type,
+)
 from fluxvla_models.lerobot_names import act_name, diffusion_name
 from fluxvla_models.lerobot_statistics import read_normalization, tables
 from fluxvla_models.lerobot_write import write_act, write_diffusion
+
+_ACT = (
+    "feedforward_activation",
+    "pre_norm",
+    "n_encoder_layers",
+    "n_decoder_layers",
+    "use_vae",
+    "latent_dim",
+    "n_vae_encoder_layers",
+    "dim_model",
+    "n_heads",
+    "dim_feedforward",
+    "dropout",
+    "kl_weight",
+)
+_DIFFUSION = (
+    "horizon",
+    "n_obs_steps",
+    "crop_shape",
+    "down_dims",
+    "kernel_size",
+    "n_groups",
+    "diffusion_step_embed_dim",
+    "use_film_scale_modulation",
+    "noise_scheduler_type",
+    "num_train_timesteps",
+    "num_inference_steps",
+    "beta_schedule",
+    "beta_start",
+    "beta_end",
+    "prediction_type",
+)
+"""Settings that LeRobot and our models call the same."""
 
 
 class _LeRobotFormat(CheckpointFormat):
@@ -22,6 +61,8 @@ class _LeRobotFormat(CheckpointFormat):
     name = "lerobot"
     kind: ClassVar[str]
     our_name: ClassVar[Callable[[str], str | None]]
+    settings: ClassVar[Sequence[str]]
+    """Its own names of settings in LeRobot's config."""
 
     @abstractmethod
     def model(self, config: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -46,6 +87,7 @@ class _LeRobotFormat(CheckpointFormat):
     def read(self, folder: Path, tokenizer: str | None = None) -> ForeignCheckpoint:
         where = str(folder / CONFIG)
         config = read_json(folder / CONFIG, dict[str, Any], CheckpointError)
+        check_policy_settings(config, self.settings, where)
         cameras, size = image_features(config, where)
         joints, dim = width(config, "input_features", STATE, where), action_dim(config, where)
         model = self.model(config, where)
@@ -71,6 +113,13 @@ class LeRobotACT(_LeRobotFormat):
 
     kind = "act"
     model_types = ("ACT",)
+    settings = (
+        *_ACT,
+        "vision_backbone",
+        "pretrained_backbone_weights",
+        "replace_final_stride_with_dilation",
+        "temporal_ensemble_coeff",
+    )
     our_name = staticmethod(act_name)
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
@@ -95,24 +144,10 @@ class LeRobotACT(_LeRobotFormat):
 
     def model(self, config: Mapping[str, Any], where: str) -> dict[str, Any]:
         _refuse(config, where, n_obs_steps=1, replace_final_stride_with_dilation=0)
-        same = (
-            "feedforward_activation",
-            "pre_norm",
-            "n_encoder_layers",
-            "n_decoder_layers",
-            "use_vae",
-            "latent_dim",
-            "n_vae_encoder_layers",
-            "dim_model",
-            "n_heads",
-            "dim_feedforward",
-            "dropout",
-            "kl_weight",
-        )
         return {
             "type": "ACT",
             **_common(config, where),
-            **_taken(config, same, where),
+            **_taken(config, _ACT, where),
             "horizon": _value(config, "chunk_size", where),
             "backbone_norm": "frozen_batch",
             "masked_mean": True,
@@ -124,6 +159,21 @@ class LeRobotDiffusion(_LeRobotFormat):
 
     kind = "diffusion"
     model_types = ("DiffusionPolicy",)
+    settings = (
+        *_DIFFUSION,
+        "drop_n_last_frames",
+        "vision_backbone",
+        "pretrained_backbone_weights",
+        "resize_shape",
+        "crop_ratio",
+        "crop_is_random",
+        "use_group_norm",
+        "spatial_softmax_num_keypoints",
+        "use_separate_rgb_encoder_per_camera",
+        "clip_sample",
+        "clip_sample_range",
+        "do_mask_loss_for_padding",
+    )
     our_name = staticmethod(diffusion_name)
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
@@ -138,23 +188,6 @@ class LeRobotDiffusion(_LeRobotFormat):
         return _count(config, "horizon")
 
     def model(self, config: Mapping[str, Any], where: str) -> dict[str, Any]:
-        same = (
-            "horizon",
-            "n_obs_steps",
-            "crop_shape",
-            "down_dims",
-            "kernel_size",
-            "n_groups",
-            "diffusion_step_embed_dim",
-            "use_film_scale_modulation",
-            "noise_scheduler_type",
-            "num_train_timesteps",
-            "num_inference_steps",
-            "beta_schedule",
-            "beta_start",
-            "beta_end",
-            "prediction_type",
-        )
         steps, horizon = _value(config, "n_obs_steps", where), self.horizon(config)
         if not isinstance(steps, int) or not 1 <= steps <= horizon:
             raise CheckpointError(
@@ -164,7 +197,7 @@ class LeRobotDiffusion(_LeRobotFormat):
         return {
             "type": "DiffusionPolicy",
             **_common(config, where),
-            **_taken(config, same, where),
+            **_taken(config, _DIFFUSION, where),
             "resize_shape": config.get("resize_shape"),
             "backbone_norm": "group" if _value(config, "use_group_norm", where) else "batch",
             "separate_encoders": _value(config, "use_separate_rgb_encoder_per_camera", where),

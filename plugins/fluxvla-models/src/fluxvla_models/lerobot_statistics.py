@@ -25,6 +25,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
+    check_both,
     read_steps,
     whole,
 )
@@ -160,6 +161,9 @@ def tables(
         cameras: the images' features, in the order of the model; size: their height and width.
         joints, dim: widths of state and action.
     """
+    used = {STATE: "STATE", ACTION: "ACTION"}
+    normalized = [f for f, kind in used.items() if normalization.modes.get(kind) != "IDENTITY"]
+    check_both({f: normalization.statistics.get(f) for f in normalized})
     scales = [normalization.affine(name, "VISUAL", 3) for name in cameras]
     proprio, state_norm = normalization.entry(STATE, "STATE", joints)
     action, action_norm = normalization.entry(ACTION, "ACTION", dim)

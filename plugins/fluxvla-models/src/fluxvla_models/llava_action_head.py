@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_models.transformer import Decoder
+from fluxvla_models.widths import check_states
 
 
 class LlavaActionHead(nn.Module):
@@ -34,7 +35,7 @@ class LlavaActionHead(nn.Module):
         super().__init__()
         if context_dim is None:
             raise ConfigError("LlavaActionHead needs context_dim, the hidden states' width")
-        self.horizon, self.action_dim = horizon, action_dim
+        self.horizon, self.action_dim, self.state_dim = horizon, action_dim, state_dim
         self.queries = nn.Embedding(horizon, width)
         self.state_in = nn.Linear(state_dim, width)
         self.context_in = nn.Sequential(nn.LayerNorm(context_dim), nn.Linear(context_dim, width))
@@ -45,6 +46,7 @@ class LlavaActionHead(nn.Module):
 
     def predict(self, hidden: Tensor, masks: Tensor, states: Tensor) -> Tensor:
         """``(B, L, C)``, ``(B, L)`` bool and ``(B, S)`` -> actions ``(B, T, D)``."""
+        check_states("LlavaActionHead", "state_dim", states, self.state_dim)
         memory = torch.cat([self.state_in(states)[:, None], self.context_in(hidden)], dim=1)
         ignored = torch.cat([masks.new_zeros(len(masks), 1), ~masks], dim=1)
         queries = self.queries.weight[None].expand(len(hidden), -1, -1)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import CheckpointError
+from fluxvla_core.models import check_settings
 from fluxvla_core.results import read_json
 
 SIDECAR = "fluxvla_openvla.json"
@@ -37,6 +38,56 @@ _KEYS = (
     "bounds",
     "gripper",
     "model",
+)
+
+
+_SAVED = ("architectures", "auto_map", "dtype", "torch_dtype", "transformers_version", "use_cache")
+"""What transformers writes into any model's config."""
+_SETTINGS = (
+    *_SAVED,
+    "model_type",
+    "vision_backbone_id",
+    "llm_backbone_id",
+    "arch_specifier",
+    "use_fused_vision_backbone",
+    "timm_model_ids",
+    "timm_override_act_layers",
+    "image_sizes",
+    "image_resize_strategy",
+    "hf_llm_id",
+    "llm_max_length",
+    "pad_token_id",
+    "pad_to_multiple_of",
+    "text_config",
+    "output_projector_states",
+    "norm_stats",
+    "n_action_bins",
+)
+_LANGUAGE = (
+    "hidden_size",
+    "intermediate_size",
+    "num_hidden_layers",
+    "num_attention_heads",
+    "num_key_value_heads",
+    "vocab_size",
+    "rms_norm_eps",
+    "rope_theta",
+    "max_position_embeddings",
+)
+"""Settings of the language model that are read, and below those that change no number here."""
+_LANGUAGE_UNREAD = (
+    *_SAVED,
+    "model_type",
+    "head_dim",
+    "hidden_act",
+    "initializer_range",
+    "pretraining_tp",
+    "rope_parameters",
+    "attention_dropout",
+    "pad_token_id",
+    "bos_token_id",
+    "eos_token_id",
+    "return_dict",
 )
 
 
@@ -159,18 +210,8 @@ def language_table(config: Mapping[str, Any], native: bool) -> dict[str, Any]:
         # Llama 2's own config.json, which that code loads, has another epsilon.
         return {"rms_norm_eps": 1e-5}
     text = config.get("text_config")
-    known = (
-        "hidden_size",
-        "intermediate_size",
-        "num_hidden_layers",
-        "num_attention_heads",
-        "num_key_value_heads",
-        "vocab_size",
-        "rms_norm_eps",
-        "rope_theta",
-        "max_position_embeddings",
-    )
-    table = {key: text[key] for key in known if key in text} if isinstance(text, Mapping) else {}
+    given = text if isinstance(text, Mapping) else {}
+    table = {key: given[key] for key in _LANGUAGE if key in given}
     padding = config.get("pad_to_multiple_of", 64)
     table["text_vocab_size"] = table.get("vocab_size", 32064) - padding
     return table
@@ -182,6 +223,17 @@ def check_config(config: Mapping[str, Any], folder: Path) -> None:
     Raises:
         CheckpointError: with what the config says.
     """
+    where = str(folder / "config.json")
+    if not is_native(folder, config):
+        check_settings(config, _SETTINGS, where)
+        text = config.get("text_config")
+        if isinstance(text, Mapping):
+            check_settings(text, (*_LANGUAGE, *_LANGUAGE_UNREAD), f"{where}: text_config")
+            if text.get("hidden_act", "silu") != "silu":
+                raise CheckpointError(
+                    f"text_config.hidden_act is {text['hidden_act']!r}; only 'silu' is built here",
+                    where=where,
+                )
     for key, built in (
         ("vision_backbone_id", BACKBONE),
         ("image_resize_strategy", "resize-naive"),
@@ -191,7 +243,7 @@ def check_config(config: Mapping[str, Any], folder: Path) -> None:
         if found != built:
             raise CheckpointError(
                 f"{key} is {found!r}; only {built!r} is built here",
-                where=str(folder / "config.json"),
+                where=where,
             )
 
 

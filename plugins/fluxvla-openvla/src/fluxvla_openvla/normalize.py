@@ -7,6 +7,7 @@ data are 0. Source: ``normalize_action_and_proprio`` of openvla-oft.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -150,11 +151,12 @@ class Row:
         """
         entry = stats.get(key) if isinstance(stats, Mapping) else None
         names = (*BOUNDS[bounds], *BOUNDS["min_max"])
-        if not isinstance(entry, Mapping) or any(name not in entry for name in names):
-            have = ", ".join(sorted(entry)) if isinstance(entry, Mapping) else "nothing"
+        table = entry if isinstance(entry, Mapping) else {}
+        lacks = [name for name in dict.fromkeys(names) if name not in table]
+        if lacks:
             raise ConfigError(
-                f"the statistics of {key!r} lack {', '.join(dict.fromkeys(names))}; they have "
-                f"{have}"
+                f"the statistics of {key!r} lack {', '.join(lacks)}; they have "
+                f"{', '.join(sorted(table)) or 'nothing'}"
             )
         if entry.get("relative") is not None:
             raise ConfigError(
@@ -162,12 +164,16 @@ class Row:
                 "NormalizeOpenVLA does not",
                 next="train without relative_actions",
             )
-        low, high, least, most = (np.asarray(entry[name], np.float64) for name in names)
+        low, high, least, most = (_finite(entry[name], name, key) for name in names)
         chosen = mask if mask is not None else entry.get("mask", np.ones(low.shape, bool))
         used = np.asarray(chosen, bool)
-        if low.ndim != 1 or not low.shape == high.shape == used.shape == least.shape == most.shape:
+        rows = dict(zip(names, (low, high, least, most), strict=True))
+        sizes = {**{name: row.shape for name, row in rows.items()}, "mask": used.shape}
+        if low.ndim != 1 or len(set(sizes.values())) > 1:
+            told = ", ".join(f"{math.prod(n)} in {name!r}" for name, n in sizes.items())
             raise ConfigError(
-                f"the statistics of {key!r} have {low.size} dimensions, the mask {used.size}"
+                f"the statistics of {key!r} are not rows of one length: {told}",
+                cause="the statistics or the mask belong to another robot",
             )
         return cls(low, high, used, least == most)
 
@@ -217,6 +223,23 @@ class SampleDiffusionSteps(RandomTransform):
         """The sample with normal noise and a step 0, 1, … drawn evenly."""
         noise = rng.standard_normal((1, *np.shape(sample["actions"])), dtype=np.float32)
         return {**sample, "noise": noise, "time": rng.integers(0, self.num_steps, 1)}
+
+
+def _finite(row: Any, name: str, key: str) -> Floats:
+    """``row`` as an array.
+
+    Raises:
+        ConfigError: it is not finite numbers.
+    """
+    try:
+        found = np.asarray(row, np.float64)
+    except (TypeError, ValueError):
+        found = np.asarray(np.nan)
+    if not np.isfinite(found).all():
+        raise ConfigError(
+            f"{name!r} of the statistics of {key!r} is {str(row)[:60]}; finite numbers are expected"
+        )
+    return found
 
 
 def _check_names(who: str, bounds: str, gripper: str | None) -> None:

@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_models.fast_tokenizer import SETTINGS
-from fluxvla_models.lerobot_files import ACTION, CONFIG, STATE, policy_type
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    CONFIG,
+    STATE,
+    check_policy_settings,
+    policy_type,
+)
 
 from fluxvla_core.data import PretrainedTokenizer
 from fluxvla_core.errors import CheckpointError
@@ -20,6 +26,7 @@ from fluxvla_core.results import read_json
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.lerobot_fast_write import TOKENIZER, write_fast
 from fluxvla_pi.lerobot_format import (
+    SHARED,
     cameras_in,
     count_of,
     features_of,
@@ -36,6 +43,17 @@ from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.published import FAST, weights_in
 
 _FIXED = {"n_obs_steps": 1, "use_peft": False}
+_SETTINGS = (
+    *SHARED,
+    "max_action_tokens",
+    "text_tokenizer_name",
+    "action_tokenizer_name",
+    "temperature",
+    "max_decoding_steps",
+    "fast_skip_tokens",
+    "validate_action_token_prefix",
+    "use_kv_cache",
+)
 
 
 class LeRobotPi0FastFormat(CheckpointFormat):
@@ -67,6 +85,7 @@ class LeRobotPi0FastFormat(CheckpointFormat):
         for key, value in _FIXED.items():
             if config.get(key, value) != value:
                 raise CheckpointError(f"{key} is {config[key]!r}; {value!r} is read", where=where)
+        check_policy_settings(config, _SETTINGS, where)
         inputs, outputs = (features_of(config, f"{w}_features", where) for w in ("input", "output"))
         weights = weights_in(folder)
         if weights.family != FAST:

@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from fluxvla_models.lerobot_files import ACTION, BUFFERS, CONFIG, PREPROCESSOR, STATE, policy_type
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    BUFFERS,
+    CONFIG,
+    PREPROCESSOR,
+    STATE,
+    check_policy_settings,
+    policy_type,
+)
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
@@ -37,7 +45,41 @@ from fluxvla_pi.writing import action_names, only, table_of, weights_to_write
 
 IMAGES = "observation.images."
 _EMPTY = f"{IMAGES}empty_camera_"
-_FIXED = {"n_obs_steps": 1, "min_period": 4e-3, "max_period": 4.0, "use_peft": False}
+_FIXED = {
+    "n_obs_steps": 1,
+    "min_period": 4e-3,
+    "max_period": 4.0,
+    "use_peft": False,
+    # Before LeRobot 0.4:
+    "num_steps": 10,
+    "resize_imgs_with_padding": [224, 224],
+    "adapt_to_pi_aloha": False,
+    "use_delta_joint_actions_aloha": False,
+}
+SHARED = (
+    "paligemma_variant",
+    "action_expert_variant",
+    "dtype",
+    "max_state_dim",
+    "max_action_dim",
+    "use_relative_actions",
+    "relative_exclude_joints",
+    "action_feature_names",
+    "rtc_config",
+    "image_resolution",
+    "empty_cameras",
+    "tokenizer_max_length",
+)
+"""Names of settings in LeRobot's config of PI0, PI0.5 and PI0-FAST."""
+SETTINGS = (
+    *SHARED,
+    *_FIXED,
+    "num_inference_steps",
+    "proj_width",
+    "use_cache",
+    "attention_implementation",
+)
+"""Those of PI0 and PI0.5; the last three from before LeRobot 0.4."""
 
 
 class LeRobotPiFormat(CheckpointFormat):
@@ -68,6 +110,7 @@ class LeRobotPiFormat(CheckpointFormat):
         for key, value in _FIXED.items():
             if config.get(key, value) != value:
                 raise CheckpointError(f"{key} is {config[key]!r}; {value!r} is read", where=where)
+        check_policy_settings(config, SETTINGS, where)
         family = config["type"]
         inputs, outputs = (
             features_of(config, f"{way}_features", where) for way in ("input", "output")
@@ -223,17 +266,20 @@ def of_words(preparation: Preparation, tokenizer: str | None) -> dict[str, Any]:
 
 
 def statistics_of(preparation: Preparation, widths: Mapping[str, int]) -> dict[str, Any]:
-    """Of each of our entries; zeros and ones where nothing is normalised."""
+    """Of each of our entries, but for those that a base model has not; zeros and ones where nothing
+    is normalised."""
     found: dict[str, Any] = {}
     for key, entry in KEYS.items():
         rows = dict(preparation.statistics.get(key, {}))
         if preparation.modes[key] == "none":
             rows = {"mean": [0.0] * widths[key], "std": [1.0] * widths[key]}
+        elif not rows:
+            continue
         elif "mean" not in rows:
             low, high = (rows[name] for name in list(rows)[:2])
             rows["mean"] = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
         found[entry] = {name: list(row) for name, row in rows.items()}
-    if preparation.relative is not None:
+    if preparation.relative is not None and "action" in found:
         found["action"]["relative"] = [float(counted) for counted in preparation.relative]
     return found
 
@@ -241,10 +287,15 @@ def statistics_of(preparation: Preparation, widths: Mapping[str, int]) -> dict[s
 def notes_of(preparation: Preparation, tokenizer: str | None) -> list[str]:
     """What a user should know of the import."""
     notes = []
-    none = [key for key in KEYS if not preparation.statistics.get(key)]
+    none = [
+        key
+        for key in KEYS
+        if preparation.modes[key] != "none" and not preparation.statistics.get(key)
+    ]
     if none:
         notes.append(
-            f"there are no statistics of {', '.join(none)}: it is a base model, to be fine-tuned"
+            f"there are no statistics of {', '.join(none)}: it is a base model, to be fine-tuned; "
+            "it drives no robot"
         )
     if tokenizer is None:
         notes.append(
@@ -356,6 +407,14 @@ def _preparation(checkpoint: ForeignCheckpoint) -> Preparation:
     mode = numbers.get("norm_type", "mean_std")
     modes = {STATE: numbers.get("state_norm_type") or mode, ACTION: mode}
     entries = checkpoint.statistics["private"]
+    missing = [entry for entry in KEYS.values() if entry not in entries]
+    if missing:
+        raise CheckpointError(
+            f"the checkpoint has no statistics of {', '.join(missing)}, which LeRobot's processors "
+            "need",
+            cause="it is a base model that was imported",
+            next="fine-tune it; a training's checkpoints have the statistics of its data",
+        )
     rows = {
         key: {name: list(entries[entry][name]) for name in STATISTICS if name in entries[entry]}
         for key, entry in KEYS.items()

@@ -19,6 +19,7 @@ from fluxvla_models.lerobot_files import (
     PREPROCESSOR,
     STATE,
     Step,
+    check_both,
     read_steps,
     whole,
     write_steps,
@@ -127,7 +128,7 @@ def from_files(folder: Path, widths: Mapping[str, int]) -> Preparation:
         _setting(relative, key, [], (list, type(None)), where)
     names = settings.get("rename_observations_processor", {})
     return Preparation(
-        modes={key: modes[key] if found.get(key) else "none" for key in KEYS},
+        modes=modes,
         statistics=found,
         epsilon=_setting(normalizer, "eps", 1e-8, (int, float), where),
         epsilon_if_zero=True,
@@ -153,10 +154,10 @@ def from_buffers(
         STATE: "normalize_inputs.buffer_observation_state.",
         ACTION: "unnormalize_outputs.buffer_action.",
     }
-    found = {key: _rows(tensors, prefixes[key], widths[key], where) for key in KEYS}
+    found = {key: _rows(tensors, prefixes[key], widths[key], where, True) for key in KEYS}
     _check(found, modes, where)
     return Preparation(
-        modes={key: modes[key] if found[key] else "none" for key in KEYS},
+        modes=modes,
         statistics=found,
         epsilon=1e-8,
         epsilon_if_zero=False,
@@ -279,9 +280,13 @@ def _modes(given: Any, where: str) -> dict[str, str]:
 
 
 def _rows(
-    tensors: Mapping[str, Stored], prefix: str, width: int, where: str
+    tensors: Mapping[str, Stored], prefix: str, width: int, where: str, unfilled: bool = False
 ) -> dict[str, Sequence[float]]:
-    """The statistics whose names begin with ``prefix``; none where they were never filled."""
+    """The statistics whose names begin with ``prefix``.
+
+    Args:
+        unfilled: those that are infinite throughout were never filled, as before LeRobot 0.4.
+    """
     found: dict[str, Sequence[float]] = {}
     for name in STATISTICS:
         stored = tensors.get(prefix + name)
@@ -293,13 +298,18 @@ def _rows(
                 f"{prefix}{name} has shape {tuple(row.shape)}, {width} numbers are expected",
                 where=where,
             )
-        if torch.isfinite(row).all():  # LeRobot before 0.4 marks empty ones by infinity
+        if torch.isfinite(row).all():
             found[name] = row.tolist()
+        elif not (unfilled and torch.isinf(row).all()):
+            raise CheckpointError(
+                f"{prefix}{name} is {row.tolist()}; finite numbers are expected", where=where
+            )
     return found
 
 
 def _check(found: Mapping[str, Mapping[str, Any]], modes: Mapping[str, str], where: str) -> None:
     """Statistics are there as a whole for a feature, or not at all, as in base models."""
+    check_both({key: found.get(key) for key in KEYS if modes[key] != "none"}, where)
     for key, rows in found.items():
         lacks = [name for name in NEEDS[modes[key]] if name not in rows]
         if rows and lacks:

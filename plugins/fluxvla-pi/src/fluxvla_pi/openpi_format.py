@@ -20,6 +20,7 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import (
     CheckpointFormat,
     ForeignCheckpoint,
+    check_settings,
     chosen_robot,
     without_cameras,
 )
@@ -37,6 +38,14 @@ NORM_TYPES = {"pi0": "mean_std", "pi05": "quantile"}
 MAX_LENGTHS = {"pi0": 48, "pi05": 200}
 HORIZON = 50
 EPSILON = 1e-6
+_SETTINGS = (
+    "action_dim",
+    "action_horizon",
+    "paligemma_variant",
+    "action_expert_variant",
+    "precision",
+)
+"""What openpi's conversion writes into ``config.json``."""
 
 
 class OpenPiFormat(CheckpointFormat):
@@ -167,11 +176,13 @@ def _statistics(file: Path, family: str) -> tuple[dict[str, Any], bool]:
             raise CheckpointError(
                 f"norm_stats: {theirs!r} has not all of {', '.join(wanted)}", where=where
             )
-        rows = {
-            name: np.asarray(table[name], np.float64)
-            for name in ("mean", "std", "q01", "q99")
-            if table.get(name) is not None
-        }
+        given = {n: table[n] for n in ("mean", "std", "q01", "q99") if table.get(n) is not None}
+        try:
+            rows = {name: np.asarray(row, np.float64) for name, row in given.items()}
+        except (TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"norm_stats: {theirs!r}: {', '.join(given)} are not rows of numbers", where=where
+            ) from error
         if any(row.ndim != 1 or row.shape != rows["mean"].shape for row in rows.values()):
             raise CheckpointError(
                 f"norm_stats: {theirs!r}: mean, std and quantiles are no rows of one length",
@@ -191,7 +202,9 @@ def _horizon(folder: Path) -> tuple[int, bool]:
     file = folder / "config.json"
     if not os.path.lexists(file):
         return HORIZON, False
-    horizon = read_json(file, dict[str, Any], CheckpointError).get("action_horizon")
+    config = read_json(file, dict[str, Any], CheckpointError)
+    check_settings(config, _SETTINGS, str(file))
+    horizon = config.get("action_horizon")
     if horizon is None:
         return HORIZON, False
     if not isinstance(horizon, int) or horizon < 1:

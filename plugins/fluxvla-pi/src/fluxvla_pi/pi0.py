@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
+from fluxvla_models.widths import check_states
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -48,6 +49,7 @@ class PI0FlowMatching(PiFlowMatching):
             pretrained_name_or_path=pretrained_name_or_path,
         )
         width = self.llm_expert.size.width
+        self.max_state_dim = max_state_dim
         self.state_proj = nn.Linear(max_state_dim, width)
         self.action_time_mlp_in = nn.Linear(2 * width, width)
         self.action_time_mlp_out = nn.Linear(width, width)
@@ -81,6 +83,7 @@ class PI0FlowMatching(PiFlowMatching):
 
     def state_tokens(self, states: Tensor) -> Tensor:
         """``(B, S)`` -> ``(B, 1, W)``."""
+        check_states(type(self).__name__, "max_state_dim", states, self.max_state_dim)
         return self.state_proj(states)[:, None]
 
     def _told(self, actions: Tensor, times: Tensor) -> Tensor:

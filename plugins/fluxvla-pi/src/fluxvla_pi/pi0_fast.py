@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from fluxvla_models.fast_tokenizer import FastTokenizer
 from fluxvla_models.folded_attention import folded_mask
+from fluxvla_models.widths import check_actions
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -124,6 +125,7 @@ class PI0FAST(VLA, nn.Module):
         action_tokens: Tensor,
         action_token_masks: Tensor,
         img_masks: Tensor | None = None,
+        actions: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -137,7 +139,13 @@ class PI0FAST(VLA, nn.Module):
             action_tokens, action_token_masks: ``(B, M)`` int64 and bool, of
                 ``ProcessActionTokens``.
             img_masks: ``(B, N)``, False for a camera that is not there.
+            actions: ``(B, T, D)``, what the action tokens say; only their shape is looked at.
+
+        Raises:
+            ConfigError: ``actions`` of another shape than the model's chunks.
         """
+        if actions is not None:
+            check_actions(type(self).__name__, actions, self.action_shape)
         prefix = self._prefix(images, img_masks, lang_tokens, lang_masks)
         said, real = action_tokens[:, :-1], action_token_masks[:, :-1].bool()
         hidden, real = self._joined(prefix.hidden, prefix.real, said, real)

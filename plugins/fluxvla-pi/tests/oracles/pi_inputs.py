@@ -176,4 +176,13 @@ def fast_answers(ids):
         "with_words": [*begin, *chunk[:3], 9, 12, *chunk[3:], stop],
         "beyond_the_last": [*begin, *chunk[:3], FAST_WORDS - 1, *chunk[3:], stop],
         "nothing": [stop, *chunk],
+        "one_short": [*begin, *chunk[:-1], stop],
+        "one_more": [*begin, *chunk, chunk[-1], stop],
+        "two_stops": [*begin, *chunk, stop, *chunk, stop],
+        "no_begin": [*chunk, stop],
+        "half_begun": [*begin[:4], *chunk, stop],
+        "padded": [*begin, 0, *chunk[:5], 0, 0, *chunk[5:], stop],
+        "first_of_the_vocabulary": [*begin, last, last, last, stop],
+        "last_of_the_vocabulary": [*begin, *[last - (FAST_VOCABULARY - 1)] * 3, stop],
+        "past_the_vocabulary": [*begin, last - FAST_VOCABULARY, *chunk[:2], stop],
     }

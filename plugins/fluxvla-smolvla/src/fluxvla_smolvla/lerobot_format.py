@@ -8,7 +8,14 @@ from math import isqrt
 from pathlib import Path
 from typing import Any, ClassVar
 
-from fluxvla_models.lerobot_files import ACTION, BUFFERS, STATE, policy_type
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    BUFFERS,
+    STATE,
+    check_both,
+    check_policy_settings,
+    policy_type,
+)
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import (
@@ -45,6 +52,29 @@ UNSUPPORTED = {
     "n_obs_steps": (1, "it looks at several frames"),
 }
 """Settings that change what the model computes, and the values that are known here."""
+SETTINGS = (
+    *UNSUPPORTED,
+    "max_state_dim",
+    "max_action_dim",
+    "resize_imgs_with_padding",
+    "empty_cameras",
+    "tokenizer_max_length",
+    "num_steps",
+    "use_cache",
+    "vlm_model_name",
+    "load_vlm_weights",
+    "attention_mode",
+    "prefix_length",
+    "pad_language_to",
+    "num_expert_layers",
+    "num_vlm_layers",
+    "self_attn_every_n_layers",
+    "expert_width_multiplier",
+    "min_period",
+    "max_period",
+    "rtc_config",
+)
+"""Its own names of settings in LeRobot's config."""
 _EMPTY = re.compile(r"empty_camera_\d+$")
 
 
@@ -74,6 +104,7 @@ class LeRobotSmolVLA(CheckpointFormat):
         where = str(folder / "config.json")
         config = Settings(read_json(folder / "config.json", dict[str, Any], CheckpointError), where)
         config.refuse_unsupported()
+        check_policy_settings(config.content, SETTINGS, where)
         stored = safetensors_in(folder)
         weights = {
             name.replace(COMPILED, "model.", 1): tensor
@@ -89,6 +120,14 @@ class LeRobotSmolVLA(CheckpointFormat):
             norms = norms_of(config.table("normalization_mapping"), where)
             processors = Processors(norms, statistics)
         bare = {kind for kind, norm in processors.norms.items() if norm == "none"}
+        check_both(
+            {
+                feature: processors.statistics.get(feature)
+                for feature, kind in ((STATE, "STATE"), (ACTION, "ACTION"))
+                if kind not in bare
+            },
+            str(folder),
+        )
         if not processors.statistics and bare != {"STATE", "ACTION"}:
             notes.append("it has no statistics: it can be trained on, and drives no robot")
         steps, executed = config.count("chunk_size", 50), config.count("n_action_steps", 50)

@@ -48,7 +48,11 @@ class Pipeline:
     def __call__(self, sample: Sample, rng: np.random.Generator | None = None) -> Sample:
         for transform in self.transforms:
             if not transform.needs_rng:
-                sample = cast(Transform, transform)(sample)
+                try:
+                    sample = cast(Transform, transform)(sample)
+                except KeyError as error:
+                    _tell_missing(transform, sample, error)
+                    raise
                 continue
             if rng is None:
                 raise ConfigError(
@@ -128,6 +132,24 @@ def redirected(tables: Sequence[Mapping[str, Any]], processors: Path) -> list[Ma
     """``tables`` with the tokenizers that a checkpoint's ``processors`` folder has."""
     saved = _saved(processors)
     return [_redirect(table, saved) for table in tables]
+
+
+_OF_A_SAMPLE = {
+    "images": "img_keys names no camera",
+    "states": "the data or the robot has no state",
+    "task_description": "the data or the section has no task",
+    "stats": "there are no statistics: norm_stats, or a dataset or checkpoint that has them",
+}
+"""What a transform may look for in a sample -> why it may not be there."""
+
+
+def _tell_missing(transform: Any, sample: Sample, error: KeyError) -> None:
+    key = error.args[0] if error.args else None
+    if key in _OF_A_SAMPLE and key not in sample:
+        raise ConfigError(
+            f"{type(transform).__name__} needs {key!r}; the sample has {', '.join(sorted(sample))}",
+            cause=_OF_A_SAMPLE[key],
+        ) from error
 
 
 def _saved(folder: Path) -> dict[str, str]:

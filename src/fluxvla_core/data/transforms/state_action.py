@@ -387,7 +387,7 @@ def _check_settings(norm_type: str, epsilon: float, who: str) -> None:
 
 def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:
     if not isinstance(stats, Mapping) or key not in stats:
-        have = ", ".join(sorted(stats)) if isinstance(stats, Mapping) else "nothing"
+        have = (", ".join(sorted(stats)) if isinstance(stats, Mapping) else "") or "nothing"
         raise ConfigError(f"{who}: the statistics have no entry {key!r}; they have {have}")
     entry = stats[key]
     if not isinstance(entry, Mapping):

@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import sys
 
+from fluxvla_core.robot.process.control_main import serve
 from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Kind, error_fields
-from fluxvla_core.robot.process.serve import serve
 from fluxvla_core.robot.process.setup import ControlSetup
 
 

@@ -13,15 +13,15 @@ import sys
 import threading
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.safety import Rule
 from fluxvla_core.errors import RunFailed, SafetyStop
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.safety import Rule
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.frames import FrameMemory
 from fluxvla_core.robot.process.link import Link, make_memory
 from fluxvla_core.robot.process.messages import Kind, Message
+from fluxvla_core.robot.process.query_server import LinkServer
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
-from fluxvla_core.robot.process.server import LinkServer
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from fluxvla_core.robot.control.limits import Clamp
-from fluxvla_core.robot.control.safety import Trip
-from fluxvla_core.robot.control.sender import SentCommand
+from fluxvla_core.control.limits import Clamp
+from fluxvla_core.control.safety import Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.robot.events import (
     CommandSent,
     EpisodeEnded,

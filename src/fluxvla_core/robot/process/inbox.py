@@ -9,10 +9,10 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from types import FrameType
 
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.policy_client import Answer
+from fluxvla_core.control.safety import BadChunk, Rule, RuleStop, SafetySettings
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.policy_client import Answer
-from fluxvla_core.robot.control.safety import BadChunk, Rule, RuleStop, SafetySettings
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Kind, Message, error_of
@@ -115,7 +115,7 @@ class Inbox(Interrupts):
             case Kind.FAULT:
                 self._fault = error_of(message.fields)
             case kind:
-                if kind == Kind.PLAY:
+                if kind == Kind.RUN_EPISODE:
                     # Here, not when it is carried out: what comes after it is for this episode.
                     self.forget()
                 self.orders.append(message)
@@ -128,7 +128,7 @@ class Inbox(Interrupts):
     def _check_silence(self) -> None:
         if self.orphaned:
             raise MainSilent("the main process was killed", cause="look for it in the system log")
-        # An arm that rests is held until the policy has warmed up, however that takes its time.
+        # An arm that rests is held until the policy has warmed up, however long that takes.
         if self.phase.moving:
             name, most = "silence_s", self._safety.silence_s
         else:

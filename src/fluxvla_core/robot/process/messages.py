@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core import errors
+from fluxvla_core.control import policy_client, safety
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import policy_client, safety
 
 Array = npt.NDArray[np.float64]
 _HEADER = struct.Struct("<I")
@@ -37,7 +37,7 @@ class Kind(str, Enum):
     # Main process -> control process: orders, carried out one after the other. Each is answered by
     # DONE, CLOSE by CLOSED.
     CONNECT = "connect"
-    PLAY = "play"
+    RUN_EPISODE = "run episode"
     """Run an episode: ``task``, ``instruction``, ``free``, ``number``, ``seed``, ``folder``."""
     REARM = "rearm"
     RELEASE = "release"
@@ -61,8 +61,8 @@ class Kind(str, Enum):
     FAILED = "failed"
     """The control process ends: an error."""
     DONE = "done"
-    """``order``, with ``result``, ``signal`` (a number) or an error; after PLAY also ``facts``,
-    ``stop_failure`` and ``holding``."""
+    """``order``, with ``result``, ``signal`` (a number) or an error; after RUN_EPISODE ``facts``,
+    ``stop_failure`` and ``holding``, too."""
     CLOSED = "closed"
     """The robot was stopped and disconnected: ``failures``, texts or None."""
     RELEASED = "released"

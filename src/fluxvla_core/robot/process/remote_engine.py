@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupted, Interrupts
+from fluxvla_core.control.policy_client import PolicyClient
+from fluxvla_core.control.safety import Latch, Rule
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.interrupt import Interrupted, Interrupts
-from fluxvla_core.robot.control.policy_client import PolicyClient
-from fluxvla_core.robot.control.safety import Latch, Rule
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, RunHistory
 from fluxvla_core.robot.episode import PolicyClientFactory
 from fluxvla_core.robot.events import (
@@ -195,7 +195,7 @@ class RemoteEngine(Engine):
         """Order an episode, and handle what the control process sends until it is over."""
         problem: BaseException | None = None
         self._process.link.send(
-            Kind.PLAY,
+            Kind.RUN_EPISODE,
             task=task.name,
             instruction=task.instruction,
             free=task.free,
@@ -221,7 +221,7 @@ class RemoteEngine(Engine):
                     self._interrupts.stopping = True
                     self._process.link.send(Kind.FAULT, **_fault(error))
                 continue
-            if done is not None and done["order"] == Kind.PLAY:
+            if done is not None and done["order"] == Kind.RUN_EPISODE:
                 break
         self.stop_failure, self._process.holding = done["stop_failure"], done["holding"]
         self._facts = done["facts"]

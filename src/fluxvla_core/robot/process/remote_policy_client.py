@@ -6,11 +6,11 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
+from fluxvla_core.control.chunks import Chunk
+from fluxvla_core.control.delays import DelaySource
+from fluxvla_core.control.joiners import PreviousChunk
+from fluxvla_core.control.policy_client import Answer, PolicyClient
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.robot.control.chunks import Chunk
-from fluxvla_core.robot.control.delays import DelaySource
-from fluxvla_core.robot.control.joiners import PreviousChunk
-from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.process.inbox import Inbox, RemoteAnswer
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Array, Kind, Message, error_of

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fluxvla_core.contracts.robot import ActionFilter
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.filters import LowPass, SnapGripper, WorkspaceBox
-from fluxvla_core.robot.control.safety import BadCommand, FilterLate
+from fluxvla_core.control import realtime
+from fluxvla_core.control.filters import LowPass, SnapGripper, WorkspaceBox
+from fluxvla_core.control.safety import BadCommand, FilterLate
 from fluxvla_core.robot.process.messages import Array
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 

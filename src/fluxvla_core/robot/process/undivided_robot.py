@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from fluxvla_core.contracts.frame import STATE
+from fluxvla_core.control.safety import BadFrame, BadTiming
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control.safety import BadFrame, BadTiming
 from fluxvla_core.robot.operator_values import as_state, check_frame, is_number
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
@@ -80,10 +80,10 @@ class UndividedRobot(Robot):
         seconds = 0.0 if began is None else time.monotonic() - began
         if seconds > self._max_age_s:
             raise BadTiming(
-                f"{self.reading.name} has not returned for {seconds:.2f} s, "
+                f"{self.frame_call.name} has not returned for {seconds:.2f} s, "
                 f"safety.max_age_s is {self._max_age_s:g}",
-                cause=self.reading.cause,
-                next=self.reading.next,
+                cause=self.frame_call.cause,
+                next=self.frame_call.next,
             )
 
     def state(self) -> StateSample | None:
@@ -105,13 +105,13 @@ class UndividedRobot(Robot):
         message = FrameMessage({"error": error_fields(error)})
         if channel.fits(message):
             return message
-        what = f"{self.reading.name} raised {type(error).__name__} with a very long message"
+        what = f"{self.frame_call.name} raised {type(error).__name__} with a very long message"
         return FrameMessage({"error": error_fields(BadFrame(what))})
 
     def _read(self) -> FrameMessage:
         if self._observe is None:
             frame = self.frame()
-            message = message_of_frame(frame, self._cameras, self.reading.name)
+            message = message_of_frame(frame, self._cameras, self.frame_call.name)
             self._keep_state(frame.state, frame.stamps.get(STATE))
             return message
         try:
@@ -120,7 +120,7 @@ class UndividedRobot(Robot):
             raise
         except (Exception, SystemExit) as error:
             raise BadFrame(
-                f"{self.reading.name}, or what the runner makes of it, "
+                f"{self.frame_call.name}, or what the runner makes of it, "
                 f"raised {type(error).__name__}: {error}"
             ) from error
         message = message_of_observation(
@@ -135,7 +135,7 @@ class UndividedRobot(Robot):
     def _keep_state(self, found: Any, stamp: float | None) -> None:
         """Keep a valid state for the tracking check; the main process reports an invalid one."""
         try:
-            state = as_state(found, self.embodiment, self.reading.name)
+            state = as_state(found, self.embodiment, self.frame_call.name)
         except FluxError:
             return
         timed = stamp is not None and is_number(stamp) and math.isfinite(stamp)
@@ -147,4 +147,4 @@ class UndividedRobot(Robot):
         except BadFrame as error:
             return error
         size = sum(array.nbytes for array in message.arrays.values())
-        return BadFrame(f"{self.reading.name} gave {size} bytes, more than its embodiment says")
+        return BadFrame(f"{self.frame_call.name} gave {size} bytes, more than its embodiment says")

@@ -25,6 +25,7 @@ from fluxvla_core.robot.events import (
     FilterLeftOut,
     Observed,
     Refused,
+    Remembered,
     RobotReading,
     Stopped,
     StoppedWhileHeld,
@@ -80,6 +81,9 @@ class EpisodeRecorder(EpisodeObserver):
             case EpisodePrepared():
                 self._open(event)
             case Observed():
+                self._images = dict(event.reading.observation["images"])
+                self._observed(event.at, event.reading)
+            case Remembered():
                 self._observed(event.at, event.reading)
             case Refused():
                 self._write(
@@ -139,7 +143,6 @@ class EpisodeRecorder(EpisodeObserver):
 
     def _observed(self, now: float, reading: RobotReading) -> None:
         frame, images = reading.frame, reading.observation["images"]
-        self._images = dict(images)
         seen = images if frame is None else frame.images
         stamps = dict(frame.stamps) if frame is not None else dict.fromkeys((STATE, *images), now)
         for camera, image in seen.items():
@@ -211,7 +214,7 @@ class EpisodeRecorder(EpisodeObserver):
             return
         images: Mapping[str, Any] = self._images
         if robot.lockstep and robot.complete:
-            with robot.delays.of(robot.reading):
+            with robot.delays.of(robot.frame_call):
                 frame = robot.frame()
             images = frame.images
             for camera, image in images.items():

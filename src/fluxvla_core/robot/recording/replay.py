@@ -16,9 +16,9 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.contracts.frame import STATE, Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.robot import Clock, Operator
+from fluxvla_core.control.clock import MonotonicClock, SimulatedClock
+from fluxvla_core.control.policy_client import PolicyEnded
 from fluxvla_core.errors import ConfigError, DataError, NotReady
-from fluxvla_core.robot.control.clock import MonotonicClock, SimulatedClock
-from fluxvla_core.robot.control.policy_client import PolicyEnded
 from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,
@@ -190,7 +190,8 @@ class ReplayOperator(Operator):
 
     @cached_property
     def _observations(self) -> list[Event]:
-        found = self.recorded.of(episode_log.OBSERVATION)
+        # A policy's history is recorded with the question that needs it, in the order of that.
+        found = sorted(self.recorded.of(episode_log.OBSERVATION), key=lambda event: event["t"])
         if not found:
             raise DataError(
                 "the recording holds no reading of the robot", where=str(self.recorded.path)

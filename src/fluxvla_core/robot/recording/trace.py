@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core import atomic
+from fluxvla_core.control import realtime
 from fluxvla_core.errors import FluxError, RunFailed
-from fluxvla_core.robot.control import realtime
 from fluxvla_core.robot.recording import ros_messages as ros
 from fluxvla_core.robot.recording.bag import Bag
 from fluxvla_core.robot.recording.video import VideoWriter

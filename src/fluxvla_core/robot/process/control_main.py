@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.joiners import make_joiner
+from fluxvla_core.control.safety import Latch
+from fluxvla_core.control.sender import ExecuteActions
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.interrupt import Interrupted
-from fluxvla_core.robot.control.joiners import make_joiner
-from fluxvla_core.robot.control.safety import Latch
-from fluxvla_core.robot.control.sender import ExecuteActions
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts
 from fluxvla_core.robot.events import (
@@ -211,7 +211,7 @@ def _carry_out(
         Kind.REARM: engine.rearm,
         Kind.RELEASE: engine.release,
         Kind.STOP: engine.stop,
-        Kind.PLAY: lambda: _run_episode(inbox, engine, observer, order),
+        Kind.RUN_EPISODE: lambda: _run_episode(inbox, engine, observer, order),
     }
     fields: dict[str, Any]
     try:
@@ -220,7 +220,7 @@ def _carry_out(
         fields = {"signal": signal_.number}
     except BaseException as error:  # noqa: BLE001 - raised in the main process
         fields = error_fields(error)
-    if order.kind == Kind.PLAY:
+    if order.kind == Kind.RUN_EPISODE:
         facts = dict(engine.episode_facts())
         failure, holding = engine.stop_failure, engine.holding
         fields |= {"facts": facts, "stop_failure": failure, "holding": holding}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.robot.control.safety import BadChunk, SafetySettings
+from fluxvla_core.control.safety import BadChunk, SafetySettings
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -58,9 +58,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.control.safety import BadCommand
+from fluxvla_core.control.smoothing import Smoothing
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.safety import BadCommand
-from fluxvla_core.robot.control.smoothing import Smoothing
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

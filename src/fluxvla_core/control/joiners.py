@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.policy import Continuation
+from fluxvla_core.control.chunks import Chunk, sample
 from fluxvla_core.errors import ConfigError, nearest
-from fluxvla_core.robot.control.chunks import Chunk, sample
 
 Array = npt.NDArray[np.float64]
 SCHEDULES = ("exp", "linear", "ones", "zeros")

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.control.kinematics import Chain, vector
+from fluxvla_core.control.safety import BadCommand
 from fluxvla_core.errors import ConfigError, nearest
-from fluxvla_core.robot.control.kinematics import Chain, vector
-from fluxvla_core.robot.control.safety import BadCommand
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.robot.control.safety import BadFrame, NotFollowing, SafetySettings
+from fluxvla_core.control.safety import BadFrame, NotFollowing, SafetySettings
 from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ import time
 from typing import ClassVar
 
 from fluxvla_core.contracts.robot import Clock, Operator
-from fluxvla_core.robot.control import realtime
+from fluxvla_core.control import realtime
 
 
 class MonotonicClock(Clock):

@@ -15,18 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.robot import Clock
+from fluxvla_core.control.clock import Rate
+from fluxvla_core.control.limits import Clamp, CommandLimiter
+from fluxvla_core.control.safety import BadCommand, Latch
+from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.robot.control.clock import Rate
-from fluxvla_core.robot.control.limits import Clamp, CommandLimiter
-from fluxvla_core.robot.control.safety import BadCommand, Latch
-from fluxvla_core.robot.control.tracking import TrackingWatch
 from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 Filter = Callable[[Array], Array]
 ExecuteActions = Callable[[Array, Rate], None]
 """Sends ``(N, D)`` commands, one at each tick of the rate: a runner's ``_execute_actions``."""
-AfterTick = Callable[["SentCommand | None", float, float], None]
+OnSent = Callable[["SentCommand | None", float, float], None]
 # How long an arm is led to where it is held, at most. No arm's limits are as low as that.
 _LEAD_S = 3.0
 _THERE = 1e-9  # from a pose that is moved to, in the joints' units
@@ -125,26 +125,24 @@ class CommandRate(Rate):
 
     Args:
         hz, clock, lead_s: as ``Rate`` has them.
-        after_tick: called after each wait; what it raises leaves ``sleep()``.
+        on_tick: called after each wait; what it raises leaves ``sleep()``.
     """
 
-    def __init__(
-        self, hz: float, clock: Clock, lead_s: float, after_tick: Callable[[], None]
-    ) -> None:
+    def __init__(self, hz: float, clock: Clock, lead_s: float, on_tick: Callable[[], None]) -> None:
         super().__init__(hz, clock, lead_s)
-        self._after_tick = after_tick
+        self._on_tick = on_tick
 
     def sleep(self) -> float:
         late = super().sleep()
-        self._after_tick()
+        self._on_tick()
         return late
 
 
 class CommandSender:
-    """Sends commands for targets to a robot; nothing else in a run does.
+    """Sends commands for targets to a robot; only an operator's ``stop`` does so, too.
 
     A ``CommandPipeline`` makes commands of targets. They are handed to ``execute_actions``, which
-    sends each and waits with ``rate.sleep()``; at that tick ``after_tick`` is called with the
+    sends each and waits with ``rate.sleep()``; at that tick ``on_sent`` is called with the
     command.
 
     Args:
@@ -154,7 +152,7 @@ class CommandSender:
         limiter: started before anything is sent.
         latch: while it is tripped only ``brake``, ``send_hold`` and ``rest_at`` send.
         filters: ``(D,)`` -> ``(D,)`` callables; what a config's ``action_filters`` named.
-        after_tick: called at each tick with what was sent (None for a tick without a command), when
+        on_sent: called at each tick with what was sent (None for a tick without a command), when
             the arm had it at the latest (of commands that a loop without ticks sends, when it had
             the first), and how late the tick was, in seconds.
         speed: tells, before each command, the share of the velocity limits that it may use, in
@@ -172,17 +170,17 @@ class CommandSender:
         limiter: CommandLimiter,
         latch: Latch,
         filters: Sequence[Filter] = (),
-        after_tick: AfterTick | None = None,
+        on_sent: OnSent | None = None,
         speed: Callable[[], float] | None = None,
         one_by_one: bool = False,
         lead_s: float = 0.0,
     ) -> None:
-        self.rate = CommandRate(rate_hz, clock, lead_s, self._after_tick)
+        self.rate = CommandRate(rate_hz, clock, lead_s, self._report_sent)
         self.limiter = limiter
         self.latch = latch
         self._execute_actions = execute_actions
         self._pipeline = CommandPipeline(limiter, filters)
-        self._report = after_tick or (lambda sent, sent_at, late_s: None)
+        self._on_sent = on_sent or (lambda sent, sent_at, late_s: None)
         self._speed = speed
         self._one_by_one = one_by_one or speed is not None
         self._rows: deque[SentCommand] = deque()
@@ -290,12 +288,12 @@ class CommandSender:
             # A loop with ticks of its own: what it was given, it has sent.
             self._sent_count = len(commands)
             while self._rows:
-                self._report(self._rows.popleft(), sent_at, self.rate.late_s)
+                self._on_sent(self._rows.popleft(), sent_at, self.rate.late_s)
         self._sent_count = len(commands) - len(self._rows)
 
-    def _after_tick(self) -> None:
+    def _report_sent(self) -> None:
         rate, sent = self.rate, self._rows.popleft() if self._rows else None
-        self._report(sent, rate.clock.now(), rate.late_s)
+        self._on_sent(sent, rate.clock.now(), rate.late_s)
         self._sent_count += 1
 
 

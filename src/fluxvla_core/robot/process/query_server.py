@@ -8,10 +8,10 @@ import time
 from collections import deque
 from concurrent.futures import Future
 
+from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.policy_client import Answer, PolicyClient
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.control import realtime
-from fluxvla_core.robot.control.interrupt import Interrupts
-from fluxvla_core.robot.control.policy_client import Answer, PolicyClient
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.link import Link
 from fluxvla_core.robot.process.messages import Kind, Message, error_fields

@@ -11,10 +11,10 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from fluxvla_core.control.delays import DelaySource
+from fluxvla_core.control.joiners import PreviousChunk
+from fluxvla_core.control.safety import BadChunk, Rule
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.robot.control.delays import DelaySource
-from fluxvla_core.robot.control.joiners import PreviousChunk
-from fluxvla_core.robot.control.safety import BadChunk, Rule
 
 Array = npt.NDArray[np.float64]
 

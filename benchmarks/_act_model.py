@@ -184,7 +184,7 @@ class Layer(nn.Module):
 
 @VLAS.register_module()
 class BenchACT(nn.Module):
-    """A conditional variational autoencoder of action chunks, decoded from pictures and a pose.
+    """A conditional variational autoencoder of action chunks, decoded from images and a pose.
 
     Args:
         state_dim, action_dim: D.
@@ -293,7 +293,7 @@ class BenchACT(nn.Module):
         return self.decode(images, states, prior, every).unflatten(0, every.shape)
 
     def fsdp_units(self) -> list[nn.Module]:
-        """The transformers' layers and the picture's blocks."""
+        """The transformers' layers and the image's blocks."""
         layers = (*self.action_encoder, *self.encoder, *self.decoder)
         return [*layers, *self.backbone.blocks]
 

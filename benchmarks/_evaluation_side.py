@@ -170,7 +170,7 @@ class _Single:
 
 
 def vector(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
-    """``gymnasium.vector.AsyncVectorEnv`` over the engine's scene: one camera, equal pictures."""
+    """``gymnasium.vector.AsyncVectorEnv`` over the engine's scene: one camera, equal images."""
     from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
     env = AsyncVectorEnv(

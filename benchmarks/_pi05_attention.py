@@ -1,6 +1,6 @@
 """Who sees what in ``_pi05_model.py``, and how fast kernels of attention stay in reach.
 
-What comes first (pictures and prompt) sees itself and never the actions; actions see everything.
+What comes first (images and prompt) sees itself and never the actions; actions see everything.
 So there is no mask between them, only two calls, each over all of its keys. Then:
 
 - All heads share one key and value head, so the heads of a token are simply more queries: ``H * L``

@@ -3,7 +3,7 @@
 Written from the reports, weights random:
 
 - the whole: Black et al. 2024 ("pi0", arXiv 2410.24164, section IV and appendix B) and Physical
-  Intelligence 2025 ("pi0.5", arXiv 2504.16054): pictures, words and the state as words are seen by
+  Intelligence 2025 ("pi0.5", arXiv 2504.16054): images, words and the state as words are seen by
   a language model; an action expert with layers of its own attends to it layer by layer, and its
   norms know the time of flow matching;
 - PaliGemma (Beyer et al. 2024, arXiv 2407.07726): the vision tower SigLIP So400m/14 (Zhai et al.
@@ -33,7 +33,7 @@ ATTENTION = ("sdpa", "packed")
 
 @dataclass(frozen=True)
 class Size:
-    """Lengths and widths of everything; pictures are square, in pixels."""
+    """Lengths and widths of everything; images are square, in pixels."""
 
     cameras: int = 2
     picture: int = 224
@@ -56,7 +56,7 @@ class Size:
 
     @property
     def patches(self) -> int:
-        """Of one picture."""
+        """Of one image."""
         return (self.picture // self.patch) ** 2
 
     @property
@@ -134,7 +134,7 @@ class AdaptiveNorm(nn.Module):
 
 
 class VisionBlock(nn.Module):
-    """Attention among the patches of a picture and an MLP, both normalised before."""
+    """Attention among the patches of an image and an MLP, both normalised before."""
 
     def __init__(self, size: Size) -> None:
         super().__init__()

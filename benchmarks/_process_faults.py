@@ -309,7 +309,7 @@ _FAULTS = [
         LOCKED,
         rule=MAIN,
     ),
-    Fault("picture callback spins for 5 s", order("picture callback spins"), LOCKED, rule=MAIN),
+    Fault("image callback spins for 5 s", order("image callback spins"), LOCKED, rule=MAIN),
     Fault("policy crashes (segmentation fault)", order("crash"), KILLED, exit_code=-signal.SIGSEGV),
     Fault(
         "policy uses all memory",

@@ -61,7 +61,7 @@ class ProgramArm(BenchArm):
 
 @OPERATORS.register_module()
 class WholeArm(Operator):
-    """In one process, of the old shape: it cannot be divided, and its state comes with pictures.
+    """In one process, of the old shape: it cannot be divided, and its state comes with images.
 
     Follows at once, and stores every command and when it came. ``get_frame`` does harm while
     ``BLOCK`` or ``KEEP`` is there.
@@ -175,8 +175,8 @@ def use_all_memory() -> None:
         blocks.append(bytearray(2**20))
 
 
-def stand_in_for_a_picture_callback_that_spins(policy: HarmfulSwing) -> None:
-    """What stores a picture keeps the interpreter's lock; none of ours does that."""
+def stand_in_for_an_image_callback_that_spins(policy: HarmfulSwing) -> None:
+    """What stores an image keeps the interpreter's lock; none of ours does that."""
     add = Ring.add
 
     def spin(ring: Ring, receipt: float, stamp: float | None, message: Any) -> bool:
@@ -233,7 +233,7 @@ HARMS: Mapping[str, Callable[[HarmfulSwing], None]] = {
     "think": in_policy(think),
     "crash": in_policy(crash),
     "use all memory": in_policy(use_all_memory),
-    "picture callback spins": stand_in_for_a_picture_callback_that_spins,
+    "image callback spins": stand_in_for_an_image_callback_that_spins,
     "link is not read": stand_in_for_a_link_that_is_not_read,
     "hook blocks": block_a_hook,
     "link's thread ends": stand_in_for_a_link_whose_thread_ends,

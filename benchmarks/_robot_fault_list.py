@@ -223,7 +223,7 @@ REFUSALS = [
         lambda stage: impatient(stage, BenchArm(state_topic="/arm/stat")),
         r"/arm/stat\b.*",
     ),
-    Fault("a camera never gives a picture", silent_camera, r"cam \(/cam/image\)"),
+    Fault("a camera never gives an image", silent_camera, r"cam \(/cam/image\)"),
     Fault("joint outside its limits at the start", outside, "wrist is at 2.5, outside its limits"),
     Fault("record cannot be written", no_record, "cannot record the episode"),
 ]
@@ -231,7 +231,7 @@ ROBOT = [
     Fault("camera freezes", ill(f"{CAM}=freeze"), rf"^cam \({CAM}\) {SILENT}", rule="freshness"),
     Fault("camera falls silent", ill(f"{CAM}=drop"), rf"^cam \({CAM}\) {SILENT}", rule="freshness"),
     Fault("camera is late", ill(f"{CAM}=delay:0.7"), r"^cam .*is (late|silent)", rule="freshness"),
-    # Whichever rule is there first: the state is too old, or too old for its picture.
+    # Whichever rule is there first: the state is too old, or too old for its image.
     Fault(
         "joint states stop",
         ill(f"{STATE}=drop"),
@@ -252,13 +252,13 @@ ROBOT = [
         after=restarted,
     ),
     Fault(
-        "pictures of another size",
+        "images of another size",
         change(CAM, height=24, width=32),
         "sends 32x24 images",
         rule="frame",
     ),
     Fault(
-        "pictures without colours",
+        "images without colours",
         change(CAM, encoding="16UC1"),
         "sends 16UC1 images",
         rule="frame",
@@ -313,7 +313,7 @@ SIGNALS = [
 NO_FAULTS = [
     Fault("chunk a little beyond a position limit", chunk(beyond)),
     Fault("chunk faster than the velocity limit", chunk(hasty)),
-    Fault("joints in another order or too many, bgr pictures", turned_round),
+    Fault("joints in another order or too many, bgr images", turned_round),
     Fault("messages twice, or overtaken", ill(f"{STATE}=out_of_order", f"{CAM}=duplicate")),
     Fault(
         "wall clock stepped",

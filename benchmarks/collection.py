@@ -5,10 +5,10 @@
 Three comparisons; in each the sides take turns, so that other work on the machine slows them alike,
 and the figure is the median over the rounds:
 
-- a picture without shadows and multisampling against one as the model file asks for it (also in
+- an image without shadows and multisampling against one as the model file asks for it (also in
   processor time, which other work disturbs less);
 - collecting with two worker processes against one, and one against gym-aloha's own environment,
-  which draws three 480 x 640 pictures after every step;
+  which draws three 480 x 640 images after every step;
 - evaluating through the engine (processes, evaluation log) against the same episodes in a bare
   loop.
 
@@ -52,7 +52,7 @@ PICTURES = 10
 
 
 def pictures() -> dict[str, Callable[[], tuple[float, float]]]:
-    """Wall and processor milliseconds of one picture, cheap and as the model file asks."""
+    """Wall and processor milliseconds of one image, cheap and as the model file asks."""
 
     def side(quality: str) -> Callable[[], tuple[float, float]]:
         scene = AlohaScene(quality)

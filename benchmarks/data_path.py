@@ -7,7 +7,7 @@ random through both sides' loaders, in batches of 8 with chunks of 50 actions, w
 workers. The sides take turns, each in its own environment (``tools/lerobot_env.py`` makes
 LeRobot's) with as many threads as it takes by itself: without workers, FluxVLA decodes with
 several. Figures are medians over the rounds. Where the machine is shared, ratios of processor time
-(without workers) say more than those of rates. FluxVLA's pictures stay uint8, LeRobot's become
+(without workers) say more than those of rates. FluxVLA's images stay uint8, LeRobot's become
 float32, for that is what each hands to training. Goals: 3 times LeRobot's rate with video, 5 times
 without. Writes ``benchmarks/results/data_path.json``.
 """
@@ -36,7 +36,7 @@ HEIGHT, WIDTH = 480, 640
 
 
 def make_datasets(folder: Path, episodes: int, frames: int) -> None:
-    """``mp4`` and ``parquet`` below ``folder``: textured pictures that move, smooth joints."""
+    """``mp4`` and ``parquet`` below ``folder``: textured images that move, smooth joints."""
     from fluxvla_core.data.writer import LeRobotWriter
     from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 

@@ -4,7 +4,7 @@
 
 Collects demonstrations as the demo does (simulated ALOHA, top camera, 144 x 192, mp4) and trains
 LeRobot's ``act`` in its default size on them with both commands, as a user would: the same files,
-picture size, batch, loader workers, chunk, optimizer and clipping, in fp32 on the CPU, nothing
+image size, batch, loader workers, chunk, optimizer and clipping, in fp32 on the CPU, nothing
 pretrained. ``_act_model.py`` is the same network; that both give equal actions, losses and
 gradients with equal weights is checked first, and kept with the results. The sides take turns;
 figures are medians over the rounds of the rate over the steps after the first ``--warm-up``, by

@@ -3,20 +3,20 @@
     python -m benchmarks.evaluation [--rounds 3] [--checkpoint DIR]
 
 gym-aloha's transfer task with a policy that costs nothing, in as many processes as there are cores
-(at most 4), the top camera looked at in 480 x 640 at every step: the engine with stock pictures
+(at most 4), the top camera looked at in 480 x 640 at every step: the engine with stock images
 (shadows, multisampling) and with its own cheap ones, ``lerobot-eval``'s rollout over its
 asynchronous vector environments, Gymnasium's asynchronous vector environment around the engine's
 own scene, and the engine's environment in a bare loop in as many processes. Renderer (EGL), MuJoCo
 and resolution are the same on all sides. LeRobot's environment always draws three cameras where the
-others draw one, so most of ``times_lerobot`` is pictures that nobody looks at;
-``times_gymnasium_vector`` compares equal pictures, and is what the engine itself is worth. LeRobot
+others draw one, so most of ``times_lerobot`` is images that nobody looks at;
+``times_gymnasium_vector`` compares equal images, and is what the engine itself is worth. LeRobot
 is given the processes that its own command cannot use. The sides take turns;
 figures are medians over the rounds. An episode is 300 steps. Where the machine is shared, ratios of
 processor time say more than those of rates.
 
 With ``--checkpoint`` also: a model in each worker against one model for all of them, in batches.
 
-Goals: 1.5 times LeRobot's episodes a minute with stock pictures, 0.9 of bare stepping. Writes
+Goals: 1.5 times LeRobot's episodes a minute with stock images, 0.9 of bare stepping. Writes
 ``benchmarks/results/evaluation.json``.
 """
 
@@ -40,7 +40,7 @@ NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0")
 """The simulator, in addition to what LeRobot itself imports."""
 KEYS = {"engine, stock pictures": "times_lerobot", "engine": "times_lerobot_cheap_pictures"}
 GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
-# side -> words of _evaluation_side.py: side, steps, episodes for each process, pictures
+# side -> words of _evaluation_side.py: side, steps, episodes for each process, images
 SIDES = {
     "lerobot": ("lerobot", 20, 1, "reference"),
     "gymnasium.vector, stock pictures": ("vector", 20, 2, "reference"),

@@ -8,7 +8,7 @@
 places of its images in each prompt: its operations cannot be counted, and there is no MFU.
 
 ``FSDPTrainRunner`` against a torch loop written by hand: the same model (``_pi05_model.py``),
-random batches made on the host (pictures as uint8), bf16 compute over fp32 weights, fused AdamW
+random batches made on the host (images as uint8), bf16 compute over fp32 weights, fused AdamW
 and clipping. By hand one process has plain autocast; several have ``fully_shard``. The sides take
 turns as processes of their own (``--rounds``), each of which measures ``--blocks`` blocks of
 ``--steps`` steps after a warm-up; the hand-written loop waits for the device at the ends of a block

@@ -8,7 +8,7 @@ sides take turns, each in a process of its own:
 
 * ``fluxvla``: ``AlohaInferenceRunner`` with ``async_execution`` and every safety rule; a process of
   its own sends the commands.
-* ``recording``: the same with ``--record``: everything into a bag, pictures too.
+* ``recording``: the same with ``--record``: everything into a bag, images too.
 * ``lock held``: the same with a policy that keeps the interpreter's lock half of the time.
 * ``one process``, also ``recording`` and ``lock held``: with ``control_process=False``.
 * ``upstream``: the same policy and topics, driven as FluxVLA's ROS 1 operators and runners do it
@@ -86,7 +86,7 @@ PICTURES = 3 * 480 * 640 * 3
 
 
 class TenMillion:
-    """A transformer over patches of all pictures; swings both arms gently, whatever it sees."""
+    """A transformer over patches of all images; swings both arms gently, whatever it sees."""
 
     action_rate_hz, horizon = RATE_HZ, HORIZON
     embodiment = aloha_spec()

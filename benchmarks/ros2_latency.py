@@ -5,9 +5,9 @@
 A driver process publishes three 640x480 rgb8 cameras at 30 Hz and two joint states at 100 Hz. The
 two sides take turns, each in a process of its own: the bare script keeps the newest message of each
 topic and copies them when asked; the operator matches them in time, checks age, skew, names and
-sizes, and then copies them. Both are asked ten times a second. Latency is the time from a picture's
+sizes, and then copies them. Both are asked ten times a second. Latency is the time from an image's
 stamp to its receipt, and the time that making the observation takes: how long the asker happens to
-wait for the next picture is not counted. Goal: at most 1.15 times the bare script's. Loopback only.
+wait for the next image is not counted. Goal: at most 1.15 times the bare script's. Loopback only.
 Writes ``benchmarks/results/ros2_latency.json``.
 """
 
@@ -53,10 +53,10 @@ def drive() -> Driver:
 
 
 def ask(observe: Callable[[], float], seconds: float) -> dict[str, Any]:
-    """Milliseconds that pictures were under way and that observations took.
+    """Milliseconds that images were under way and that observations took.
 
     Args:
-        observe: makes an observation; gives how long its first picture was under way, in seconds.
+        observe: makes an observation; gives how long its first image was under way, in seconds.
     """
     receipt, making, until = [], [], time.monotonic() + seconds
     while time.monotonic() < until:

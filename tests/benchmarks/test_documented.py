@@ -34,17 +34,17 @@ def rows(name: str, head: str) -> list[list[str]]:
 
 
 SIDES = {
-    "the engine, stock pictures": "engine, stock pictures",
-    "`gymnasium.vector` (asynchronous) around the same scene, stock pictures": (
+    "the engine, stock images": "engine, stock pictures",
+    "`gymnasium.vector` (asynchronous) around the same scene, stock images": (
         "gymnasium.vector, stock pictures"
     ),
-    "`lerobot-eval`'s rollout, stock pictures": "lerobot",
-    "the engine, cheap pictures (the default)": "engine",
-    "the same scene in a bare loop, cheap pictures": "bare",
+    "`lerobot-eval`'s rollout, stock images": "lerobot",
+    "the engine, cheap images (the default)": "engine",
+    "the same scene in a bare loop, cheap images": "bare",
 }
 
 
-def test_evaluations_are_compared_with_what_drew_as_many_pictures() -> None:
+def test_evaluations_are_compared_with_what_drew_as_many_images() -> None:
     found = results("evaluation")
     table = rows("evaluation", "| | cameras drawn |")
     assert [SIDES[row[0]] for row in table] == list(SIDES.values())

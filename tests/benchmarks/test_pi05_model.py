@@ -122,7 +122,7 @@ def test_a_shorter_prompt_is_a_prompt_without_padding(
     torch.testing.assert_close(model(**whole)["loss"], with_masks)
 
 
-def test_pictures_and_prompt_do_not_see_the_actions(
+def test_images_and_prompt_do_not_see_the_actions(
     model: BenchPi05, batch: dict[str, Tensor]
 ) -> None:
     found: list[Tensor] = []

@@ -144,7 +144,7 @@ def test_a_missing_feature_gets_a_hint(shared):
     assert "feature 'task_index' is int64 of shape (1,), not a vector of float32" in text
 
 
-def test_pictures_that_are_not_in_the_tables(dataset):
+def test_images_that_are_not_in_the_tables(dataset):
     info = json.loads((dataset / "meta/info.json").read_text())
     info["features"]["observation.images.side"] = {
         "dtype": "image",
@@ -247,7 +247,7 @@ def test_datasets_that_do_not_go_together(shared, tmp_path, recorder, take, spec
         ParquetDataset([str(shared), str(tmp_path / "fast")], [], ["top"])
 
 
-def test_pictures_of_another_size_than_stated(dataset, capsys):
+def test_images_of_another_size_than_stated(dataset, capsys):
     info = json.loads((dataset / "meta/info.json").read_text())
     info["features"][TOP]["shape"] = [64, 48, 3]
     edit_info(dataset, features=info["features"])

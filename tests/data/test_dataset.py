@@ -135,7 +135,7 @@ def test_the_cache_cannot_be_written_to(shared, cache):
     np.testing.assert_array_equal(load(shared, cache_frames=cache)[3]["images"][0], before)
 
 
-def test_without_cameras_there_are_no_pictures(shared):
+def test_without_cameras_there_are_no_images(shared):
     sample = load(shared, img_keys=[])[3]
     assert not {"images", "img_masks"} & set(sample)
     assert sample["states"].shape == (3,)

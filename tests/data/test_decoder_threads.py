@@ -49,7 +49,7 @@ def greys(images):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, MAX_THREADS, 2 * MAX_THREADS])
-def test_every_picture_is_the_one_asked_for(movies, allowed, count):
+def test_every_image_is_the_one_asked_for(movies, allowed, count):
     allowed(count)
     decoders = DecoderThreads()
     for size in (24, 0, 1, 2, 3, 24, 7):

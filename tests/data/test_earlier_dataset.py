@@ -54,7 +54,7 @@ def test_numbers_are_the_same_to_the_bit(samples: list[dict[str, Any]], key: str
     assert hashlib.sha256(joined).hexdigest() == EXPECTED["sha256"][key]
 
 
-def test_pictures_and_places_are_the_same(samples: list[dict[str, Any]]) -> None:
+def test_images_and_places_are_the_same(samples: list[dict[str, Any]]) -> None:
     shapes = {sample["images"].shape for sample in samples}
     assert shapes == {tuple(EXPECTED["image_shape"])}
     # Versions of FFmpeg may round colours differently.

@@ -64,7 +64,7 @@ def test_an_observation_becomes_a_batch_of_one(stats):
     np.testing.assert_allclose(batch["states"][0], expected, rtol=1e-5)
 
 
-def test_a_model_without_cameras_gets_no_pictures(shared):
+def test_a_model_without_cameras_gets_no_images(shared):
     transforms = [{"type": "NormalizeStatesAndActions", "norm_type": "mean_std"}]
     trained = ParquetDataset(str(shared), transforms, [])
     prepare = PrivateInferenceDataset([], transforms, trained.statistics)
@@ -90,7 +90,7 @@ def test_it_prepares_as_training_did(shared, stats):
         np.testing.assert_array_equal(value[0].numpy(), sample[key])
 
 
-def test_pictures_may_be_flat(stats):
+def test_images_may_be_flat(stats):
     prepare = PrivateInferenceDataset(IMG_KEYS, TRANSFORMS, stats)
     nested = observe()
     flat = {**{k: v for k, v in nested.items() if k != "images"}, **nested["images"]}

@@ -177,7 +177,7 @@ def test_we_read_what_lerobot_recorded(seen, takes):
     validate(root)
 
 
-def test_pictures_that_lerobot_put_into_tables_are_exact(seen, takes):
+def test_images_that_lerobot_put_into_tables_are_exact(seen, takes):
     root = seen["theirs stored"].root
     assert not list(root.rglob("*.mp4"))
     top = ParquetDataset(str(root), [], CAMERAS)[12]["images"][0].transpose(1, 2, 0)
@@ -274,11 +274,11 @@ def test_a_dataset_that_lerobot_recorded_trains(seen, tmp_path, spec):
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
     policy = load_policy(work)
     sample = ParquetDataset(str(root), [], CAMERAS)[0]
-    pictures = [image.transpose(1, 2, 0) for image in sample["images"]]
+    images = [image.transpose(1, 2, 0) for image in sample["images"]]
     chunk = policy.predict_action(
         {
             "qpos": sample["states"],
-            "images": dict(zip(CAMERAS, pictures, strict=True)),
+            "images": dict(zip(CAMERAS, images, strict=True)),
             "task_description": sample["task_description"],
         }
     )

@@ -46,7 +46,7 @@ def new(tmp_path, old):
 
 @pytest.mark.parametrize("cache", [False, True])
 @pytest.mark.parametrize("which", ["old", "new"])
-def test_pictures_are_those_that_were_stored(which, cache, takes, request):
+def test_images_are_those_that_were_stored(which, cache, takes, request):
     dataset = load(request.getfixturevalue(which), cache_frames=cache)
     keys = [SampleKey(0, i) for i in np.random.default_rng(0).permutation(28)]
     found = {key.index: s for key, s in zip(keys, dataset.get_samples(keys), strict=True)}
@@ -75,7 +75,7 @@ def test_jpegs_and_shapes_with_the_channels_first(tmp_path, takes):
     assert validate(root)[0].startswith("meta/fluxvla_embodiment.json is missing")
 
 
-def test_video_and_stored_pictures_in_one_dataset(tmp_path, takes):
+def test_video_and_stored_images_in_one_dataset(tmp_path, takes):
     root = write_v2(tmp_path / "both", takes)
     stored = write_v2(tmp_path / "stored", takes, codec="png")
     for path in stored.glob("data/*/*.parquet"):
@@ -102,7 +102,7 @@ def test_commands_know_them(old, tmp_path, capsys):
     assert found[TOP] == json.loads((tmp_path / "new/meta/stats.json").read_text())[TOP]
 
 
-def test_pictures_that_are_damaged_are_named(old):
+def test_images_that_are_damaged_are_named(old):
     path = old / "data/chunk-000/episode_000001.parquet"
     kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     edit(path, lambda rows: pa.array([*rows[:6], {"bytes": b"?", "path": "x"}, *rows[7:]], kind))
@@ -124,7 +124,7 @@ def test_a_column_of_something_else_is_refused_before_training(old):
     assert len(load(old, ["top"])) == 28
 
 
-def test_a_picture_is_looked_at_before_it_is_decoded(old):
+def test_an_image_is_looked_at_before_it_is_decoded(old):
     """20,000 x 20,000 equal pixels are 1 MB as a PNG and 1.2 GB in memory."""
     path = next(iter(sorted(old.glob("data/*/*.parquet"))))
     whole = bytearray(pq.read_table(path)[TOP][0].as_py()["bytes"])
@@ -140,7 +140,7 @@ def test_a_picture_is_looked_at_before_it_is_decoded(old):
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("size", [(1, 1), (480, 640), (33, 7)])
-def test_the_size_in_a_pictures_head(suffix, size):
+def test_the_size_in_an_images_header(suffix, size):
     data = cv2.imencode(suffix, np.zeros((*size, 3), np.uint8))[1].tobytes()
     assert image_size(data) == size
     assert image_size(data[:10]) is None

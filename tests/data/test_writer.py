@@ -112,7 +112,7 @@ def test_statistics_of_the_whole(shared, takes):
     }
 
 
-def test_the_embodiment_has_the_pictures_true_sizes(shared, spec):
+def test_the_embodiment_has_the_images_true_sizes(shared, spec):
     found = read_metadata(shared).embodiment
     assert found.joints == spec().joints
     assert found.rate_hz == 50
@@ -120,7 +120,7 @@ def test_the_embodiment_has_the_pictures_true_sizes(shared, spec):
 
 
 @pytest.mark.parametrize("codec", list(CODECS))
-def test_pictures_come_back_nearly_as_they_were(codec, tmp_path, takes, recorder):
+def test_images_come_back_nearly_as_they_were(codec, tmp_path, takes, recorder):
     root = recorder(tmp_path / "d", video_codec=codec)
     dataset = ParquetDataset(str(root), [], ["wrist"])
     whole = np.concatenate([t.wrist for t in takes]).transpose(0, 3, 1, 2)

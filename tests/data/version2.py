@@ -40,7 +40,7 @@ def write_v2(
         table = {k: column(a) for k, a in columns.items()}
         if codec in STORED:
             for camera in CAMERAS:
-                table[f"observation.images.{camera}"] = pictures(getattr(take, camera), codec)
+                table[f"observation.images.{camera}"] = stored_images(getattr(take, camera), codec)
         pq.write_table(pa.table(table), path, row_group_size=5)
         stats = {k: column_statistics(a.reshape(len(a), -1)) for k, a in columns.items()}
         for camera in CAMERAS:
@@ -69,7 +69,7 @@ def write_v2(
     return root
 
 
-def pictures(images: np.ndarray, kind: str) -> Any:
+def stored_images(images: np.ndarray, kind: str) -> Any:
     """A column as the Image feature of Hugging Face's datasets stores it."""
     files = [cv2.imencode(f".{kind}", image[..., ::-1])[1].tobytes() for image in images]
     rows = [{"bytes": data, "path": f"frame-{i:06d}.{kind}"} for i, data in enumerate(files)]

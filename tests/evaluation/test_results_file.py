@@ -63,7 +63,7 @@ def test_speed_is_told_of_whole_runs_only():
     assert "steps_per_s" not in rest
 
 
-def test_times_of_steps_and_pictures_and_memory_are_those_of_finished_episodes():
+def test_times_of_steps_and_images_and_memory_are_those_of_finished_episodes():
     slow = record("a", 0, True)
     slow["timing"] |= {"step_seconds": 0.5, "observe_seconds": 0.25, "memory_mb": 300.0}
     found = results_file.timing([slow, {"status": "error"}], 2, 2.0, 1)

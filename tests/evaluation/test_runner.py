@@ -13,21 +13,10 @@ from fluxvla_core.config.load import load_config
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch, UsageError
 from fluxvla_core.evaluation.collect import Collection, collect
 from fluxvla_core.evaluation.compare import read
-from fluxvla_core.evaluation.policies import PolicySource, chosen_checkpoint, load
 from fluxvla_core.evaluation.runner import EvalRunner
 from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files
 from tests.evaluation.conftest import WALKING
-
-WALK = {"type": "Walk"}
-
-
-def evaluate(work_dir, environment=WALK, reporter=None, **options):
-    more = {} if reporter is None else {"reporter": reporter}
-    context = RunContext(work_dir=work_dir, section="eval", **more)
-    options = {"policy": "expert", "episodes": 4, "record_videos": 0, **options}
-    runner = EvalRunner(context=context, environment=environment, **options)
-    runner.run_setup()
-    return runner.run()
+from tests.evaluation.runs import WALK, evaluate
 
 
 def courses(work_dir):
@@ -329,7 +318,7 @@ def test_results_say_whether_training_saw_their_seeds(tmp_path, checkpoint, firs
     assert results(tmp_path)["provenance"]["unseen_seeds"] is unseen
 
 
-def test_how_pictures_were_drawn_is_in_the_results(tmp_path, walking):
+def test_how_images_were_drawn_is_in_the_results(tmp_path, walking):
     evaluate(tmp_path, policy={"type": "Thinker"}, tasks=["right"], episodes=1, workers=1)
     images = results(tmp_path)["provenance"]["pictures"]
     assert images == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"
@@ -391,63 +380,6 @@ def test_statistics_that_the_checkpoint_lacks_are_refused(tmp_path, checkpoint):
     with_key = courses(tmp_path)
     evaluate(tmp_path / "plain", ckpt_path=str(tmp_path), **options)
     assert with_key == courses(tmp_path / "plain")
-
-
-def test_how_the_model_computes_is_part_of_what_was_evaluated(tmp_path, checkpoint):
-    def settings(**options):
-        context = RunContext(work_dir=tmp_path, section="eval")
-        runner = EvalRunner(context=context, environment=WALK, policy="checkpoint", **options)
-        runner.run_setup()
-        found = runner.identity()["settings"]
-        return found["execution"], found["quantization"]
-
-    assert settings() == ("eager", None)
-    assert settings(execution="compiled") == ("compiled", None)
-
-
-@pytest.mark.parametrize("name", ["checkpoint", "untrained"])
-def test_a_policy_computes_as_the_evaluation_says(checkpoint, name):
-    path = chosen_checkpoint(str(checkpoint), checkpoint)["path"]
-    policy = load(PolicySource(policy=name, ckpt_path=path, execution="compiled"))
-    assert policy.execution == "compiled"
-    assert "forward" in vars(policy.model.mix)
-
-
-@pytest.mark.parametrize("name", ["checkpoint", "untrained"])
-def test_the_weights_are_quantised_as_the_evaluation_says(checkpoint, name):
-    pytest.importorskip("torchao")
-    path = chosen_checkpoint(str(checkpoint), checkpoint)["path"]
-    plain = load(PolicySource(policy=name, ckpt_path=path))
-    small = load(PolicySource(policy=name, ckpt_path=path, quantization="int8"))
-    weights = [each.model.mix.weight.detach() for each in (plain, small)]
-    assert type(weights[1]) is not type(weights[0])
-    gap = (weights[1].dequantize() - weights[0]).abs().max() / weights[0].abs().max()
-    assert 0 < gap < 0.01
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"execution": "fast"}, "execution .fast. is unknown; choose one of eager, comp"),
-        ({"quantization": "int4"}, "quantization 'int4' is unknown; choose one of int8, fp8"),
-    ],
-)
-def test_a_model_cannot_compute_in_unknown_ways(tmp_path, walking, options, text):
-    pytest.importorskip("torch")
-    options = {"policy": "checkpoint", "ckpt_path": str(tmp_path / "none"), **options}
-    with pytest.raises(ConfigError, match=text):
-        evaluate(tmp_path, **options)
-    assert not (tmp_path / "eval").exists()
-
-
-def test_a_model_that_continues_no_chunks_is_not_loaded_for_it(tmp_path, checkpoint):
-    live = {"chunk_joining": {"method": "rtc", "window": 3}}
-    walk = {**WALK, "limited": True}
-    with pytest.raises(
-        ConfigError, match=r"live has chunk_joining .*, and Strides cannot continue"
-    ):
-        evaluate(tmp_path, walk, policy="checkpoint", ckpt_path=str(checkpoint), live=live)
-    assert not (tmp_path / "eval_live").exists()
 
 
 def test_an_evaluation_without_any_result_is_none(tmp_path, walking):

@@ -217,7 +217,7 @@ def test_the_specifications_dataset_and_denormalisation_override(tmp_path):
     np.testing.assert_allclose(chunk, expected, rtol=1e-4)
 
 
-def test_pictures_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tmp_path):
+def test_images_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tmp_path):
     crop = {"type": "CropImages", "top": 0, "left": 0, "height": 12, "width": 32}
     transforms = [
         crop,

@@ -252,3 +252,14 @@ def make_rover() -> type[Rover]:
 @pytest.fixture
 def make_waver() -> type[Waver]:
     return Waver
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """``asked(person)``: whatever the command line says, this person gives the tasks."""
+
+    def say(person):
+        monkeypatch.setattr(BaseInferenceRunner, "_task_source", lambda self: person)
+        return person
+
+    return say

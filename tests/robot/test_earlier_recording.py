@@ -43,7 +43,7 @@ def test_every_number_and_pixel_is_the_same(recorded: Recorded) -> None:
     assert [len(states), digest(states)] == EXPECTED["states"]
     chunks = recorded.chunks()
     assert [len(chunks), digest(np.concatenate(chunks))] == EXPECTED["chunks"]
-    front = recorded.pictures["front"]
+    front = recorded.images["front"]
     images = np.stack([front.read(index) for index in range(len(front))])
     assert [len(front), digest(images)] == EXPECTED["pictures"]
 

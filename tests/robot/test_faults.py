@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import sys
 import time
@@ -13,132 +12,7 @@ import pytest
 
 from fluxvla_core.errors import Faulted, FluxError, NotReady, RunFailed, SafetyStop
 from fluxvla_core.ros2 import Stale
-
-
-def spoil(row: int, column: int, value: float):
-    def change(chunk):
-        chunk[row, column] = value
-        return chunk
-
-    return change
-
-
-def stand_still(seconds):
-    ctypes.PyDLL(None).usleep(int(seconds * 1e6))
-
-
-def fails(bench, kind, match, **arguments):
-    with pytest.raises(kind, match=match) as caught:
-        bench.run(**arguments)
-    return caught.value
-
-
-def assert_stopped(bench, rule: str, text: str) -> None:
-    """The robot was stopped and given back, and the record says why."""
-    assert bench.arm.calls[0] == "connect"
-    assert bench.arm.calls[1:] == ["stop", "stop", "close"]
-    summary = bench.episode()
-    assert summary["outcome"] == "failed"
-    assert text in summary["problem"]
-    assert [(trip["rule"], trip["what"]) for trip in summary["trips"]] == [
-        (rule, summary["problem"])
-    ]
-    (stop,) = [row for row in bench.trace() if row["event"] == "stop"]
-    assert stop["rule"] == rule
-    if rule != "tracking":
-        bench.assert_within_limits()
-        return
-    rows = [row for row in bench.trace() if row["event"] == "command"]
-    before = [np.array(row["command"]) for row in rows if row["phase"] == "run"]
-    after = [np.array(row["command"]) for row in rows if row["phase"] == "stop"]
-    # What blocks it is not pushed on; it is let go within the limits, and nothing more is sent.
-    assert (np.diff([before[-1][0], *(row[0] for row in after)]) <= 0).all()
-    np.testing.assert_array_equal(after[-1], bench.arm.state)
-    assert len(bench.arm.sent) == len(before) + len(after)
-    bench.assert_within_limits(sent=before)
-    bench.assert_within_limits(tuple(before[-1]), after)
-
-
-def assert_braked(bench) -> None:
-    """The last commands slow down to a hold within the acceleration limit."""
-    np.testing.assert_allclose(bench.arm.sent[-1], bench.arm.sent[-2], atol=1e-2)
-    assert bench.trace()[-2]["phase"] == "stop" or len(bench.arm.sent) == 25
-
-
-@pytest.mark.parametrize("call", [1, 2])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_chunk_that_is_not_finite(bench, call, bad):
-    bench.policy.faults[call] = spoil(3, 1, bad)
-
-    fails(bench, SafetyStop, "chunk is not finite: action 3, elbow is")
-    assert_stopped(bench, "chunk", "not finite")
-    assert len(bench.arm.sent) <= 35 * (call - 1)
-
-
-@pytest.mark.parametrize("shape", [(5, 2), (5, 4), (15,), (0, 3), (1, 5, 3)])
-def test_a_chunk_of_a_wrong_shape(bench, shape):
-    bench.policy.faults[2] = lambda chunk: np.zeros(shape)
-
-    fails(bench, SafetyStop, r"chunk has shape \(.*\); testarm takes \(T, 3\)")
-    assert_stopped(bench, "chunk", "has shape")
-
-
-def test_a_chunk_of_another_length_than_the_policy_said(bench):
-    bench.policy.faults[2] = lambda chunk: chunk[:3]
-
-    fails(bench, SafetyStop, "chunk has 3 actions; it said 5")
-    assert_stopped(bench, "chunk", "3 actions")
-
-
-@pytest.mark.parametrize("answer", ["left a bit", None, np.zeros((5, 3), complex)])
-def test_a_chunk_that_is_no_array(bench, answer):
-    bench.policy.faults[1] = lambda chunk: answer
-
-    fails(bench, SafetyStop, "the policy's chunk is no array of numbers")
-    assert_stopped(bench, "chunk", "no array")
-    assert bench.arm.sent == []
-
-
-def test_a_chunk_that_jumps(bench):
-    def jump(chunk):
-        chunk[2:, 0] = -1.0
-        chunk[:2, 0] = 1.5
-        return chunk
-
-    bench.policy.faults[2] = jump
-
-    fails(bench, SafetyStop, "action 2 wants shoulder to jump by -2.5; at full speed")
-    assert_stopped(bench, "chunk", "jump")
-    assert_braked(bench)
-
-
-def test_a_chunk_far_beyond_a_limit(bench):
-    bench.policy.faults[2] = spoil(4, 0, 9.0)
-
-    fails(bench, SafetyStop, r"action 4 wants shoulder at 9, far beyond its limits \[-1, 1.5\]")
-    assert_stopped(bench, "chunk", "far beyond")
-
-
-def test_a_chunk_a_little_beyond_a_limit_is_clamped(bench):
-    bench.policy.goal = 1.6
-
-    result = bench.run(max_publish_step=150)
-
-    assert result["outcome"] == "max_steps"
-    assert bench.arm.state[0] == 1.5
-    assert bench.episode()["clamps"]["shoulder"].keys() >= {"position"}
-    bench.assert_within_limits()
-
-
-@pytest.mark.parametrize("realtime", [False, pytest.param(True, marks=pytest.mark.realtime)])
-def test_a_policy_that_raises(bench, make_arm, realtime):
-    bench.arm = make_arm(realtime=realtime)
-    bench.policy.faults[3] = ValueError("out of memory")
-
-    error = fails(bench, RunFailed, "the policy raised ValueError: out of memory")
-    assert error.exit_code == 1
-    assert_stopped(bench, "policy", "out of memory")
-    assert_braked(bench)
+from tests.robot.faults import assert_braked, assert_stopped, fails, spoil
 
 
 def test_a_part_of_an_episode_that_ends_the_program(bench):
@@ -170,147 +44,6 @@ def test_an_operator_that_ends_the_program(bench, name):
     assert_stopped(bench, "frame", "SystemExit")
 
 
-@pytest.mark.parametrize("asynchronous", [False, True])
-@pytest.mark.realtime
-def test_a_policy_that_hangs_on_a_robot(bench, make_arm, asynchronous):
-    """The sender goes on sending holds in the meantime; then the motion is stopped."""
-    bench.arm = make_arm(realtime=True)
-    bench.policy.faults[4] = lambda chunk: time.sleep(3)
-
-    fails(
-        bench,
-        SafetyStop,
-        r"waits for a chunk for \d\.\d+ s, safety.starvation_s is 0.3: the policy took 0\.3",
-        async_execution=asynchronous,
-        max_publish_step=500,
-        safety={"starvation_s": 0.3},
-    )
-    assert_stopped(bench, "starvation", "waits for a chunk")
-    assert any("the policy still hangs" in line for line in bench.notes.lines)
-    holds = bench.arm.sent[-3:]
-    np.testing.assert_array_equal(holds[0], holds[-1])
-
-
-def test_a_policy_that_hangs_in_a_simulation(bench):
-    bench.policy.faults[2] = lambda chunk: time.sleep(3)
-
-    fails(
-        bench,
-        SafetyStop,
-        r"there was no chunk within 0.2 s: the policy took 0\.\d+ s of that",
-        safety={"first_chunk_s": 0.2},
-    )
-    assert_stopped(bench, "starvation", "no chunk")
-
-
-@pytest.mark.parametrize("asynchronous", [False, True])
-@pytest.mark.realtime
-def test_a_get_frame_that_blocks_in_motion_is_not_the_policys_doing(bench, make_arm, asynchronous):
-    bench.arm = make_arm(realtime=True)
-    bench.arm.faults = {"get_frame": lambda: time.sleep(3), "after": 20}
-
-    error = fails(
-        bench,
-        SafetyStop,
-        r"safety.starvation_s is 0.3: Arm\.get_frame\(\) took 0\.[23]\d s of that",
-        async_execution=asynchronous,
-        max_publish_step=500,
-        safety={"starvation_s": 0.3},
-    )
-    assert "camera that is read in this call" in error.cause
-    assert_stopped(bench, "starvation", "Arm.get_frame()")
-    assert any("Arm.get_frame() still hangs" in line for line in bench.notes.lines)
-
-
-def test_a_get_frame_that_blocks_in_a_simulation_is_told(bench):
-    """While it does: nobody knows whether it will return."""
-
-    def once():
-        if len(bench.arm.sent) >= 20:
-            bench.arm.faults.clear()
-            time.sleep(0.6)
-
-    bench.arm.faults = {"get_frame": once}
-    assert bench.run(safety={"starvation_s": 0.2})["outcome"] == "max_steps"
-
-    (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert "Arm.get_frame() has not returned for 0." in line
-
-
-def test_a_get_frame_that_takes_too_long_in_a_simulation(bench):
-    bench.arm.faults = {"get_frame": lambda: time.sleep(0.3), "after": 20}
-
-    fails(
-        bench,
-        SafetyStop,
-        r"no chunk within 0.2 s: Arm\.get_frame\(\) took 0\.3\d s of that",
-        safety={"first_chunk_s": 0.2},
-    )
-    assert_stopped(bench, "starvation", "Arm.get_frame()")
-
-
-@pytest.mark.realtime
-def test_a_get_frame_that_returns_late_says_which_stream_came_last(bench, make_arm):
-    bench.arm = make_arm(realtime=True)
-    good = bench.arm.get_frame
-
-    def late():
-        frame = good()
-        if len(bench.arm.sent) >= 20:
-            time.sleep(0.4)
-            frame.stamps["front"] = bench.arm.now()
-        return frame
-
-    bench.arm.get_frame = late
-
-    error = fails(bench, SafetyStop, r"streams state and front are 0\.4\d s apart")
-    assert re.match(r"Arm\.get_frame\(\) took 0\.4\d s; front came last in it", error.cause)
-
-
-@pytest.mark.realtime
-def test_a_process_that_stood_still_blames_neither_the_policy_nor_a_stream(bench, make_arm):
-    """Native code that sleeps without giving up the interpreter: nothing else runs meanwhile."""
-    bench.arm = make_arm(realtime=True)
-    bench.policy.faults[4] = lambda chunk: stand_still(0.8)
-
-    fails(
-        bench,
-        SafetyStop,
-        r"safety.starvation_s is 0.3: this machine took 0\.\d+ s of that",
-        max_publish_step=500,
-        safety={"starvation_s": 0.3},
-    )
-    assert_stopped(bench, "starvation", "this machine")
-
-    bench.arm, bench.policy.faults = make_arm(realtime=True), {}
-    good = bench.arm.get_frame
-
-    def paused():
-        frame = good()
-        if len(bench.arm.sent) >= 20:
-            stand_still(0.8)
-        return frame
-
-    bench.arm.get_frame = paused
-    error = fails(bench, SafetyStop, "is stale: .*; this machine let the program stand still for")
-    assert "the process was paused" in error.cause
-
-
-@pytest.mark.realtime
-def test_a_send_action_that_blocks_is_told(bench, make_arm):
-    bench.arm = make_arm(realtime=True)
-
-    def once():
-        if len(bench.arm.sent) == 20:
-            time.sleep(0.6)
-
-    bench.arm.faults = {"send_action": once}
-    bench.run(safety={"starvation_s": 0.2})
-
-    (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert "Arm.send_action() has not returned for 0." in line
-
-
 @pytest.mark.parametrize("after", [0, 7])
 def test_an_operator_that_raises_in_send_action(bench, after):
     bench.arm.faults = {"send_action": OSError("cable pulled"), "after": after}
@@ -336,18 +69,6 @@ def test_an_operator_whose_stop_raises_is_reported_and_closed(bench):
     assert bench.arm.calls[-1] == "close"
     # Tried again at the run's end, and not said again.
     assert bench.notes.lines.count("warning: Arm.stop raised OSError: no answer") == 1
-
-
-@pytest.mark.realtime
-def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, monkeypatch):
-    monkeypatch.setattr("fluxvla_core.robot.robot.STOP_S", 0.1)
-    bench.arm = make_arm(realtime=True)
-    bench.arm.faults = {"stop": lambda: time.sleep(1)}
-
-    bench.run(max_publish_step=5)
-
-    (line,) = [line for line in bench.notes.lines if "emergency" in line]
-    assert "Arm.stop did not return within 0.1 s: use the robot's emergency stop" in line
 
 
 def test_a_robot_that_does_not_follow(bench):
@@ -461,17 +182,6 @@ def test_a_state_that_is_not_finite_after_a_command(bench):
     assert_braked(bench)
 
 
-def test_a_policy_that_raises_in_reset(bench):
-    def reset(seed):
-        raise ValueError("no such seed")
-
-    bench.policy.reset = reset
-
-    fails(bench, RunFailed, r"the policy raised ValueError in reset\(\): no such seed")
-    assert_stopped(bench, "policy", "no such seed")
-    assert bench.arm.sent == []
-
-
 def test_a_stream_that_froze(bench):
     bench.arm.faults["frozen_after"] = 20
 
@@ -526,47 +236,6 @@ def test_a_reading_that_is_old_moves_nothing(bench, make_arm):
     assert bench.arm.sent == []
 
 
-def test_motion_does_not_begin_with_an_answer_that_took_long(bench, make_arm):
-    """The second may, too: libraries compile more than once, and servers pause."""
-    bench.arm = make_arm(realtime=True)
-
-    def slow(chunk):
-        time.sleep(0.5)
-        return chunk
-
-    bench.policy.faults = {1: slow, 2: slow}
-    bench.run(max_publish_step=20, safety={"starvation_s": 0.3})
-
-    assert len(bench.policy.asked) >= 3
-    first = next(row for row in bench.trace() if row["event"] == "chunk")
-    assert first["ms"]["policy"] < 300
-
-
-def test_a_policy_that_is_slow_for_good_is_not_asked_for_ever(bench, make_arm):
-    """Long chunks may make up for it; where they do not, starvation says so."""
-    bench.arm = make_arm(realtime=True)
-    think = bench.policy.predict_action
-
-    def slow(observation):
-        time.sleep(0.3)
-        return think(observation)
-
-    bench.policy.predict_action = slow
-    bench.run(max_publish_step=20, safety={"starvation_s": 0.2})
-
-    first = next(row for row in bench.trace() if row["event"] == "chunk")
-    assert first["ms"]["policy"] >= 300
-    assert len(bench.policy.asked) >= 3
-
-
-def test_a_robot_whose_get_frame_hangs(bench, make_arm):
-    bench.arm = make_arm(realtime=True)
-    bench.arm.faults["get_frame"] = lambda: time.sleep(2)
-
-    fails(bench, NotReady, r"Arm\.get_frame does not return", ready_timeout=0.2)
-    assert bench.arm.sent == []
-
-
 def test_a_robot_that_is_ready_after_a_while(bench):
     begin = time.monotonic()
 
@@ -586,7 +255,7 @@ def test_a_joint_outside_its_limits_at_the_start(bench):
     assert bench.arm.sent == []
 
 
-def test_a_picture_of_another_size(bench):
+def test_an_image_of_another_size(bench):
     from fluxvla_core.contracts.frame import Frame
 
     good = bench.arm.get_frame

@@ -100,8 +100,7 @@ def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make
     times = [event["t"] for event in found.of("observation")]
     assert len(set(times)) == len(times) > len(found.chunks())
     recorded = {
-        int(found.pictures["front"].read(found.pictures["front"].newest(at))[0, 0, 0])
-        for at in times
+        int(found.images["front"].read(found.images["front"].newest(at))[0, 0, 0]) for at in times
     }
     assert seen <= recorded
     table = {"type": "ReplayOperator", "recording": f"{root}/001-1"}

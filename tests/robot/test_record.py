@@ -89,8 +89,8 @@ def test_what_is_read_back_is_what_happened(bench):
     assert [len(chunk) for chunk in found.chunks()] == [5] * len(bench.policy.asked)
     seen = [event["t"] for event in found.of("observation")]
     for asked, at in zip(bench.policy.asked, seen[1:], strict=True):  # the first is of the start
-        index = found.pictures["front"].newest(at)
-        np.testing.assert_array_equal(found.pictures["front"].read(index), asked["images"]["front"])
+        index = found.images["front"].newest(at)
+        np.testing.assert_array_equal(found.images["front"].read(index), asked["images"]["front"])
     summary = json.loads((found.path / "episode.json").read_text())
     assert summary.pop("dropped") == {"frames": 0, "pictures": 0, "events": 0}
     assert summary == found.summary()
@@ -104,8 +104,8 @@ def test_depth_and_base_are_recorded_and_read_back(bench, make_rover):
 
     seen = found.of("observation")
     for event in seen:
-        index = found.pictures["front"].newest(event["stamps"]["front"])
-        count = int(found.pictures["front"].read(index)[0, 0, 0])
+        index = found.images["front"].newest(event["stamps"]["front"])
+        count = int(found.images["front"].read(index)[0, 0, 0])
         assert event["base"] == make_rover.speeds(count)
         index = found.depths["front"].newest(event["stamps"]["front_depth"])
         np.testing.assert_array_equal(found.depths["front"].read(index), make_rover.depth(count))
@@ -141,7 +141,7 @@ def test_lines_and_bag_hold_the_same_events(bench, tmp_path, make_arm):
         return [{k: v for k, v in e.items() if k not in ("ms", "began")} for e in events]
 
     assert facts(lines.events) == facts(found.events)
-    assert lines.pictures == {}
+    assert lines.images == {}
 
 
 @pytest.mark.parametrize(
@@ -238,13 +238,13 @@ class Tapped:
 
 
 @pytest.mark.realtime
-def test_pictures_that_nobody_looked_at_are_recorded_where_the_robot_keeps_them(bench, make_arm):
+def test_images_that_nobody_looked_at_are_recorded_where_the_robot_keeps_them(bench, make_arm):
     bench.arm = make_arm(realtime=True)
     Tapped(bench.arm)
 
     found = recorded(bench, max_publish_step=60, record_fps=10)
 
-    times = np.diff(found.pictures["front"].times)
+    times = np.diff(found.images["front"].times)
     arrived = np.count_nonzero(times > 1e-3)  # what was looked at lies in between
     lost = json.loads((found.path / "episode.json").read_text())["dropped"]["pictures"]
     assert found.native
@@ -294,7 +294,7 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     times, commands = found.commands()
     assert len(commands) > 10
     assert len(found.chunks()) > 0
-    assert found.pictures["front"].read(len(found.pictures["front"]) - 1).shape == (24, 32, 3)
+    assert found.images["front"].read(len(found.images["front"]) - 1).shape == (24, 32, 3)
     outcome = "interrupted" if found.whole else "cut short"
     assert found.summary()["outcome"] == outcome
     assert np.diff(times).max() < 5

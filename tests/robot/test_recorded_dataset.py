@@ -81,7 +81,7 @@ def test_a_row_holds_what_was_known_then_and_what_was_commanded_next(recordings,
     assert validate(out) == []
 
 
-def test_pictures_belong_to_their_rows(recordings, tmp_path):
+def test_images_belong_to_their_rows(recordings, tmp_path):
     from fluxvla_core.data.dataset import ParquetDataset
 
     out = recordings_to_dataset([recordings / "001-1"], tmp_path / "data")
@@ -89,9 +89,7 @@ def test_pictures_belong_to_their_rows(recordings, tmp_path):
     found = ParquetDataset(str(out), [], ["front"])
     first = open_recording(recordings / "001-1")
     for row in (0, 7, 30):
-        image = first.pictures["front"].read(
-            first.pictures["front"].newest(row_times(first, 50)[row])
-        )
+        image = first.images["front"].read(first.images["front"].newest(row_times(first, 50)[row]))
         seen = np.asarray(found[row]["images"][0], dtype=np.float64)
         assert abs(seen.mean() - image.mean()) < 3  # h264 is not exact
     assert found.embodiment.joint_names == ("shoulder", "elbow", "jaw")
@@ -108,7 +106,7 @@ def test_fewer_rows_a_second_take_the_command_at_the_next_row(recordings, tmp_pa
     assert said.lines == []
 
 
-def test_rows_that_show_a_picture_again_are_said(make_bench, tmp_path):
+def test_rows_that_show_an_image_again_are_said(make_bench, tmp_path):
     bench, said = make_bench(tmp_path), Said()
     bench.run(record=str(tmp_path / "rec"), record_fps=10, max_publish_step=50)
 

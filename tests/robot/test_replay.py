@@ -150,10 +150,10 @@ class Streams:
         return self.at(self.newest(self.STATE_HZ, self.arm.now()))
 
     def get_frame(self):
-        picture = self.newest(self.CAMERA_HZ, self.arm.now() - self.LATE_S)
-        state = self.newest(self.STATE_HZ, picture)
-        stamps = {"front": picture + self.LATE_S, "state": state}
-        image = np.full((24, 32, 3), int(picture * self.CAMERA_HZ) % 256, np.uint8)
+        imaged_at = self.newest(self.CAMERA_HZ, self.arm.now() - self.LATE_S)
+        state = self.newest(self.STATE_HZ, imaged_at)
+        stamps = {"front": imaged_at + self.LATE_S, "state": state}
+        image = np.full((24, 32, 3), int(imaged_at * self.CAMERA_HZ) % 256, np.uint8)
         return RobotFrame(self.at(state), {"front": image}, stamps)
 
     def send_action(self, action):
@@ -202,8 +202,8 @@ def test_streams_of_their_own_rates_never_run_backwards_in_a_replay(streams):
         frame = shown[event["t"]]
         assert frame.stamps == pytest.approx(event["stamps"], abs=1e-9)
         np.testing.assert_array_equal(frame.state, event["state"])
-        place = recorded.pictures["front"].newest(event["stamps"]["front"])
-        np.testing.assert_array_equal(frame.images["front"], recorded.pictures["front"].read(place))
+        place = recorded.images["front"].newest(event["stamps"]["front"])
+        np.testing.assert_array_equal(frame.images["front"], recorded.images["front"].read(place))
 
 
 @pytest.mark.parametrize("joining", METHODS)
@@ -216,9 +216,9 @@ def test_streams_of_their_own_rates_are_replayed_with_every_joiner(bench, stream
     assert bench.episode()["outcome"] == "done"
 
 
-def test_a_picture_that_was_not_recorded_in_time_does_not_end_a_replay(streams):
+def test_an_image_that_was_not_recorded_in_time_does_not_end_a_replay(streams):
     operator = ReplayOperator(streams)
-    images = operator.recorded.pictures["front"]
+    images = operator.recorded.images["front"]
     first = images.read(1)
     # As where the disk was too slow for the very first one.
     del images.times[0], images._places[0]

@@ -41,7 +41,7 @@ def test_an_episode_cut_in_full_motion_still_brakes_within_limits(bench):
     np.testing.assert_allclose(bench.arm.sent[-1], bench.arm.sent[-2], atol=1e-3)
 
 
-def test_the_policy_hears_the_tasks_words_and_sees_the_pictures(bench):
+def test_the_policy_hears_the_tasks_words_and_sees_the_images(bench):
     bench.run(task="2")
 
     asked = bench.policy.asked[0]
@@ -151,7 +151,7 @@ def test_every_clamp_is_in_the_record(bench):
     bench.assert_within_limits()
 
 
-def test_pictures_become_a_video_for_each_camera(bench):
+def test_images_become_a_video_for_each_camera(bench):
     av = pytest.importorskip("av")
 
     bench.run(record_fps=10)

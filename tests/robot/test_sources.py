@@ -50,6 +50,18 @@ class Person(TaskSource):
         return self.lines.pop(0)
 
 
+class Slow(Person):
+    """Thinks for so many polls before each line."""
+
+    def __init__(self, *lines, polls=10):
+        super().__init__(*lines)
+        self.polls = polls
+
+    def ask(self):
+        super().ask()
+        self.thinking = self.polls
+
+
 def test_given_tasks_come_in_order_and_once():
     said = []
     given = [Task("cube", KNOWN["cube"]), Task("stir the soup", "stir the soup", free=True)]

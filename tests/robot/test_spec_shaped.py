@@ -150,7 +150,7 @@ def test_an_operator_that_is_sent_actions_and_cannot_be_stopped_is_refused(bench
     assert arm.calls == []
 
 
-def test_joint_states_that_come_after_the_pictures_are_waited_for(bare):
+def test_joint_states_that_come_after_the_images_are_waited_for(bare):
     """The specification's runner makes one NaN of a state that is None."""
     bare.arm.state_after = 3
 

@@ -81,7 +81,7 @@ class Arm:
             state[int(abs(amount)) % 3] = np.nan
         elif kind == "short":
             state = state[:2]
-        elif kind == "picture":
+        elif kind == "image":
             image = np.zeros((4, 8, 3), np.uint8)
         elif kind == "stamps":
             stamps["front"] += amount
@@ -280,7 +280,7 @@ ENDING = st.tuples(
     st.sampled_from([*MOVES, "nan", "shape"]),
     AMOUNTS,
     AMOUNTS,
-    st.sampled_from(["", "elsewhere", "nan", "short", "picture", "stamps", "blind"]),
+    st.sampled_from(["", "elsewhere", "nan", "short", "image", "stamps", "blind"]),
 )
 MOVE = st.integers(0, 9).flatmap(lambda n: ENDING if n == 0 else GOOD)
 SCRIPTS = st.lists(MOVE, min_size=CHUNKS, max_size=CHUNKS)

@@ -39,7 +39,7 @@ STATE = {
     "names": ["grip", "finger", "elbow", "wrist"],
     "positions": [0.5, 9.0, 0.1, 0.2],
 }
-PICTURES = {"topic": "/cam/image", "message": IMAGE, "hz": 30, "height": 48, "width": 64}
+CAMERA = {"topic": "/cam/image", "message": IMAGE, "hz": 30, "height": 48, "width": 64}
 COMMANDS = {"topic": "/arm/command", "message": JOINT_STATE}
 
 

@@ -86,7 +86,7 @@ def test_metres_stay_metres():
     np.testing.assert_array_equal(images.to_depth(message(sent, "32FC1", 8), 1, 2), sent)
 
 
-def test_a_view_copies_nothing_and_a_picture_is_copied_once():
+def test_a_view_copies_nothing_and_an_image_is_copied_once():
     sent = message(np.zeros((480, 640, 3), np.uint8), "rgb8")
     assert np.shares_memory(images.view(sent), np.frombuffer(sent.data, np.uint8))
 
@@ -119,7 +119,7 @@ def test_what_does_not_fit_is_named(call, sent, what):
 
 
 @pytest.mark.parametrize("change", [{"step": 10}, {"height": 5}, {"data": array.array("B")}])
-def test_damaged_pictures_are_refused(change):
+def test_damaged_images_are_refused(change):
     sent = message(colours(), "rgb8")
     vars(sent).update(change)
 
@@ -177,7 +177,7 @@ class TestCompressed:
         assert np.abs(got.astype(int) - rgb).max() <= 4
 
     @pytest.mark.parametrize("form", ["mono8; jpeg compressed ", "jpeg"])
-    def test_a_compressed_picture_without_colours_is_refused(self, form):
+    def test_a_compressed_image_without_colours_is_refused(self, form):
         grey = self.packed(np.full((48, 64), 90, np.uint8), ".jpg", form)
 
         with pytest.raises(BadMessage, match="sends mono8 images, which have no colours"):
@@ -226,7 +226,7 @@ class TestCompressed:
         with pytest.raises(ValueError, match=what):
             images.fill_compressed(SimpleNamespace(), pixels, encoding, form)
 
-    def test_a_compressed_picture_has_a_size_too(self):
+    def test_a_compressed_image_has_a_size_too(self):
         with pytest.raises(BadMessage, match="sends 6x4 images, the embodiment says 6x8"):
             images.to_rgb(self.packed(colours(), ".png", "png"), 8, 6)
 

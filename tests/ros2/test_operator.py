@@ -12,9 +12,9 @@ import pytest
 from fluxvla_core.errors import Faulted, NotReady, Rejected
 from fluxvla_core.ros2 import JOINT_STATE, BadMessage, Stale, StreamSpec, joints
 from tests.ros2.arm import (
+    CAMERA,
     COMMANDS,
     NAMES,
-    PICTURES,
     STATE,
     Arm,
     frame_error,
@@ -39,7 +39,7 @@ class TwoArms(Arm):
 
 @pytest.fixture(scope="module")
 def lasting_robot(lasting_drivers):
-    return lasting_drivers([STATE, SECOND, PICTURES], [COMMANDS], name="robot")
+    return lasting_drivers([STATE, SECOND, CAMERA], [COMMANDS], name="robot")
 
 
 def settled(robot):
@@ -74,7 +74,7 @@ def arm(operators, robot):
     return operator
 
 
-def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
+def test_a_frame_has_state_by_name_images_and_receipt_stamps(arm):
     frame = arm.get_frame()
 
     np.testing.assert_array_equal(frame.state, [0.1, 0.2, 0.5])
@@ -84,7 +84,7 @@ def test_a_frame_has_state_by_name_pictures_and_receipt_stamps(arm):
     assert all(0 <= time.monotonic() - stamp < 1.0 for stamp in frame.stamps.values())
 
 
-def test_pictures_that_nobody_looked_at_can_be_had(arm):
+def test_images_that_nobody_looked_at_can_be_had(arm):
     images, received = arm.images_after("cam", 0.0)
     assert received >= len(images) > 0
     assert all(image.shape == (48, 64, 3) for _, image in images)
@@ -282,7 +282,7 @@ class TestFaults:
         with pytest.raises(Stale, match=r"cam \(/cam/image\) is silent"):
             arm.get_state()
 
-    def test_a_camera_that_repeats_its_last_picture_is_silent_too(self, arm, robot):
+    def test_a_camera_that_repeats_its_last_image_is_silent_too(self, arm, robot):
         robot.tell(fault="/cam/image=freeze")
 
         frame_error(arm, "cam (/cam/image) is silent for ")

@@ -12,8 +12,8 @@ from fluxvla_core.errors import ConfigError, NotReady
 from fluxvla_core.ros2 import AUXILIARY, JOINT_STATE, StreamSpec, camera_stream, qos
 from tests.ros2.arm import (
     CAM,
+    CAMERA,
     COMMANDS,
-    PICTURES,
     STATE,
     Arm,
     frame_error,
@@ -36,14 +36,14 @@ def test_missing_topics_are_named_with_those_that_exist(operators, drivers):
 
 def test_another_type_is_named(operators, drivers):
     packed = "sensor_msgs.msg:CompressedImage"
-    drivers([STATE, {**PICTURES, "message": packed, "format": "jpeg"}], [COMMANDS])
+    drivers([STATE, {**CAMERA, "message": packed, "format": "jpeg"}], [COMMANDS])
     error = refusal_of(operators)
 
     assert error.what.startswith("cam (/cam/image) is published as sensor_msgs/msg/CompressedImage")
 
 
 @pytest.mark.parametrize(("form", "off"), [("jpeg", 4), ("png", 0)])
-def test_compressed_pictures_are_read(operators, drivers, monkeypatch, form, off):
+def test_compressed_images_are_read(operators, drivers, monkeypatch, form, off):
     topic = "/cam/image/compressed"
     monkeypatch.setattr(
         Arm,
@@ -51,7 +51,7 @@ def test_compressed_pictures_are_read(operators, drivers, monkeypatch, form, off
         lambda _: [StreamSpec("arm", "/arm/state", JOINT_STATE), camera_stream(CAM, topic)],
     )
     packed = "sensor_msgs.msg:CompressedImage"
-    drivers([STATE, {**PICTURES, "topic": topic, "message": packed, "format": form}], [COMMANDS])
+    drivers([STATE, {**CAMERA, "topic": topic, "message": packed, "format": form}], [COMMANDS])
     operator = operators()
     operator.connect()
 
@@ -60,7 +60,7 @@ def test_compressed_pictures_are_read(operators, drivers, monkeypatch, form, off
 
 
 def test_a_publisher_that_never_sends_is_named(operators, drivers):
-    drivers([STATE, PICTURES], [COMMANDS]).tell(fault="/cam/image=drop")
+    drivers([STATE, CAMERA], [COMMANDS]).tell(fault="/cam/image=drop")
     time.sleep(0.2)
     error = refusal_of(operators)
 
@@ -68,13 +68,13 @@ def test_a_publisher_that_never_sends_is_named(operators, drivers):
 
 
 def test_commands_that_nobody_hears_are_an_error(operators, drivers):
-    drivers([STATE, PICTURES])
+    drivers([STATE, CAMERA])
 
     assert refusal_of(operators).what.startswith("nobody listens on /arm/command")
 
 
 def test_the_shared_memory_trap_is_named_at_start_up(drivers, operators):
-    large = {**PICTURES, "height": 1536, "width": 2048, "best_effort": True}
+    large = {**CAMERA, "height": 1536, "width": 2048, "best_effort": True}
     drivers([STATE, large], [COMMANDS])
     operator = operators(rate_window_s=0.5)
 
@@ -93,16 +93,16 @@ def test_a_lossy_stream_is_a_warning(drivers, operators, caplog, monkeypatch):
         ]
 
     monkeypatch.setattr(Arm, "streams", streams)
-    drivers([STATE, PICTURES], [COMMANDS])
+    drivers([STATE, CAMERA], [COMMANDS])
     operators(rate_window_s=0.5).connect()
 
     assert "arm (/arm/state): " in caplog.text
     assert "messages arrived in 0.5 s" in caplog.text
 
 
-def test_pictures_from_another_dds_are_a_warning(drivers, operators, caplog, monkeypatch):
+def test_images_from_another_dds_are_a_warning(drivers, operators, caplog, monkeypatch):
     monkeypatch.setattr(qos, "_vendor", lambda offer: b"\x01\x10")
-    drivers([STATE, PICTURES], [COMMANDS])
+    drivers([STATE, CAMERA], [COMMANDS])
     operators().connect()
 
     (warning,) = [line for line in caplog.messages if "another DDS" in line]
@@ -111,16 +111,16 @@ def test_pictures_from_another_dds_are_a_warning(drivers, operators, caplog, mon
     assert "fastdds_large_frames.xml" in warning
 
 
-def test_pictures_from_the_same_dds_are_none(drivers, operators, caplog):
-    drivers([STATE, PICTURES], [COMMANDS])
+def test_images_from_the_same_dds_are_none(drivers, operators, caplog):
+    drivers([STATE, CAMERA], [COMMANDS])
     operators().connect()
 
     assert "another DDS" not in caplog.text
 
 
-def test_best_effort_pictures_from_another_dds_are_none(drivers, operators, caplog, monkeypatch):
+def test_best_effort_images_from_another_dds_are_none(drivers, operators, caplog, monkeypatch):
     monkeypatch.setattr(qos, "_vendor", lambda offer: b"\x01\x10")
-    drivers([STATE, {**PICTURES, "best_effort": True}], [COMMANDS])
+    drivers([STATE, {**CAMERA, "best_effort": True}], [COMMANDS])
     operators().connect()
 
     assert "another DDS" not in caplog.text
@@ -173,20 +173,20 @@ def test_before_connecting_there_is_nothing():
 
 @pytest.mark.parametrize("ending", ["close", "kill"])
 def test_a_driver_that_left_and_comes_back(operators, drivers, ending):
-    robot, arm = drivers([STATE, PICTURES], [COMMANDS]), operators()
+    robot, arm = drivers([STATE, CAMERA], [COMMANDS]), operators()
     arm.connect()
     getattr(robot, ending)()
     error = frame_error(arm, "(/cam/image) is silent for ")
     # Who was killed is on the graph for another 20 s.
     assert ("the driver is gone: nobody publishes" in error.cause) == (ending == "close")
 
-    drivers([STATE, PICTURES], [COMMANDS])
+    drivers([STATE, CAMERA], [COMMANDS])
     wait_for(lambda: all(time.monotonic() - arm.newest(n).receipt < 0.2 for n in ("arm", "cam")))
     assert frames_of(arm)
 
 
 def test_streams_without_stamps_are_matched_by_receipt(operators, drivers):
-    drivers([{**STATE, "stamped": False}, {**PICTURES, "stamped": False}], [COMMANDS])
+    drivers([{**STATE, "stamped": False}, {**CAMERA, "stamped": False}], [COMMANDS])
     operator = operators()
     operator.connect()
 
@@ -197,7 +197,7 @@ def test_a_side_stream_that_need_not_be_there_is_not_missed(drivers, operators, 
     streams = Arm.streams(Arm())
     side = StreamSpec("mode", "/mode", "std_msgs.msg:Bool", kind=AUXILIARY, required=False)
     monkeypatch.setattr(Arm, "streams", lambda self: [*streams, side])
-    drivers([STATE, PICTURES], [COMMANDS])
+    drivers([STATE, CAMERA], [COMMANDS])
     operator = operators()
     operator.connect()
 

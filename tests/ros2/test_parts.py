@@ -11,7 +11,7 @@ from fluxvla_core.errors import NotReady, Rejected
 from fluxvla_core.operators import Part
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE, Stale
 from fluxvla_core.ros2.connection import WATCH_S
-from tests.ros2.arm import COMMANDS, PICTURES, STATE, Arm, wait_for
+from tests.ros2.arm import CAMERA, COMMANDS, STATE, Arm, wait_for
 
 TARGET = np.array([0.3, -0.2, 0.8])
 
@@ -37,7 +37,7 @@ class Wired(Arm):
 @pytest.fixture
 def robot(drivers):
     follows = {**STATE, "follows": COMMANDS["topic"]}
-    return drivers([follows, PICTURES], [COMMANDS], name="robot")
+    return drivers([follows, CAMERA], [COMMANDS], name="robot")
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def heard(robot):
     return robot.on(COMMANDS["topic"])
 
 
-def test_both_parts_read_the_same_state_and_one_of_them_the_pictures(both):
+def test_both_parts_read_the_same_state_and_one_of_them_the_images(both):
     control, cameras = both
     frame = cameras.get_frame()
 
@@ -151,7 +151,7 @@ def test_the_part_without_commands_sends_nothing_and_its_hooks_are_not_called(bo
 
 def test_a_camera_that_falls_silent_is_noticed_where_it_is_read(both, robot):
     control, cameras = both
-    robot.tell(fault=f"{PICTURES['topic']}=drop")
+    robot.tell(fault=f"{CAMERA['topic']}=drop")
     wait_for(lambda: says_silent(cameras, "cam (/cam/image)"))
 
     control.send_action(TARGET)
@@ -165,7 +165,7 @@ def test_joint_states_that_fall_silent_are_noticed_in_both(both, robot):
         wait_for(lambda part=part: says_silent(part, "arm (/arm/state)"))
 
 
-def test_the_part_without_cameras_needs_no_camera_and_no_picture_type(parts, drivers, monkeypatch):
+def test_the_part_without_cameras_needs_no_camera_and_no_image_type(parts, drivers, monkeypatch):
     from fluxvla_core.ros2 import operator as module
 
     asked, import_it = [], module.message_class
@@ -181,7 +181,7 @@ def test_the_part_without_cameras_needs_no_camera_and_no_picture_type(parts, dri
 
 
 def test_the_part_without_commands_needs_no_listener_and_minds_no_commander(parts, drivers):
-    drivers([STATE, PICTURES, {**STATE, "topic": COMMANDS["topic"]}])
+    drivers([STATE, CAMERA, {**STATE, "topic": COMMANDS["topic"]}])
     control, cameras = parts(connect_timeout_s=2.0, rate_window_s=0.5)
     cameras.connect()
 

@@ -81,7 +81,7 @@ def test_other_losses_are_not_blamed_on_it(bad):
     assert "slower than expected" in caught.value.cause
 
 
-def test_the_profile_ships_and_its_segment_holds_a_picture():
+def test_the_profile_ships_and_its_segment_holds_an_image():
     path = Path(large_frames_profile())
     space = "{http://www.eprosima.com}"
     (segment,) = ElementTree.parse(path).iter(f"{space}segment_size")

@@ -37,7 +37,7 @@ def test_a_ring_holds_at_least_one():
         Ring(0)
 
 
-def test_a_repeated_picture_is_no_news_however_long_it_is_repeated():
+def test_a_repeated_image_is_no_news_however_long_it_is_repeated():
     ring, kept = fed([5.0] + [5.1] * 40)
 
     assert kept == [True, True] + [False] * 39

@@ -22,7 +22,7 @@ def wait_for(condition, seconds=30.0):
 
 
 @pytest.fixture
-def pictures(ros_domain):
+def camera(ros_domain):
     connection = Connection("viewer")
     yield connection.subscribe("cam", "/cam", message_class(IMAGE), depth=4)
     connection.close()
@@ -34,26 +34,26 @@ def count(stream, seconds):
     return stream.ring.received - before, stream.lost - lost
 
 
-def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(pictures, drivers):
+def test_reliable_is_taken_where_it_is_offered_and_nothing_is_lost(camera, drivers):
     # So slow that the queue of ten outlasts the seconds for which a busy machine may stop us.
     drivers([{**CAMERA, "hz": 5}])
-    wait_for(pictures.newest)
-    lost = pictures.lost
-    wait_for(lambda: pictures.ring.received >= 8)
+    wait_for(camera.newest)
+    lost = camera.lost
+    wait_for(lambda: camera.ring.received >= 8)
 
-    assert pictures.reliability == "reliable"
-    assert pictures.lost == lost
-    assert len(pictures.ring.items()) == 4
+    assert camera.reliability == "reliable"
+    assert camera.lost == lost
+    assert len(camera.ring.items()) == 4
 
 
-def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
+def test_the_shared_memory_trap_is_real_and_counted(camera, drivers):
     """If this fails because all arrive, Fast DDS was mended and ``ReceptionStats`` can go."""
     drivers([{**CAMERA, "height": 1536, "width": 2048, "best_effort": True}])
-    wait_for(lambda: pictures.lost > 0)
-    received, lost = count(pictures, 1.0)
-    stats = ReceptionStats("cam", pictures.reliability, 1.0, received, lost, 0)
+    wait_for(lambda: camera.lost > 0)
+    received, lost = count(camera, 1.0)
+    stats = ReceptionStats("cam", camera.reliability, 1.0, received, lost, 0)
 
-    assert pictures.reliability == "best_effort"
+    assert camera.reliability == "best_effort"
     assert is_trap(stats)
 
 
@@ -61,28 +61,28 @@ def test_the_shared_memory_trap_is_real_and_counted(pictures, drivers):
     (metadata.version("rclpy") if util.find_spec("rclpy") else "").startswith("7."),
     reason="Jazzy overrides a profile's transports while discovery is limited to this machine",
 )
-def test_the_profile_in_the_publisher_springs_the_trap(pictures, drivers, monkeypatch):
+def test_the_profile_in_the_publisher_springs_the_trap(camera, drivers, monkeypatch):
     monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", large_frames_profile())
     drivers([{**CAMERA, "best_effort": True}])
-    wait_for(pictures.newest)
-    received, lost = pictures.ring.received, pictures.lost
-    wait_for(lambda: pictures.ring.received >= received + 20)
+    wait_for(camera.newest)
+    received, lost = camera.ring.received, camera.lost
+    wait_for(lambda: camera.ring.received >= received + 20)
 
-    assert pictures.reliability == "best_effort"
-    assert pictures.lost - lost <= 2
+    assert camera.reliability == "best_effort"
+    assert camera.lost - lost <= 2
 
 
-def test_a_driver_that_comes_back_with_other_settings_is_heard_again(pictures, drivers):
+def test_a_driver_that_comes_back_with_other_settings_is_heard_again(camera, drivers):
     small = {**CAMERA, "height": 48, "width": 64}
     first = drivers([small])
-    wait_for(lambda: pictures.newest() and pictures.reliability == "reliable")
+    wait_for(lambda: camera.newest() and camera.reliability == "reliable")
 
     first.close()
-    before = pictures.ring.received
+    before = camera.ring.received
     drivers([{**small, "best_effort": True}])
-    wait_for(lambda: pictures.ring.received > before + 3)
+    wait_for(lambda: camera.ring.received > before + 3)
 
-    assert pictures.reliability == "best_effort"
+    assert camera.reliability == "best_effort"
 
 
 def test_latched_topics_give_their_last_message_to_who_comes_late(ros_domain, drivers):

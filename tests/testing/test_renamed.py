@@ -8,7 +8,7 @@ from fluxvla_core.testing import EnvironmentConformance, ModelConformance, Trans
 
 
 @pytest.mark.parametrize("kit", [EnvironmentConformance, ModelConformance, TransformConformance])
-def test_picture_still_works(kit):
+def test_picture_is_deprecated_and_still_works(kit):
     with pytest.warns(DeprecationWarning, match="Own.picture is deprecated, use image_size"):
         own = type("Own", (kit,), {"picture": (20, 30)})
     assert own.image_size == (20, 30)

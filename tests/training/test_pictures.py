@@ -145,7 +145,7 @@ def leave(monkeypatch):
 
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("kind", ["one", "mixture"])
-def test_nothing_changes_in_a_run_but_where_pictures_are_normalised(
+def test_nothing_changes_in_a_run_but_where_images_are_normalised(
     roots, tmp_path, leave, kind, workers
 ):
     dataset = table(roots[0]) if kind == "one" else mixture(roots)

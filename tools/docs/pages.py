@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 DOCS = "docs"
-PICTURES = {".jpg", ".png", ".svg"}
+IMAGE_SUFFIXES = {".jpg", ".png", ".svg"}
 _FIXED = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -78,7 +78,7 @@ def linked_files(root: Path) -> dict[str, str]:
             if "://" in target or not there or there in known:
                 continue
             if (root / there).is_file() and not there.startswith(f"{DOCS}/"):
-                shown = there if Path(there).suffix in PICTURES else f"{there}.md"
+                shown = there if Path(there).suffix in IMAGE_SUFFIXES else f"{there}.md"
                 found[there] = f"sources/{shown}"
     return found
 

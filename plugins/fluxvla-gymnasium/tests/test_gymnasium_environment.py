@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from fluxvla_gymnasium.environment import GymnasiumEnvironment, SuccessCriterion
-from fluxvla_gymnasium.parts import parts, pictures, state_row
+from fluxvla_gymnasium.parts import images_of, parts, state_row
 from fluxvla_mujoco import divergence
 
 from fluxvla_core import build_environment_from_cfg, build_runner_from_cfg
@@ -67,7 +67,7 @@ class TestGymnasiumEnvironment(EnvironmentConformance):
 
 
 @needs_mujoco
-def test_a_real_environment_with_pictures():
+def test_a_real_environment_with_images():
     made = build_environment_from_cfg(reacher())
     assert (made.spec.name, made.spec.details["render"]) == ("Reacher-v5", "cheap")
     (task,) = made.spec.tasks
@@ -234,7 +234,7 @@ def test_impossible_values_are_refused(arguments, message):
     assert message in str(caught.value)
 
 
-def test_a_picture_that_is_not_there_is_named():
+def test_an_image_that_is_not_there_is_named():
     made = GymnasiumEnvironment("CartPole-v1", body(1, 4, [("top", 8, 8)]), success="terminated")
     made.reset(0, "CartPole-v1")
     with pytest.raises(SpecMismatch, match="has no image 'top'; it has none") as caught:
@@ -247,7 +247,7 @@ def test_observations_are_taken_apart_by_name():
     eye = np.zeros((4, 5, 3), np.uint8)
     found = parts({"z": np.array([[1.0, 2.0]]), "eyes": {"left": eye}, "a": 3})
     assert list(found) == ["a", "eyes.left", "z"]
-    assert list(pictures(found)) == ["eyes.left"]
+    assert list(images_of(found)) == ["eyes.left"]
     np.testing.assert_array_equal(state_row(found, None), [3, 1, 2])
     np.testing.assert_array_equal(state_row(found, ["z"]), [1, 2])
     assert list(parts(eye)) == ["image"]

@@ -13,7 +13,7 @@ import pytest
 from fluxvla_lerobot import installed
 from fluxvla_lerobot.files import camera_of, describe
 from fluxvla_lerobot.installed import known_version, lerobot
-from fluxvla_lerobot.mapping import cameras_for, check_sizes, columns_for, pictures
+from fluxvla_lerobot.mapping import camera_images, cameras_for, check_sizes, columns_for
 from fluxvla_lerobot.policy import LeRobotPolicy
 
 from fluxvla_core import Camera, EmbodimentSpec, Joint
@@ -194,10 +194,10 @@ def test_cameras_by_name(folder: Path) -> None:
     trained = {camera.name: camera for camera in ROBOT.cameras}
     large = np.full((96, 128, 3), 7, np.uint8)
     seen = {"images": {"top": large}, "qpos": np.zeros(3, np.float32), "task_description": ""}
-    (found,) = pictures(seen, {feature: "top"}, trained).values()
+    (found,) = camera_images(seen, {feature: "top"}, trained).values()
     assert np.array_equal(found, large[:48, :64])
     with pytest.raises(DataError, match=r"the image of top is \(96, 128, 3\) float64"):
-        pictures({**seen, "images": {"top": large / 2}}, {feature: "top"}, trained)
+        camera_images({**seen, "images": {"top": large / 2}}, {feature: "top"}, trained)
     with pytest.raises(SpecMismatch, match=r"top gives 96 x 128 images; .* trained on 48 x 64"):
         check_sizes(described, {feature: "top"}, {"top": (96, 128)})
 

@@ -130,7 +130,7 @@ def test_another_instruction_is_followed_and_counted(environment):
         environment.set_instruction("pick_up_the_butter_and_place_it_in_the_basket")
 
 
-def test_pictures_come_by_every_name_and_in_every_size(environment):
+def test_images_come_by_every_name_and_in_every_size(environment):
     environment.reset(0, SALAD)
     cameras = [Camera("image", 32, 48), Camera("wrist_image", 40, 40)]
     seen = environment.observe(cameras)
@@ -276,7 +276,7 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     assert recorded.embodiment.name == summary["embodiment"]
     assert f"success after {summary['steps']} steps" in listener.lines
     shown = images[0].read()
-    assert shown.startswith(b"--picture\r\nContent-Type: image/jpeg")
+    assert shown.startswith(b"--frame\r\nContent-Type: image/jpeg")
     assert shown.count(b"\xff\xd8\xff") >= 1, "JPEG"
 
 

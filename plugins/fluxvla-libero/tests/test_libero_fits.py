@@ -13,8 +13,8 @@ import pytest
 from fluxvla_libero.embodiment import (
     CAMERAS,
     CLOSED,
+    IMAGE_SIZE,
     OPEN,
-    PICTURE,
     axis_angle,
     libero_spec,
 )
@@ -87,7 +87,7 @@ MISMATCHES = [
 ]
 
 
-SIDES = [Camera(name, PICTURE, PICTURE) for name in CAMERAS]
+SIDES = [Camera(name, IMAGE_SIZE, IMAGE_SIZE) for name in CAMERAS]
 HERE = EnvironmentSpec("libero_object", libero_spec(SIDES), (TaskSpec("pick", "pick it", 280),))
 
 
@@ -142,11 +142,11 @@ def test_names_of_public_datasets_are_understood(name):
     assert cameras == (Camera(name, 128, 100), Camera("wrist_image", 90, 90))
 
 
-def test_pictures_have_the_size_that_is_asked_for():
+def test_images_have_the_size_that_is_asked_for():
     spec = libero_spec([Camera("agentview", 128, 128)])
     assert match_policy(policy(spec), HERE, (224, 224)) == (Camera("agentview", 224, 224),)
     unsized = replace(spec, cameras=())
-    assert match_policy(policy(unsized), HERE) == (Camera("agentview", PICTURE, PICTURE),)
+    assert match_policy(policy(unsized), HERE) == (Camera("agentview", IMAGE_SIZE, IMAGE_SIZE),)
 
 
 def test_liberos_own_spec_survives_json():

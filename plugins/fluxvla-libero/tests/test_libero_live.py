@@ -15,7 +15,7 @@ from fluxvla_core.errors import RunFailed
 
 def part(stream):
     """The next image of the stream."""
-    assert stream.readline() == b"--picture\r\n"
+    assert stream.readline() == b"--frame\r\n"
     assert stream.readline() == b"Content-Type: image/jpeg\r\n"
     length = int(stream.readline().split(b":")[1])
     assert stream.readline() == b"\r\n"
@@ -24,7 +24,7 @@ def part(stream):
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
 
 
-def test_viewers_see_the_newest_picture_until_it_is_closed():
+def test_viewers_see_the_newest_image_until_it_is_closed():
     red = np.zeros((16, 24, 3), np.uint8)
     red[..., 0] = 255
     with LiveView(0) as view:

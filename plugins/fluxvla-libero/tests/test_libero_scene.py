@@ -182,7 +182,7 @@ def test_waiting_steps_do_not_count(scene):
     assert scene.steps == 1
 
 
-def test_cheap_pictures_show_the_same_without_shadows(scene):
+def test_cheap_images_show_the_same_without_shadows(scene):
     scene.reset(init_states("libero_object", 2)[0])
     image = scene.render("agentview", 48, 80)
     assert image.shape == (48, 80, 3)

@@ -68,7 +68,7 @@ def test_an_episode_goes_as_in_meta_worlds_own_environment(environment, metaworl
 
 
 @pytest.mark.parametrize("camera", ["corner2", "topview"])
-def test_reference_pictures_are_meta_worlds_own(metaworld, camera):
+def test_reference_images_are_meta_worlds_own(metaworld, camera):
     own = metaworld["push-v3-goal-observable"](seed=0, render_mode="rgb_array")
     own._freeze_rand_vec, own.seeded_rand_vec = False, True
     own.mujoco_renderer.width, own.mujoco_renderer.height = 96, 80
@@ -102,7 +102,7 @@ def test_every_camera_shows_something_at_no_cost_to_the_physics(environment):
         environment.observe([Camera("front", 32, 32)])
 
 
-def test_the_first_picture_shows_this_episodes_goal_and_not_the_last_ones(environment):
+def test_the_first_image_shows_this_episodes_goal_and_not_the_last_ones(environment):
     """Meta-World moves the goal's marker only when the simulation goes on."""
     camera = [Camera("topview", 96, 96)]
 

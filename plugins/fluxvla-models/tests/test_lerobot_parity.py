@@ -180,7 +180,7 @@ def observation(cameras: tuple[str, ...], at: str = "raw") -> dict[str, object]:
 
 
 @pytest.mark.parametrize("case", ACTING)
-def test_raw_pictures_and_joints_to_commands(case: str, tmp_path: Path, monkeypatch) -> None:
+def test_raw_images_and_joints_to_commands(case: str, tmp_path: Path, monkeypatch) -> None:
     golden = load_file(GOLDEN / f"{case}.safetensors")
     source = published(case, tmp_path / "theirs")
     import_checkpoint(

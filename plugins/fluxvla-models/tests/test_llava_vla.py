@@ -189,7 +189,7 @@ def test_what_is_seen_read_and_felt_matters_and_a_missing_camera_does_not(folder
         torch.testing.assert_close(model.predict_action(**{**dark, "images": changed}), without)
 
 
-def test_pictures_and_words_see_each_other_in_paligemma(folders) -> None:
+def test_images_and_words_see_each_other_in_paligemma(folders) -> None:
     part = PaliGemmaBackbone(folders["paligemma"], num_cameras=2).eval()
     batch = batch_of()
     keys = ("images", "img_masks", "lang_tokens", "lang_masks")

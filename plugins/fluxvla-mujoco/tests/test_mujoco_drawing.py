@@ -52,7 +52,7 @@ def _egl(monkeypatch):
         monkeypatch.setenv("MUJOCO_GL", "egl")
 
 
-def test_pictures_are_upright_and_of_the_size_that_is_asked_for():
+def test_images_are_upright_and_of_the_size_that_is_asked_for():
     image = draw(model(), "cheap")
     assert (image.shape, image.dtype) == ((48, 64, 3), np.uint8)
     red = (image[..., 0] > 60) & (image[..., 2] < 30)
@@ -61,7 +61,7 @@ def test_pictures_are_upright_and_of_the_size_that_is_asked_for():
     assert image[40, 32, 2] > image[40, 32, 0]
 
 
-def test_coarse_pictures_show_the_same_with_fewer_faces_and_leave_the_physics_alone():
+def test_coarse_images_show_the_same_with_fewer_faces_and_leave_the_physics_alone():
     fine, coarse = model(), model()
     expected = draw(fine, "cheap").astype(int)
     vertices, graph = coarse.mesh_vert.copy(), coarse.mesh_graph.copy()

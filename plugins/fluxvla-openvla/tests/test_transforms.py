@@ -40,14 +40,14 @@ class Words:
         return [1, *(3 + len(word) for word in text.split())]
 
 
-def picture(height=48, width=64):
+def random_image(height=48, width=64):
     return fill.integers("picture", (height, width, 3), 256).astype(np.uint8).transpose(2, 0, 1)
 
 
-def test_pictures_equal_the_published_processors():
+def test_images_equal_the_published_processors():
     expected = tiny.golden("processor")["pixel_values"]
     pipeline = Pipeline([ResizeOpenVLAImages(28), {"type": "SimpleNormalizeImages"}])
-    found = torch.from_numpy(pipeline({"images": [picture()]})["images"])
+    found = torch.from_numpy(pipeline({"images": [random_image()]})["images"])
     both = torch.cat([for_dino(found[None])[0], found])
     np.testing.assert_allclose(both, expected, rtol=0, atol=1e-6)
 
@@ -91,7 +91,7 @@ def test_lanczos_is_tensorflows_up_to_single_levels():
 
 
 def test_a_crop_of_everything_changes_nothing():
-    image = picture(20, 28)
+    image = random_image(20, 28)
     assert np.array_equal(crop_and_resize(image, 0.0, 0.0, 1.0), image)
 
 
@@ -105,13 +105,13 @@ def test_a_crop_keeps_a_linear_ramp_linear():
 def test_training_crops_at_random_and_acting_in_the_middle():
     pipeline = Pipeline([RandomCropOpenVLAImages(0.9), CenterCropOpenVLAImages(0.9)])
     rng = np.random.default_rng(0)
-    sample = {"images": [picture(28, 28)]}
+    sample = {"images": [random_image(28, 28)]}
     first, second = (pipeline(sample, rng) for _ in range(2))
     middle = pipeline.inference()(sample)
     side = 0.9**0.5
     assert np.array_equal(
         middle["images"],
-        crop_and_resize(picture(28, 28), (1 - side) / 2, (1 - side) / 2, side),
+        crop_and_resize(random_image(28, 28), (1 - side) / 2, (1 - side) / 2, side),
     )
     assert not np.array_equal(first["images"], second["images"])
     assert first.keys() == middle.keys() == {"images"}
@@ -119,7 +119,7 @@ def test_training_crops_at_random_and_acting_in_the_middle():
 
 def test_colours_without_change_stay_and_grey_has_no_hue():
     rng = np.random.default_rng(0)
-    image = picture(8, 8)
+    image = random_image(8, 8)
     same = JitterOpenVLAColors(0.0, 0.0, 0.0, 0.0)({"images": [image]}, rng)["images"]
     assert np.abs(same.astype(int) - image).max() <= 1
     grey = np.repeat(image[:1], 3, 0)

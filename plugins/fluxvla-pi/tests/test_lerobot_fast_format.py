@@ -48,7 +48,7 @@ def golden():
     return load_file(GOLDEN / "lerobot061_pi0_fast_policy.safetensors")
 
 
-def test_it_acts_as_there_from_pictures_and_joints_to_commands(tmp_path, source, words, golden):
+def test_it_acts_as_there_from_images_and_joints_to_commands(tmp_path, source, words, golden):
     robot = robot_file(tmp_path / "robot.json")
     told = ["--tokenizer", str(words), "--embodiment", str(robot), "--rate", "10"]
     out = tmp_path / "ours"

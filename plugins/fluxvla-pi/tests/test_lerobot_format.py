@@ -53,7 +53,7 @@ def bring(tmp_path):
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_it_acts_as_there_from_pictures_and_joints_to_commands(tmp_path, bring, family):
+def test_it_acts_as_there_from_images_and_joints_to_commands(tmp_path, bring, family):
     golden = load_file(GOLDEN / f"lerobot061_{family}_policy.safetensors")
     out = bring(lerobot_folder(tmp_path / "theirs", family))
     policy = load_policy(out)
@@ -76,8 +76,8 @@ def test_what_the_model_gets_is_what_it_gets_there(tmp_path, family):
     assert torch.equal(batch["lang_masks"], golden["token_masks"])
     count = len(read.img_keys)
     assert count == 2
-    for i, picture in enumerate(batch["images"][0].unflatten(0, (count, 3))):
-        torch.testing.assert_close(picture, golden[f"picture.{i}"][0], rtol=0, atol=2e-6)
+    for i, image in enumerate(batch["images"][0].unflatten(0, (count, 3))):
+        torch.testing.assert_close(image, golden[f"picture.{i}"][0], rtol=0, atol=2e-6)
         assert golden[f"picture_mask.{i}"].all()
     masks = [golden[name] for name in golden if name.startswith("picture_mask.")]
     assert not any(mask.any() for mask in masks[count:])  # cameras that are never there

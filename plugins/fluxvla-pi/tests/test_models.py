@@ -339,7 +339,7 @@ def test_sizes_that_do_not_fit_are_refused(settings, words):
         PI05FlowMatching(**{**SIZES, **settings})
 
 
-def test_chunks_and_pictures_of_another_size_are_refused(model):
+def test_chunks_and_images_of_another_size_are_refused(model):
     batch = training_batch()
     with pytest.raises(ConfigError, match=r"actions of \(4, 8\), the model has chunks of \(5, 8\)"):
         model(**{**batch, "actions": batch["actions"][:, :4]})

@@ -43,8 +43,8 @@ def test_it_acts(tmp_path, family):
     _, out = brought(tmp_path, family)
     policy = load_policy(out)
     images, state = pi_inputs.observation()
-    pictures = dict.fromkeys(("top", "left", "right"), images["front"])
-    seen = {"images": pictures, "qpos": state, "task_description": "put it away"}
+    images_by_camera = dict.fromkeys(("top", "left", "right"), images["front"])
+    seen = {"images": images_by_camera, "qpos": state, "task_description": "put it away"}
     policy.reset(pi_inputs.SEED)
     found = policy.predict_action(seen)
 
@@ -66,11 +66,11 @@ def test_it_acts(tmp_path, family):
     small = Image.fromarray(images["front"]).resize((28, 21), Image.Resampling.BILINEAR)
     canvas = Image.new("RGB", (28, 28))
     canvas.paste(small, (0, 3))
-    picture = torch.from_numpy(np.asarray(canvas).transpose(2, 0, 1).astype(np.float32))
+    image = torch.from_numpy(np.asarray(canvas).transpose(2, 0, 1).astype(np.float32))
     padded = torch.nn.functional.pad(torch.from_numpy(scaled.astype(np.float32)), (0, 1))
     with torch.no_grad():
         raw = policy.model.predict_action(
-            images=(picture / 255 * 2 - 1).repeat(3, 1, 1)[None],
+            images=(image / 255 * 2 - 1).repeat(3, 1, 1)[None],
             lang_tokens=tokens,
             lang_masks=torch.arange(length)[None] < len(ids),
             states=padded[None],
@@ -179,16 +179,18 @@ def test_statistics_of_two_robots(tmp_path):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(tmp_path, family, monkeypatch):
-    """openpi gives the model a picture of nothing, and masks it."""
+    """openpi gives the model an image of nothing, and masks it."""
     _, out = brought(tmp_path, family, ("top", "none", "right"))
     policy = load_policy(out)
     assert policy.cameras == ("top", "right")
     act, look, asked = policy.model.predict_action, policy.model.observe, []
     monkeypatch.setattr(policy.model, "observe", lambda **b: asked.append(b) or look(**b))
     images, state = pi_inputs.observation()
-    pictures = {"top": images["front"], "right": images["front"][::-1].copy()}
+    images_by_camera = {"top": images["front"], "right": images["front"][::-1].copy()}
     policy.reset(pi_inputs.SEED)
-    policy.predict_action({"qpos": state, "images": pictures, "task_description": "put it away"})
+    policy.predict_action(
+        {"qpos": state, "images": images_by_camera, "task_description": "put it away"}
+    )
 
     monkeypatch.undo()
     batch = {**asked[0], "noise": torch.ones(1, *policy.model.action_shape)}

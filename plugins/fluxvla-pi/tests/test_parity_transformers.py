@@ -24,7 +24,7 @@ from .oracles.pi_inputs import (
 from .tiny import acting_batch, model_of, relative, training_batch
 
 pytest.importorskip("transformers.models.pi0", reason="transformers >= 5.20 has PI0")
-PICTURE = VOCABULARY  # the id of a picture's token, beyond the words
+IMAGE = VOCABULARY  # the id of an image's token, beyond the words
 
 
 def decoder(size):
@@ -60,7 +60,7 @@ def their_config():
             "text_config": decoder(GEMMA),
             "vision_config": vision,
             "projection_dim": GEMMA["width"],
-            "image_token_id": PICTURE,
+            "image_token_id": IMAGE,
         },
         dit_config=decoder(EXPERT),
         chunk_size=HORIZON,
@@ -91,14 +91,14 @@ def pair():
 
 
 def their_batch():
-    """Pictures as tokens between words; those of a camera that is not there are padding."""
+    """Images as tokens between words; those of a camera that is not there are padding."""
     batch = {key: torch.from_numpy(value) for key, value in inputs().items()}
     seen = batch["img_masks"].repeat_interleave(PATCHES, 1)
-    pictures = torch.where(seen, PICTURE, 0)
+    image_tokens = torch.where(seen, IMAGE, 0)
     side = VISION["image_size"]
     return {
         "state": batch["states"],
-        "input_ids": torch.cat([pictures, batch["lang_tokens"]], 1),
+        "input_ids": torch.cat([image_tokens, batch["lang_tokens"]], 1),
         "attention_mask": torch.cat([seen, batch["lang_masks"]], 1).long(),
         "pixel_values": batch["images"].reshape(BATCH, CAMERAS, 3, side, side),
         "pixel_attention_mask": batch["img_masks"],

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html.parser
 import json
 import math
-import os
 import re
 import shutil
 from pathlib import Path
@@ -17,41 +15,8 @@ from fluxvla_report.facts import Training, Video
 from fluxvla_report.page import VideoSources, curves, running_mean
 
 from fluxvla_core.cli.main import main
-from fluxvla_core.errors import RunFailed, UsageError
 
-
-class Page(html.parser.HTMLParser):
-    """Text, sources and unclosed tags of a page."""
-
-    VOID = frozenset({"meta", "link", "br", "img", "input"})
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.text: list[str] = []
-        self.sources: list[str] = []
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.sources += [v or "" for k, v in attrs if k in ("src", "href")]
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if data.strip() and self.open[-1:] != ["style"]:
-            self.text.append(" ".join(data.split()))
-
-    def shows(self, words: str) -> bool:
-        return words in " ".join(self.text)
-
-
-def page_of(work_dir: Path, tmp_path: Path) -> Page:
-    page = Page(build_report(work_dir, tmp_path / "out" / "r.html").read_text(encoding="utf-8"))
-    assert page.open == []
-    return page
+from .report_pages import Page, little, page_of
 
 
 def test_a_complete_run(complete: Path, tmp_path: Path) -> None:
@@ -125,44 +90,6 @@ def test_it_stands_alone(complete: Path, tmp_path: Path) -> None:
     assert not re.search(r"https?://", text)
 
 
-def little(folder: Path) -> Path:
-    """A work dir of which there is next to nothing to show."""
-    folder.mkdir(exist_ok=True)
-    stages = {"stages": [{"name": "collect", "seconds": 1.0}]}
-    (folder / "stages.json").write_text(json.dumps(stages))
-    return folder
-
-
-def test_a_folder_without_a_run_is_refused_with_those_below_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "demo_out" / "default" / "work" / "eval").mkdir(parents=True)
-    assert main(["report", "demo_out"]) == 2
-    assert capsys.readouterr().err.endswith("next: name the work dir that a run said at its end\n")
-    for place in ("demo_out/default/work", "demo_out/default/work/eval"):
-        Path(place, "config.resolved.json").write_text("{}")
-    assert main(["report", "demo_out"]) == 2
-    assert capsys.readouterr().err == (
-        "demo_out: nothing to report on: no training, evaluation or episode of fluxvla run is in "
-        "this folder\n  next: fluxvla report demo_out/default/work\n"
-    )
-    assert not Path("demo_out/report.html").exists()
-
-
-def test_a_work_dir_of_little_says_what_is_not_there(tmp_path: Path) -> None:
-    little(tmp_path / "work")
-    page = page_of(tmp_path / "work", tmp_path)
-    for words in (
-        "Not evaluated yet. To do it: fluxvla run --config … --section eval",
-        "No metrics.jsonl in the work dir",
-        "No episode was run yet. To do it: fluxvla run --config … --section inference",
-        "No environment.json in the work dir",
-        "No config.resolved.json in the work dir",
-    ):
-        assert page.shows(words), words
-
-
 def test_live_results_are_shown_apart_from_stepped_ones(complete: Path, tmp_path: Path) -> None:
     work_dir = tmp_path / "run"
     shutil.copytree(complete, work_dir)
@@ -228,24 +155,6 @@ def test_the_mean_return_is_shown_where_there_is_one(complete: Path, tmp_path: P
     assert page.shows("-12.5")
 
 
-def test_damaged_files_are_listed(tmp_path: Path) -> None:
-    (little(tmp_path / "work") / "environment.json").write_text("{")
-    assert page_of(tmp_path / "work", tmp_path).shows("environment.json: invalid JSON")
-
-
-def test_what_a_run_names_cannot_become_markup(tmp_path: Path) -> None:
-    folder = tmp_path / "work" / "inference" / "001-x"
-    folder.mkdir(parents=True)
-    evil = "<script>alert(1)</script>"
-    summary = {"instruction": evil, "outcome": evil, "problem": evil, "joints": [evil]}
-    (folder / "episode.json").write_text(json.dumps(summary))
-    event = {"event": "command", "t": 0, "command": [1.0], "state": [1.0], "clamps": []}
-    (folder / "trace.jsonl").write_text(json.dumps(event) + "\n")
-    text = build_report(tmp_path / "work").read_text(encoding="utf-8")
-    assert "<script" not in text
-    assert "&lt;script&gt;" in text
-
-
 def test_videos_beyond_the_limit_are_linked(tmp_path: Path) -> None:
     for name, size in (("a", 60), ("b", 50), ("c", 30)):
         (tmp_path / f"{name}.mp4").write_bytes(b"x" * size)
@@ -262,27 +171,6 @@ def test_the_title_can_be_given(tmp_path: Path) -> None:
     little(tmp_path / "my_work")
     assert "<h1>my work</h1>" in build_report(tmp_path / "my_work").read_text()
     assert "<h1>A &amp; B</h1>" in build_report(tmp_path / "my_work", title="A & B").read_text()
-
-
-def test_there_is_no_such_folder(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="there is no such work dir to report on"):
-        build_report(tmp_path / "nowhere")
-
-
-def test_it_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="cannot write to the report's folder") as found:
-        build_report(little(tmp_path), tmp_path / "file" / "r.html")
-    assert f"{tmp_path}/file" in str(found.value)
-
-
-def test_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, text: str) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("fluxvla_report.page.write_text", full)
-    with pytest.raises(RunFailed, match=r"the report cannot be written: .*No space left"):
-        build_report(little(tmp_path))
 
 
 def test_every_column_of_a_training_has_a_chart() -> None:
@@ -320,7 +208,6 @@ def test_the_running_mean_skips_gaps() -> None:
 
 
 def test_the_command(complete: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from fluxvla_core.cli.main import main
 
     out = tmp_path / "page.html"
     assert main(["report", str(complete), "--out", str(out), "--title", "T"]) == 0
@@ -372,8 +259,14 @@ def test_a_narrow_page_stacks_its_tables_and_scrolls_no_chart(
 
 
 NARROW = 420.0
+
+
 INSIDE = NARROW - 2 * (12 + 14) - 2
+
+
 """Pixels of a section of a narrow page: without the paddings of both, and the section's borders."""
+
+
 LEGIBLE = 9.0
 
 
@@ -453,13 +346,6 @@ def test_an_episode_that_nobody_judges_is_no_failure(complete: Path, tmp_path: P
     assert not page.shows("failure")
     (wave,) = re.findall(r'<section id="000-wave">.*?</section>', html, re.DOTALL)
     assert "chip" not in wave
-
-
-def test_a_pipe_among_the_videos_keeps_nobody_waiting(complete: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(complete / "inference" / "001-lift", tmp_path / "001-lift")
-    (folder / "top.mp4").unlink()
-    os.mkfifo(folder / "top.mp4")
-    assert "<video" not in build_report(folder, tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_a_title_stands_with_its_plot(complete: Path, tmp_path: Path) -> None:

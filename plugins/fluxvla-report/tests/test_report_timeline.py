@@ -91,7 +91,7 @@ def episode(**more: object) -> Episode:
     return Episode("001", "wave", "done", True, **{**given, **more})  # type: ignore[arg-type]
 
 
-def test_stages_come_in_the_order_of_a_pictures_way_and_no_time_counts_twice() -> None:
+def test_stages_are_in_pipeline_order_and_no_time_counts_twice() -> None:
     names = ("late", "send", "policy", "inference", "sync")
     found = stage_times(episode(timings=dict.fromkeys(names, ROW)))
     assert [row.name for row in found] == ["sync", "inference", "send"]

@@ -31,7 +31,7 @@ ARM = EmbodimentSpec(
     cameras=(),
     rate_hz=20.0,
 )
-PICTURE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
 
 
 class Notes(SilentReporter):
@@ -54,7 +54,7 @@ def run(folder: Path, play: Any = None, **settings: Any) -> tuple[RerunViewer, N
 def on_a_robot(hooks: HookCaller) -> None:
     hooks.call("run_started", embodiment=ARM)
     hooks.call("episode_started", task="wave", stamp=1.0)
-    images = {"front": PICTURE, "wrist": None}
+    images = {"front": IMAGE, "wrist": None}
     seen = {"images": images, "qpos": np.array([0.1, 0.2], np.float32), "task": "wave"}
     hooks.call("observed", observation=seen, stamp=1.5)
     hooks.call("inferred", chunk=np.ones((4, 2)), latency_s=0.03, stamp=1.6)
@@ -112,7 +112,7 @@ def test_a_run_on_a_robot_is_written_and_read_back(tmp_path: Path) -> None:
     (image,) = found["/cameras/front"]
     assert image[ROBOT] == 1_500_000_000
     pixels = np.frombuffer(bytes(image["Image:buffer"][0]), np.uint8)
-    np.testing.assert_array_equal(pixels.reshape(PICTURE.shape), PICTURE)
+    np.testing.assert_array_equal(pixels.reshape(IMAGE.shape), IMAGE)
     assert numbers(found["/joints/elbow/command"]) == [(2.0, 0.0), (3.0, 1.0), (4.0, 2.0)]
     assert numbers(found["/joints/elbow/target"]) == [(2.0, 1.0), (3.0, 2.0), (4.0, 3.0)]
     measured = numbers(found["/joints/waist/measured"])
@@ -129,7 +129,7 @@ def test_a_run_on_a_robot_is_written_and_read_back(tmp_path: Path) -> None:
     ]
 
 
-def test_pictures_are_compressed_unless_every_bit_is_asked_for(tmp_path: Path) -> None:
+def test_images_are_compressed_unless_every_bit_is_asked_for(tmp_path: Path) -> None:
     hook, _ = run(tmp_path)
     assert hook.path is not None
     (row,) = read(hook.path)["/cameras/front"]

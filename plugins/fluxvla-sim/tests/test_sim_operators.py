@@ -249,7 +249,7 @@ def test_a_machine_without_egl_gets_one_clear_message():
     assert "apt-get install -y libegl1" in run.stderr
 
 
-def test_pictures_work_whoever_imported_mujoco_first():
+def test_images_work_whoever_imported_mujoco_first():
     code = (
         "import mujoco; from fluxvla_sim.aloha.cube import AlohaScene;"
         "print(AlohaScene().render('top', 48, 64).shape)"
@@ -261,7 +261,7 @@ def test_pictures_work_whoever_imported_mujoco_first():
     assert "Traceback" not in run.stderr
 
 
-def test_pictures_can_be_taken_from_any_thread(aloha):
+def test_images_can_be_taken_from_any_thread(aloha):
     first = aloha.get_frame().images["top"]
     seen = []
     thread = threading.Thread(target=lambda: seen.append(aloha.get_frame().images["top"]))

@@ -82,7 +82,7 @@ def test_is_bit_identical_to_gym_aloha(stock, world, name, seed):
 @pytest.mark.parametrize(
     ("world", "name"), [(CUBE, "AlohaTransferCube"), (INSERTION, "AlohaInsertion")]
 )
-def test_reference_pictures_are_gym_alohas_byte_for_byte(stock, world, name):
+def test_reference_images_are_gym_alohas_byte_for_byte(stock, world, name):
     scene, stock = world.open_scene("reference"), stock(name)
     stock.reset(seed=5)
     scene.reset(5)
@@ -175,7 +175,7 @@ def test_state_has_the_embodiments_order(scene):
         assert changed.tolist() == [index]
 
 
-def test_pictures_have_any_size(scene):
+def test_images_have_any_size(scene):
     scene.reset(0)
     for size in ((33, 47), (480, 640), (600, 900), (48, 64)):
         image = scene.render("top", *size)
@@ -190,7 +190,7 @@ def test_an_unknown_camera_is_named_with_those_that_exist(scene):
         scene.render("head", 48, 64)
 
 
-def test_cheap_pictures_leave_out_shadows_and_multisampling():
+def test_cheap_images_leave_out_shadows_and_multisampling():
     cheap, reference = (load_model(AlohaScene.file, name) for name in ("cheap", "reference"))
     quality = cheap.vis.quality
     assert (quality.shadowsize, quality.offsamples) == (0, 0)
@@ -200,7 +200,7 @@ def test_cheap_pictures_leave_out_shadows_and_multisampling():
         load_model(AlohaScene.file, "best")
 
 
-def test_cheap_pictures_show_the_same_scene():
+def test_cheap_images_show_the_same_scene():
     images = []
     for quality in ("cheap", "reference"):
         drawn = AlohaScene(quality)

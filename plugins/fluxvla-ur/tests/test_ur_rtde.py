@@ -320,7 +320,7 @@ class TestCameras:
         writer.release()
         return str(path)
 
-    def test_pictures_are_rgb_and_a_camera_that_ends_is_silent(self, robot, connect, film):
+    def test_images_are_rgb_and_a_camera_that_ends_is_silent(self, robot, connect, film):
         operator = connect(robot, cameras={"top": film}, height=48, width=64)
         image = operator.get_frame().images["top"]
         assert image.shape == (48, 64, 3)
@@ -330,7 +330,7 @@ class TestCameras:
         with pytest.raises(Stale, match=r"top is silent for \d"):
             operator.get_frame()
 
-    def test_pictures_of_another_size_are_refused(self, film):
+    def test_images_of_another_size_are_refused(self, film):
         camera = VideoCamera(Camera("top", 96, 128), film)
         camera.connect()
         wait_for(lambda: camera._newest)

@@ -231,9 +231,9 @@ class ParquetDataset(Dataset):
         self.prepare()
         places = [self._place(key.index) for key in keys]
         steps = [step for place in places for step in self._steps(place)]
-        pictures = iter(self._frames.read(steps))
+        frames = iter(self._frames.read(steps))
         return [
-            stack_steps([self._prepared(key, place, step, next(pictures)) for step in steps])
+            stack_steps([self._prepared(key, place, step, next(frames)) for step in steps])
             for key, place, steps in zip(keys, places, map(self._steps, places), strict=True)
         ]
 

@@ -144,7 +144,7 @@ class _Publisher:
             spec["positions"] = [here.get(name, 0.0) for name in spec["names"]]
             joints.fill(message, spec["names"], spec["positions"])
         elif kind in ("Image", "CompressedImage"):
-            _fill_picture(message, spec)
+            _fill_image(message, spec)
         elif kind == "Odometry":
             message.twist.twist.linear.x, message.twist.twist.angular.z = spec["data"]
         else:
@@ -163,7 +163,7 @@ def _targets(command: Any, names: Sequence[str]) -> dict[str, float]:
     return dict(zip(names, command.data, strict=False))
 
 
-def picture(height: int, width: int, encoding: str) -> np.ndarray[Any, np.dtype[Any]]:
+def camera_pattern(height: int, width: int, encoding: str) -> np.ndarray[Any, np.dtype[Any]]:
     """What the driver's cameras see: in colours, red 10, green 20, blue 30; in depth, 1.5 m."""
     if encoding == "16UC1":
         return np.full((height, width), 1500, np.uint16)
@@ -176,12 +176,12 @@ def picture(height: int, width: int, encoding: str) -> np.ndarray[Any, np.dtype[
     return np.broadcast_to(np.array(row, np.uint8), (height, width, len(row)))
 
 
-def _fill_picture(message: Any, spec: dict[str, Any]) -> None:
+def _fill_image(message: Any, spec: dict[str, Any]) -> None:
     encoding = spec.get("encoding", "rgb8")
     size = spec.get("height", 48), spec.get("width", 64)
     cached = spec.get("cached")
     if cached is None or cached[0] != (size, encoding):
-        cached = spec["cached"] = ((size, encoding), picture(*size, encoding))
+        cached = spec["cached"] = ((size, encoding), camera_pattern(*size, encoding))
     if "format" in spec:
         images.fill_compressed(message, cached[1], encoding, spec["format"])
     else:

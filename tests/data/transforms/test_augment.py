@@ -10,12 +10,12 @@ from fluxvla_core.data.transforms.state_action import SampleFlowNoise, StateNois
 from fluxvla_core.errors import ConfigError
 
 
-def picture(seed=0):
+def random_image(seed=0):
     return np.random.default_rng(seed).integers(0, 256, (3, 12, 16), dtype=np.uint8)
 
 
-def test_a_shift_moves_the_picture_and_repeats_its_border():
-    image = picture()
+def test_a_shift_moves_the_image_and_repeats_its_border():
+    image = random_image()
     image.flags.writeable = False
     shift = RandomShiftImages(3)
     padded = np.pad(image, ((0, 0), (3, 3), (3, 3)), mode="edge")
@@ -34,7 +34,7 @@ def test_a_shift_moves_the_picture_and_repeats_its_border():
 
 
 def test_cameras_are_shifted_apart_and_a_stack_stays_one():
-    images = np.concatenate([picture(), picture()])
+    images = np.concatenate([random_image(), random_image()])
     outs = [
         RandomShiftImages(3)({"images": images}, sample_rng(0, 0, i))["images"] for i in range(5)
     ]

@@ -22,7 +22,7 @@ STDS = [58.27148438, 57.02636719, 57.27539062]
 UNIT = {"scale_to_unit_interval": True}
 
 
-def pictures(seed=0, dtype=np.uint8):
+def random_images(seed=0, dtype=np.uint8):
     """Two cameras, as views of (H, W, 3) memory, with every value there is."""
     rng = np.random.default_rng(seed)
     values = rng.permutation(np.arange(2 * 3 * 16 * 24) % 256).astype(dtype)
@@ -58,7 +58,7 @@ NORMALIZERS = {
 @pytest.mark.parametrize("which", NORMALIZERS)
 def test_the_result_is_the_transforms_own_bit_for_bit(which, dtype):
     transform, formula = NORMALIZERS[which]
-    samples = [{"images": pictures(seed, dtype)} for seed in (0, 1)]
+    samples = [{"images": random_images(seed, dtype)} for seed in (0, 1)]
     left = [transform.defer(sample) for sample in samples]
     batch = DictCollator(["images"])(left)
     assert batch["images"].dtype == (torch.uint8 if dtype == np.uint8 else torch.float32)
@@ -77,10 +77,10 @@ def test_the_result_is_the_transforms_own_bit_for_bit(which, dtype):
 
 def test_each_sample_of_a_batch_has_its_own_numbers():
     transforms = [transform for transform, _ in NORMALIZERS.values()]
-    samples = [{"images": pictures(seed)} for seed in range(len(transforms))]
+    samples = [{"images": random_images(seed)} for seed in range(len(transforms))]
     left = [t.defer(s) for t, s in zip(transforms, samples, strict=True)]
     # A sample that some transform has made float32 of, among others that still are uint8.
-    left[1] = transforms[1].defer({"images": pictures(1, np.float32)})
+    left[1] = transforms[1].defer({"images": random_images(1, np.float32)})
     found = normalized(DictCollator(["images"])(left))["images"].numpy()
     here = np.stack([t(s)["images"] for t, s in zip(transforms, samples, strict=True)])
     np.testing.assert_array_equal(found.view(np.uint32), here.view(np.uint32))
@@ -93,7 +93,7 @@ def test_a_batch_of_which_nothing_was_left_stays_as_it_is():
 
 def test_groups_that_fit_no_number_of_cameras_are_refused_all_the_same():
     with pytest.raises(ConfigError, match="3 groups of means and stds, 2 cameras"):
-        NormalizeImages([MEANS] * 3, [STDS] * 3).defer({"images": pictures()})
+        NormalizeImages([MEANS] * 3, [STDS] * 3).defer({"images": random_images()})
 
 
 RESIZE = {"type": "ResizeImages", "height": 8, "width": 8}
@@ -132,7 +132,7 @@ class SeeingAgain(Blind):
 def numbers():
     entry = {"mean": [0.0] * 3, "std": [1.0] * 3}
     return {
-        "images": pictures(),
+        "images": random_images(),
         "states": np.ones(3, np.float32),
         "actions": np.ones((2, 3), np.float32),
         "stats": {"proprio": entry, "action": entry},
@@ -172,7 +172,7 @@ def test_a_pipeline_leaves_its_last_normalisation(transforms, dtype):
         [Brighter(MEANS, STDS)],
     ],
 )
-def test_nothing_is_left_where_something_may_look_at_pictures(transforms):
+def test_nothing_is_left_where_something_may_look_at_images(transforms):
     assert Pipeline(transforms).deferring() is None
 
 

@@ -21,7 +21,7 @@ MEANS = [123.515625, 116.04492188, 103.59375]
 STDS = [58.27148438, 57.02636719, 57.27539062]
 
 
-def picture(seed=0, height=12, width=16):
+def random_image(seed=0, height=12, width=16):
     return np.random.default_rng(seed).integers(0, 256, (3, height, width), dtype=np.uint8)
 
 
@@ -34,7 +34,7 @@ def frozen(*images):
 @pytest.mark.parametrize("interpolation", ["linear", "area"])
 def test_resize_stretches_every_camera_and_keeps_the_dtype(interpolation):
     cfg = {"type": "ResizeImages", "height": 6, "width": 8, "interpolation": interpolation}
-    images = frozen(picture(0), picture(1, 20, 10))
+    images = frozen(random_image(0), random_image(1, 20, 10))
     out = build_transform_from_cfg(cfg)({"images": images, "other": 1})
     assert out["images"].shape == (6, 6, 8)
     assert out["images"].dtype == np.uint8
@@ -44,13 +44,13 @@ def test_resize_stretches_every_camera_and_keeps_the_dtype(interpolation):
 
 
 def test_resize_to_half_by_area_is_the_mean_of_four():
-    image = picture().astype(np.float32)
+    image = random_image().astype(np.float32)
     out = ResizeImages(6, 8, "area")({"images": [image]})["images"]
     np.testing.assert_allclose(out, image.reshape(3, 6, 2, 8, 2).mean((2, 4)), rtol=1e-5)
 
 
 def test_resize_to_the_same_size_changes_nothing():
-    images = frozen(picture(0), picture(1))
+    images = frozen(random_image(0), random_image(1))
     out = ResizeImages(12, 16)({"images": np.concatenate(images)})["images"]
     np.testing.assert_array_equal(out, np.concatenate(images))
 
@@ -68,7 +68,9 @@ def test_resize_to_the_same_size_changes_nothing():
 )
 def test_joining_planes_is_concatenation_whatever_the_memory_is_like(change):
     """Decoded images are views of (H, W, 3) memory, sometimes read-only or cut."""
-    views = [np.ascontiguousarray(picture(i).transpose(1, 2, 0)).transpose(2, 0, 1) for i in (0, 1)]
+    views = [
+        np.ascontiguousarray(random_image(i).transpose(1, 2, 0)).transpose(2, 0, 1) for i in (0, 1)
+    ]
     images = frozen(*(change(view) for view in views))
     joined = join_planes(images)
     assert joined.flags.c_contiguous
@@ -79,7 +81,7 @@ def test_joining_planes_is_concatenation_whatever_the_memory_is_like(change):
 
 @given(top=st.integers(0, 6), left=st.integers(0, 8))
 def test_crop_cuts_the_rectangle_out_of_lists_and_arrays(top, left):
-    images = frozen(picture(0), picture(1))
+    images = frozen(random_image(0), random_image(1))
     crop = CropImages(top, left, 6, 8)
     out = crop({"images": images})["images"]
     for got, image in zip(out, images, strict=True):
@@ -89,7 +91,7 @@ def test_crop_cuts_the_rectangle_out_of_lists_and_arrays(top, left):
 
 
 def test_normalize_uses_each_cameras_group():
-    images = frozen(picture(0), picture(1))
+    images = frozen(random_image(0), random_image(1))
     cfg = {"type": "NormalizeImages", "means": [MEANS, [0, 0, 0]], "stds": [STDS, [1, 1, 1]]}
     out = build_transform_from_cfg(cfg)({"images": images})["images"]
     assert out.dtype == np.float32
@@ -99,7 +101,7 @@ def test_normalize_uses_each_cameras_group():
 
 
 def test_normalize_with_one_group_serves_all_cameras_and_scales_on_request():
-    images = frozen(picture(0), picture(1))
+    images = frozen(random_image(0), random_image(1))
     out = NormalizeImages([0.5] * 3, [0.25] * 3, scale_to_unit_interval=True)({"images": images})
     expected = (np.concatenate(images) / 255 - 0.5) / 0.25
     np.testing.assert_allclose(out["images"], expected, rtol=1e-5, atol=1e-6)
@@ -142,19 +144,19 @@ def test_parameters_that_make_no_sense_are_refused(cfg, message):
 
 def test_groups_that_fit_no_number_of_cameras():
     with pytest.raises(ConfigError) as caught:
-        NormalizeImages([MEANS] * 3, [STDS] * 3)({"images": [picture(), picture()]})
+        NormalizeImages([MEANS] * 3, [STDS] * 3)({"images": [random_image(), random_image()]})
     assert "3 groups of means and stds, 2 cameras" in str(caught.value)
     assert "give one group for all cameras, or one for each" in str(caught.value)
 
 
-def test_a_crop_beyond_the_picture_is_refused():
+def test_a_crop_beyond_the_image_is_refused():
     with pytest.raises(DataError, match=r"rows 8:14, columns 0:4 are not in an image of 12 x 16"):
-        CropImages(8, 0, 6, 4)({"images": [picture()]})
+        CropImages(8, 0, 6, 4)({"images": [random_image()]})
 
 
 def test_wrong_shapes_say_what_is_likely():
     with pytest.raises(DataError, match=r"an image of shape \(12, 16, 3\) is not \(3, height"):
-        split_images([picture().transpose(1, 2, 0)])
+        split_images([random_image().transpose(1, 2, 0)])
     with pytest.raises(DataError, match=r"images of shape \(4, 5, 5\) are not \(3N, height, width"):
         split_images(np.zeros((4, 5, 5), np.uint8))
     with pytest.raises(DataError, match="the sample has no images"):
@@ -163,6 +165,6 @@ def test_wrong_shapes_say_what_is_likely():
 
 def test_different_sizes_need_a_resize():
     with pytest.raises(DataError) as caught:
-        stack_images([picture(), picture(1, 10, 10)])
+        stack_images([random_image(), random_image(1, 10, 10)])
     assert "cameras of different sizes cannot be stacked: 12 x 16, 10 x 10" in str(caught.value)
     assert "put ResizeImages before this transform" in str(caught.value)

@@ -10,7 +10,7 @@ from fluxvla_core.data.transforms.padded_resize import ResizeImagesWithPad
 from fluxvla_core.errors import ConfigError, DataError
 
 
-def picture(height, width, seed=0):
+def random_image(height, width, seed=0):
     rng = np.random.default_rng(seed)
     return rng.integers(0, 256, (3, height, width), np.uint8)
 
@@ -25,7 +25,7 @@ def run(images, height=20, width=24, **settings):
     [((48, 64), (18, 24), (1, 0)), ((41, 30), (20, 14), (0, 5)), ((10, 12), (20, 24), (0, 0))],
 )
 def test_bytes_are_pillows(size, fitted, corner):
-    image = picture(*size)
+    image = random_image(*size)
     found = run([image])
     pillow = pytest.importorskip("PIL.Image")
     small = pillow.fromarray(image.transpose(1, 2, 0)).resize(
@@ -41,7 +41,7 @@ def test_bytes_are_pillows(size, fitted, corner):
 @pytest.mark.parametrize("size", [(48, 64), (41, 30), (10, 12)])
 def test_linear_is_torchs_interpolation_without_rounding(size):
     torch = pytest.importorskip("torch")
-    image = picture(*size)
+    image = random_image(*size)
     found = run([image], interpolation="linear")
     ratio = max(size[1] / 24, size[0] / 20)
     rows, columns = int(size[0] / ratio), int(size[1] / ratio)
@@ -57,13 +57,13 @@ def test_linear_is_torchs_interpolation_without_rounding(size):
 
 
 def test_cameras_of_several_sizes_become_one_array():
-    found = run([picture(48, 64), picture(41, 30, 1)])
+    found = run([random_image(48, 64), random_image(41, 30, 1)])
     assert found.shape == (6, 20, 24)
-    np.testing.assert_array_equal(found[3:], run([picture(41, 30, 1)]))
+    np.testing.assert_array_equal(found[3:], run([random_image(41, 30, 1)]))
 
 
 def test_an_image_of_that_size_is_left_as_it_is():
-    image = picture(20, 24)
+    image = random_image(20, 24)
     for interpolation in ("antialias", "linear"):
         found = run([image], interpolation=interpolation)
         assert found.dtype == np.uint8
@@ -71,7 +71,7 @@ def test_an_image_of_that_size_is_left_as_it_is():
 
 
 def test_what_remains_is_filled():
-    found = run([picture(41, 30)], pad_value=9)
+    found = run([random_image(41, 30)], pad_value=9)
     assert (found[:, :, :5] == 9).all()
     assert (found[:, :, 19:] == 9).all()
 
@@ -89,8 +89,8 @@ def test_settings_that_mean_nothing(settings, words):
         ResizeImagesWithPad(**{"height": 20, "width": 24, **settings})
 
 
-def test_pictures_that_cannot_be_fitted():
+def test_images_that_cannot_be_fitted():
     with pytest.raises(DataError, match="takes uint8 images, got float32"):
-        run([picture(48, 64).astype(np.float32)])
+        run([random_image(48, 64).astype(np.float32)])
     with pytest.raises(DataError, match="1 x 64 pixels has no pixel left in 20 x 24"):
-        run([picture(1, 64)])
+        run([random_image(1, 64)])

@@ -175,7 +175,7 @@ def chat(sample, max_len=150, **settings):
     return Marked().decode(out["lang_tokens"][out["lang_masks"]]), out
 
 
-def test_a_chat_has_places_for_pictures():
+def test_a_chat_has_places_for_images():
     text, out = chat({"task_description": "lift it", "img_masks": np.ones(2, np.bool_)})
     places = "<img><IMG_CONTEXT><IMG_CONTEXT><IMG_CONTEXT></img>"
     assert text == (
@@ -197,7 +197,7 @@ def test_the_instruction_of_a_chat_may_come_first_and_the_padding_last():
     assert not out["lang_masks"][-1]
 
 
-def test_places_of_pictures_are_never_cut():
+def test_places_of_images_are_never_cut():
     with pytest.raises(ConfigError) as caught:
         ProcessPromptsWithImage(Marked(), max_len=180)({"task_description": "lift it"})
     assert "the instruction 'lift it' has 865 tokens with 3 x 256 places for" in str(caught.value)
@@ -218,7 +218,7 @@ def test_places_of_pictures_are_never_cut():
         ({}, "ProcessPromptsWithImage: there is no instruction"),
     ],
 )
-def test_a_chat_that_does_not_fit_its_pictures_is_refused(sample, words):
+def test_a_chat_that_does_not_fit_its_images_is_refused(sample, words):
     with pytest.raises(ConfigError, match=words):
         chat(sample)
 
@@ -236,7 +236,7 @@ def test_a_chat_of_settings_that_mean_nothing_is_refused(settings, words):
         chat({"task_description": "lift it"}, **settings)
 
 
-def test_a_tokenizer_that_knows_no_pictures_is_refused():
+def test_a_tokenizer_that_knows_no_images_is_refused():
     with pytest.raises(ConfigError, match="<IMG_CONTEXT> is not a token of this tokenizer"):
         Pipeline([{"type": "ProcessPromptsWithImage", "tokenizer": TOKENIZER}])
 

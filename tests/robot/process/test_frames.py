@@ -32,10 +32,10 @@ NAMES = SPEC.camera_names
 
 def frame(seed=0, **changed):
     random = np.random.default_rng(seed)
-    pictures = {c.name: random.integers(0, 256, (c.height, c.width, 3), np.uint8) for c in CAMERAS}
+    images = {c.name: random.integers(0, 256, (c.height, c.width, 3), np.uint8) for c in CAMERAS}
     fields = {
         "state": random.uniform(-1, 1, 1),
-        "images": pictures,
+        "images": images,
         "stamps": {"state": 1.5, "front": 1.25, "wrist": 1.0},
         **changed,
     }
@@ -106,7 +106,7 @@ def test_only_the_cameras_that_are_looked_at_are_sent(ends):
     )
 
 
-def test_a_picture_that_has_not_come_yet_is_missing(ends):
+def test_an_image_that_has_not_come_yet_is_missing(ends):
     wanted = frame()
     images = {"front": None, "wrist": wanted.images["wrist"]}
 
@@ -115,7 +115,7 @@ def test_a_picture_that_has_not_come_yet_is_missing(ends):
     assert_same(found, wanted, ("wrist",))
 
 
-def test_pictures_that_are_views_and_states_that_are_lists(ends):
+def test_images_that_are_views_and_states_that_are_lists(ends):
     wanted = frame()
     images = {
         name: np.ascontiguousarray(i[..., ::-1])[..., ::-1] for name, i in wanted.images.items()
@@ -159,7 +159,7 @@ def test_what_is_no_array_of_numbers_is_refused(changed):
         message_of_frame(frame(**changed), NAMES, "Arm.get_frame()")
 
 
-def test_a_picture_that_is_too_large_does_not_fit(ends):
+def test_an_image_that_is_too_large_does_not_fit(ends):
     larger = {"front": np.zeros((480, 640, 3), np.uint8)}
 
     assert ends[1].fits(message_of_frame(frame(), NAMES, "a"))

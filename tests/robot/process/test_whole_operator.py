@@ -51,7 +51,7 @@ def test_a_policy_of_several_observations_sees_what_was_between_two_questions(tm
     assert asked[-2][-1] < later[0] < later[1] < later[2]
 
 
-def test_an_episode_with_pictures_of_the_process_that_commands(tmp_path, module):
+def test_an_episode_with_images_of_the_process_that_commands(tmp_path, module):
     run = Run(tmp_path)
 
     result = run.runner.run()
@@ -88,7 +88,7 @@ def test_depth_and_base_speed_are_recorded(tmp_path, module):
     for event in seen:
         stamps, images, depths = (
             event["stamps"],
-            recorded.pictures["front"],
+            recorded.images["front"],
             recorded.depths["front"],
         )
         count = int(images.read(images.newest(stamps["front"]))[0, 0, 0])

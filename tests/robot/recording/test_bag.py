@@ -32,7 +32,7 @@ START = {"event": "start", "t": 5.0, "format": "fluxvla-episode-1", "native": Fa
 CAMERA = "left/wrist cam"
 
 
-def picture(level: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def solid(level: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     return np.full((4, 6, 3), level, np.uint8)
 
 
@@ -41,7 +41,7 @@ def write(folder: Path, count: int = 20, flush: int | None = None) -> None:
     bag.add({**START, "embodiment": SPEC.to_dict(), "instruction": "wave"})
     for n in range(count):
         t = 5.0 + n / 10
-        bag.picture(CAMERA, t, picture(n))
+        bag.image(CAMERA, t, solid(n))
         bag.add({"event": "command", "t": t, "command": np.array([n / 7]), "phase": "run"})
         if n == flush:
             bag.flush()
@@ -59,34 +59,34 @@ def test_values_come_back_exactly_and_in_order(folder: Path) -> None:
     assert found.whole
     assert [e["event"] for e in found.events] == ["start"] + ["command"] * 20
     assert found.commands()[1][:, 0].tolist() == [n / 7 for n in range(20)]
-    assert found.pictures[CAMERA].read(7).tolist() == picture(7).tolist()
-    assert found.pictures[CAMERA].times == pytest.approx([5 + n / 10 for n in range(20)])
+    assert found.images[CAMERA].read(7).tolist() == solid(7).tolist()
+    assert found.images[CAMERA].times == pytest.approx([5 + n / 10 for n in range(20)])
 
 
-def test_a_picture_is_written_once(tmp_path: Path) -> None:
+def test_an_image_is_written_once(tmp_path: Path) -> None:
     bag = Bag(tmp_path / "b", NAMES)
     bag.add({**START, "embodiment": SPEC.to_dict()})
     for _ in range(3):
-        bag.picture(CAMERA, 5.0, picture(1))
+        bag.image(CAMERA, 5.0, solid(1))
     bag.close()
-    assert len(open_recording(tmp_path / "b").pictures[CAMERA]) == 1
+    assert len(open_recording(tmp_path / "b").images[CAMERA]) == 1
 
 
-def test_a_picture_that_nobody_looked_at_loses_a_little_until_somebody_does(tmp_path: Path) -> None:
+def test_an_image_that_nobody_looked_at_loses_a_little_until_somebody_does(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     noise = np.random.default_rng(0).integers(100, 140, (4, 6, 3), dtype=np.uint8)
     bag = Bag(tmp_path / "b", NAMES)
     bag.add({**START, "embodiment": SPEC.to_dict()})
     for t in (5.0, 5.1, 5.1):
-        bag.picture(CAMERA, t, noise, exact=False)
-    bag.picture(CAMERA, 5.1, noise)
-    bag.picture(CAMERA, 5.2, noise)
-    bag.picture(CAMERA, 5.2, noise, exact=False)
+        bag.image(CAMERA, t, noise, exact=False)
+    bag.image(CAMERA, 5.1, noise)
+    bag.image(CAMERA, 5.2, noise)
+    bag.image(CAMERA, 5.2, noise, exact=False)
     bag.close()
 
-    kinds = [(kind, ns) for _, kind, ns, _ in read_bag(tmp_path / "b" / "b.mcap").pictures]
+    kinds = [(kind, ns) for _, kind, ns, _ in read_bag(tmp_path / "b" / "b.mcap").images]
     assert len(kinds) == 4  # 5.0 and 5.1 as JPEG, 5.1 and 5.2 as they were
-    found = open_recording(tmp_path / "b").pictures[CAMERA]
+    found = open_recording(tmp_path / "b").images[CAMERA]
     assert found.times == pytest.approx([5.0, 5.1, 5.2])
     lossy = found.read(0).astype(int)
     assert 0 < np.abs(lossy - noise).max() < 40
@@ -110,36 +110,44 @@ def test_depth_is_whole_millimetres_or_nothing(
 
     found = open_recording(tmp_path / "b")
     assert len(found.depths[CAMERA]) == 1
-    assert found.pictures == {}
+    assert found.images == {}
     read = found.depths[CAMERA].read(0)
     assert read.dtype == np.float32
     assert np.isnan(read).all() if kept is None else read == pytest.approx(np.float32(kept))
 
 
-def test_without_opencv_every_picture_is_exact(
+def test_without_opencv_every_image_is_exact(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fluxvla_core.robot.recording.ros_messages.has_jpeg", lambda: False)
     bag = Bag(tmp_path / "b", NAMES)
     bag.add({**START, "embodiment": SPEC.to_dict()})
-    bag.picture(CAMERA, 5.0, picture(7), exact=False)
+    bag.image(CAMERA, 5.0, solid(7), exact=False)
     bag.close()
-    assert (open_recording(tmp_path / "b").pictures[CAMERA].read(0) == 7).all()
+    assert (open_recording(tmp_path / "b").images[CAMERA].read(0) == 7).all()
 
 
 def test_jpegs_need_opencv_to_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("cv2")
     bag = Bag(tmp_path / "b", NAMES)
     bag.add({**START, "embodiment": SPEC.to_dict()})
-    bag.picture(CAMERA, 5.0, picture(7), exact=False)
+    bag.image(CAMERA, 5.0, solid(7), exact=False)
     bag.close()
     monkeypatch.setattr("fluxvla_core.robot.recording.ros_messages.has_jpeg", lambda: False)
     with pytest.raises(DataError, match="the package 'cv2' is not installed"):
-        open_recording(tmp_path / "b").pictures[CAMERA].read(0)
+        open_recording(tmp_path / "b").images[CAMERA].read(0)
 
 
-def test_the_newest_picture_by_a_time(folder: Path) -> None:
-    images = open_recording(folder).pictures[CAMERA]
+def test_pictures_is_a_deprecated_name_of_images(folder: Path) -> None:
+    recorded, content = open_recording(folder), read_bag(folder / f"{folder.name}.mcap")
+    with pytest.warns(DeprecationWarning, match=r"Recorded.pictures is deprecated, use images"):
+        assert recorded.pictures is recorded.images
+    with pytest.warns(DeprecationWarning, match=r"BagContent.pictures is deprecated, use images"):
+        assert content.pictures is content.images
+
+
+def test_the_newest_image_by_a_time(folder: Path) -> None:
+    images = open_recording(folder).images[CAMERA]
     assert [images.newest(t) for t in (4.9, 5.0, 5.05, 5.1, 99.0)] == [None, 0, 0, 1, 19]
 
 
@@ -254,13 +262,13 @@ def test_events_beyond_the_limit_are_counted(
     assert trace.close({})["dropped"] == {"frames": 0, "pictures": 0, "events": 1}
 
 
-def test_pictures_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_path: Path) -> None:
+def test_images_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_path: Path) -> None:
     asked: list[float] = []
 
     def source(camera: str, after: float) -> Any:
         asked.append(after)
         new = after + 0.01
-        return [(new, picture(len(asked)))], 3 * len(asked)
+        return [(new, solid(len(asked)))], 3 * len(asked)
 
     trace = EpisodeTrace(tmp_path / "e", 10.0, Recording(NAMES, (CAMERA,), source))
     trace.write({**START, "embodiment": SPEC.to_dict()})
@@ -268,4 +276,4 @@ def test_pictures_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_p
         time.sleep(0.01)
     summary = trace.close({})
     assert summary["dropped"]["pictures"] == 2 * (len(asked) - 1)
-    assert len(open_recording(tmp_path / "e").pictures[CAMERA]) == len(asked)
+    assert len(open_recording(tmp_path / "e").images[CAMERA]) == len(asked)

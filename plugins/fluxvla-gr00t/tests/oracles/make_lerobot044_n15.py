@@ -139,7 +139,7 @@ class Tiny(nn.Module):
 
 
 def inputs(padded: bool) -> BatchFeature:
-    """Two samples of two pictures of 28 x 28 pixels; ``padded``: the second has fewer words."""
+    """Two samples of two images of 28 x 28 pixels; ``padded``: the second has fewer words."""
     words = torch.from_numpy(fill.integers("words", (2, 7), PLACE))
     places = torch.full((2, 4), PLACE)
     tokens = torch.cat([words[:, :4], places, words[:, 4:5], places, words[:, 5:]], dim=1)

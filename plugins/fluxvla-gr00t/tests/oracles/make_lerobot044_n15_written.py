@@ -9,7 +9,7 @@ tests/written/n1.5 is what ``fluxvla export --format lerobot`` makes, with names
 of the weights; test_gr00t_write.py compares.
 LeRobot loads it strictly into a model that is 0 throughout, of the sizes of
 make_lerobot044_n15.py, and packs and unpacks with its processors. The steps between them need
-files from the hub: tokens and pictures are those of make_lerobot044_n15.py instead. LeRobot 0.4.4
+files from the hub: tokens and images are those of make_lerobot044_n15.py instead. LeRobot 0.4.4
 unpacks only the last action that it is given, so that it is given them one by one. It writes
 tests/golden/written_n15.safetensors.
 """

@@ -125,7 +125,7 @@ def tiny_model() -> torch.nn.Module:
 
 
 def inputs(padded: bool) -> dict[str, torch.Tensor]:
-    """Two samples of two pictures of 16 x 16 pixels; ``padded``: the second has fewer words."""
+    """Two samples of two images of 16 x 16 pixels; ``padded``: the second has fewer words."""
     pictures = torch.from_numpy(fill.normal("pictures", (2, 6, 16, 16))).reshape(4, 3, 16, 16)
     processor = Qwen2VLImageProcessor(
         do_resize=False,

@@ -1,4 +1,4 @@
-"""What LeRobot 0.6.1 makes of pictures for GR00T N1.7, up to the patches of the Qwen processor.
+"""What LeRobot 0.6.1 makes of images for GR00T N1.7, up to the patches of the Qwen processor.
 
 Run from the repository's root in an environment with LeRobot 0.6.1 and transformers 5.5.4:
 
@@ -30,7 +30,7 @@ SIZES = {"wide": (60, 80), "tall": (90, 50)}
 
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
-    # Least sizes as in Qwen3-VL's processor, in proportion to its pictures.
+    # Least sizes as in Qwen3-VL's processor, in proportion to its images.
     processor = Qwen2VLImageProcessor(
         patch_size=16,
         merge_size=2,

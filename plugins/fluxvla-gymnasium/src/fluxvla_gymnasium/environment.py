@@ -19,7 +19,7 @@ from fluxvla_mujoco import MujocoEnvironment, check_render, note_renderer, set_r
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMismatch
 from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera, EmbodimentSpec
-from fluxvla_gymnasium.parts import parts, pictures, state_row, text
+from fluxvla_gymnasium.parts import images_of, parts, state_row, text
 
 if TYPE_CHECKING:
     from fluxvla_core.models import Observation
@@ -245,7 +245,7 @@ class GymnasiumEnvironment(MujocoEnvironment):
         """
         return {
             "qpos": self.state.astype(np.float32),
-            "images": {camera.name: self._picture(camera.name) for camera in cameras},
+            "images": {camera.name: self._image(camera.name) for camera in cameras},
             "task_description": self._instruction(),
         }
 
@@ -260,13 +260,13 @@ class GymnasiumEnvironment(MujocoEnvironment):
             return self.spec.tasks[0].instruction
         return text(self._parts, self._instruction_from)
 
-    def _picture(self, camera: str) -> npt.NDArray[np.uint8]:
+    def _image(self, camera: str) -> npt.NDArray[np.uint8]:
         key = self._cameras.get(camera, camera)
         if key == "render":
             drawn = np.array(self._env.render(), dtype=np.uint8)
             note_renderer()
             return drawn
-        found = pictures(self._parts)
+        found = images_of(self._parts)
         ends = [name for name in found if name == key or name.endswith(f".{key}")]
         if len(ends) != 1:
             raise SpecMismatch(

@@ -37,7 +37,7 @@ def parts(observation: Any, prefix: str = "") -> dict[str, npt.NDArray[Any]]:
             "no array of numbers, and no text",
             next="make the environment with a wrapper that gives arrays",
         )
-    return {prefix or ("image" if is_picture(array) else ""): array}
+    return {prefix or ("image" if is_image(array) else ""): array}
 
 
 def is_text(array: npt.NDArray[Any]) -> bool:
@@ -59,14 +59,14 @@ def text(found: Parts, key: str) -> str:
     return str(found[key])
 
 
-def is_picture(array: npt.NDArray[Any]) -> bool:
+def is_image(array: npt.NDArray[Any]) -> bool:
     """Whether it is ``(H, W, 3)`` uint8."""
     return array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3
 
 
-def pictures(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
+def images_of(found: Parts) -> dict[str, npt.NDArray[np.uint8]]:
     """The parts that are images."""
-    return {name: array for name, array in found.items() if is_picture(array)}
+    return {name: array for name, array in found.items() if is_image(array)}
 
 
 def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float64]:
@@ -76,7 +76,7 @@ def state_row(found: Parts, keys: Sequence[str] | None) -> npt.NDArray[np.float6
         SpecMismatch: there is no such part, or it is a text.
     """
     if keys is None:
-        keys = [n for n, array in found.items() if not is_picture(array) and not is_text(array)]
+        keys = [n for n, array in found.items() if not is_image(array) and not is_text(array)]
     missing = [key for key in keys if key not in found]
     if missing:
         raise SpecMismatch(

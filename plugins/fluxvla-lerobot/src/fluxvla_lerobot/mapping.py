@@ -146,7 +146,7 @@ def cameras_for(
     return found
 
 
-def pictures(
+def camera_images(
     observation: Observation, cameras: Mapping[str, str], trained: Mapping[str, Camera]
 ) -> dict[str, npt.NDArray[np.uint8]]:
     """The policy's features: feature -> ``(H, W, 3)`` uint8.

@@ -18,10 +18,10 @@ from fluxvla_lerobot.installed import installed_version, known_version, lerobot
 from fluxvla_lerobot.loading import Loaded, load
 from fluxvla_lerobot.mapping import (
     Columns,
+    camera_images,
     cameras_for,
     check_sizes,
     columns_for,
-    pictures,
     plain_columns,
 )
 
@@ -146,7 +146,7 @@ class LeRobotPolicy(Actor):
                 next="embodiment = FILE, or an evaluation, whose environment has one",
             )
         began = time.perf_counter()
-        seen: dict[str, Any] = dict(pictures(observation, self._features, self._trained))
+        seen: dict[str, Any] = dict(camera_images(observation, self._features, self._trained))
         if self.embodiment is None:
             sizes = {self._features[feature]: image.shape[:2] for feature, image in seen.items()}
             check_sizes(self._described, self._features, sizes)

@@ -151,7 +151,7 @@ def test_a_robot_with_other_names_order_and_units(folders):
     np.testing.assert_allclose(mapped.predict_action(turned), expected, rtol=1e-5, atol=1e-7)
 
 
-def test_larger_pictures_of_the_same_view_are_scaled(folders):
+def test_larger_images_of_the_same_view_are_scaled(folders):
     policy = LeRobotPolicy(str(folders["act"]), embodiment=ROBOT.to_dict())
     small = observation(0)
     large = {

@@ -32,7 +32,7 @@ CAMERAS = {
 """Names that policies and public datasets give LIBERO's two cameras -> the scene's own."""
 
 SCENE_CAMERAS = ("agentview", "robot0_eye_in_hand")
-PICTURE = 224
+IMAGE_SIZE = 224
 """Side of the images of the standard protocol, in pixels."""
 
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, OPEN])
@@ -51,7 +51,7 @@ def libero_spec(cameras: Sequence[Camera] | None = None) -> EmbodimentSpec:
         cameras: the two of the scene at 224 x 224 by default.
     """
     if cameras is None:
-        cameras = [Camera(name, PICTURE, PICTURE) for name in SCENE_CAMERAS]
+        cameras = [Camera(name, IMAGE_SIZE, IMAGE_SIZE) for name in SCENE_CAMERAS]
     return EmbodimentSpec(
         name="libero_panda",
         joints=(

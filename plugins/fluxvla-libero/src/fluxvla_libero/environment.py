@@ -13,7 +13,7 @@ from fluxvla_mujoco import MujocoEnvironment, check_render
 from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera
-from fluxvla_libero.embodiment import CAMERAS, PICTURE, SCENE_CAMERAS, libero_spec
+from fluxvla_libero.embodiment import CAMERAS, IMAGE_SIZE, SCENE_CAMERAS, libero_spec
 from fluxvla_libero.suites import (
     NUM_STEPS_WAIT,
     SuiteTask,
@@ -72,8 +72,8 @@ class LiberoEnvironment(MujocoEnvironment):
         tasks: Sequence[int | str] | None = None,
         mixed: bool = False,
         cameras: Sequence[str] = SCENE_CAMERAS,
-        height: int = PICTURE,
-        width: int = PICTURE,
+        height: int = IMAGE_SIZE,
+        width: int = IMAGE_SIZE,
         render: str = "cheap",
         begin: str = FIXED,
         num_steps_wait: int = NUM_STEPS_WAIT,

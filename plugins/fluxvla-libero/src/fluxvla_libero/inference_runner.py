@@ -236,7 +236,7 @@ class LiberoInferenceRunner:
     def _live(self) -> Iterator[Any]:
         """A function that shows images side by side; it does nothing without a live view."""
         if self.live_port is None:
-            yield lambda pictures: None
+            yield lambda images: None
             return
         import numpy as np
 
@@ -244,7 +244,7 @@ class LiberoInferenceRunner:
 
         with LiveView(self.live_port) as view:
             self.context.reporter.info(f"live at {view.url}")
-            yield lambda pictures: view.show(np.hstack(pictures))
+            yield lambda images: view.show(np.hstack(images))
 
     def _resolve(self, asked: Task) -> tuple[SuiteTask, SuiteTask | None]:
         """The scene, and the suite's task of these words if there is one."""

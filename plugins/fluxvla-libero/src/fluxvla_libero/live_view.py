@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fluxvla_core.errors import RunFailed
 
 HOST = "127.0.0.1"
-_BOUNDARY = "picture"
+_BOUNDARY = "frame"
 
 
 class LiveView:
@@ -66,11 +66,11 @@ class LiveView:
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
-    def show(self, picture: npt.NDArray[np.uint8]) -> None:
+    def show(self, image: npt.NDArray[np.uint8]) -> None:
         """The newest ``(H, W, 3)`` uint8 RGB image; viewers that are slow miss some."""
         import cv2
 
-        _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]))
+        _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))
         with self._changed:
             self._jpeg = jpeg.tobytes()
             self._number += 1

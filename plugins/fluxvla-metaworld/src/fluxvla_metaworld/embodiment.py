@@ -22,7 +22,7 @@ TURNED = frozenset({"corner", "corner2", "corner3", "corner4"})
 """Cameras that hang upside down in Meta-World's scenes; their images are turned by 180 degrees,
 as public datasets of Meta-World show ``corner2``."""
 
-PICTURE = 224
+IMAGE_SIZE = 224
 
 
 def metaworld_spec(cameras: Sequence[Camera]) -> EmbodimentSpec:

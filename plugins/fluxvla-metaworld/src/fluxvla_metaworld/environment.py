@@ -19,7 +19,7 @@ from fluxvla_mujoco import Drawing, MujocoEnvironment, check_render, use_egl
 from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed
 from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera
-from fluxvla_metaworld.embodiment import CAMERAS, PICTURE, TURNED, metaworld_spec
+from fluxvla_metaworld.embodiment import CAMERAS, IMAGE_SIZE, TURNED, metaworld_spec
 from fluxvla_metaworld.tasks import INSTRUCTIONS, choose_tasks
 
 if TYPE_CHECKING:
@@ -56,8 +56,8 @@ class MetaWorldEnvironment(MujocoEnvironment):
         self,
         tasks: str | Sequence[str] = "MT50",
         cameras: Sequence[str] = ("corner2",),
-        height: int = PICTURE,
-        width: int = PICTURE,
+        height: int = IMAGE_SIZE,
+        width: int = IMAGE_SIZE,
         render: str = "cheap",
         max_steps: int = LIMIT,
     ) -> None:
@@ -152,7 +152,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
         """
         return {
             "qpos": self._seen[:4].astype(np.float32),
-            "images": {c.name: self._picture(c) for c in cameras},
+            "images": {c.name: self._image(c) for c in cameras},
             "task_description": INSTRUCTIONS[self._task],
         }
 
@@ -170,7 +170,7 @@ class MetaWorldEnvironment(MujocoEnvironment):
             self._env.close()
             self._env = None
 
-    def _picture(self, camera: Camera) -> npt.NDArray[np.uint8]:
+    def _image(self, camera: Camera) -> npt.NDArray[np.uint8]:
         import mujoco
 
         if camera.name not in CAMERAS:

@@ -196,7 +196,7 @@ def _preparation(checkpoint: ForeignCheckpoint, model: Mapping[str, Any]) -> Pre
     tables = _acting(checkpoint.transforms)
     size = _size(checkpoint, tables.pop("ResizeImages", None))
     numbers = tables.pop("NormalizeStatesAndActions", None)
-    images = next((tables.pop(n) for n in _PICTURES if n in tables), None)
+    images = next((tables.pop(n) for n in _NORMALIZE_IMAGES if n in tables), None)
     if numbers is None or images is None or tables:
         what = f"{next(iter(tables))} is" if tables else "a normalisation is not"
         raise CheckpointError(
@@ -236,13 +236,13 @@ def _preparation(checkpoint: ForeignCheckpoint, model: Mapping[str, Any]) -> Pre
     return Preparation(features, modes, statistics, size)
 
 
-_PICTURES = ("NormalizeImages", "SimpleNormalizeImages")
+_NORMALIZE_IMAGES = ("NormalizeImages", "SimpleNormalizeImages")
 
 
 def _acting(tables: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     """The transforms that a policy acts with, by name; those of training alone do not matter."""
     named = ((str(table["type"]).rpartition(":")[2], table) for table in tables)
-    known = ("ResizeImages", *_PICTURES, "NormalizeStatesAndActions")
+    known = ("ResizeImages", *_NORMALIZE_IMAGES, "NormalizeStatesAndActions")
     return {
         name: table
         for name, table in named

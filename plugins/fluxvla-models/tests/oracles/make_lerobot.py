@@ -4,7 +4,7 @@
     PYTHONPATH=. $(python -m tools.oracle_env) plugins/fluxvla-models/tests/oracles/make_lerobot.py
 
 For each case ``<case>.safetensors`` has the loss of a batch, some gradients, the actions and the
-commands that follow from a raw picture and joint state; its metadata has the names and shapes of
+commands that follow from a raw image and joint state; its metadata has the names and shapes of
 the policy's tensors. ``<case>/`` is what LeRobot saves of it, without the weights.
 """
 

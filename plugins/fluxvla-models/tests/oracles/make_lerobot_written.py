@@ -8,7 +8,7 @@
 ``make_lerobot.py``, without the weights; test_lerobot_write.py compares. They are filled by their
 names here, as there, and the constants that FluxVLA writes beside them are LeRobot's own, which are
 recorded. ``written_act_diffusion.safetensors`` has those, and the commands that follow in LeRobot
-from raw pictures and joint states.
+from raw images and joint states.
 """
 
 from __future__ import annotations

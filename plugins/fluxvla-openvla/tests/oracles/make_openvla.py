@@ -129,7 +129,7 @@ def openvla() -> dict[str, np.ndarray]:
 
 
 def oft() -> dict[str, np.ndarray]:
-    """L1 loss with the state and two pictures; gradients and predicted chunks."""
+    """L1 loss with the state and two images; gradients and predicted chunks."""
     return _oft(film=False, diffuse=False)
 
 
@@ -144,7 +144,7 @@ def diffusion() -> dict[str, np.ndarray]:
 
 
 def processor() -> dict[str, np.ndarray]:
-    """A picture through the published processor, to 28 pixels instead of 224."""
+    """An image through the published processor, to 28 pixels instead of 224."""
     from PIL import Image
     from prismatic.extern.hf.processing_prismatic import PrismaticImageProcessor
 
@@ -263,7 +263,7 @@ def prompts() -> tuple[np.ndarray, np.ndarray]:
 
 
 def pictures(count: int) -> torch.Tensor:
-    """Two observations of ``count`` pictures, ``(2, 6 * count, H, W)``: for DINOv2, for SigLIP."""
+    """Two observations of ``count`` images, ``(2, 6 * count, H, W)``: for DINOv2, for SigLIP."""
     plain = fill.uniform("images", (2, count, 3, IMAGE, IMAGE), -1.0, 1.0)
     mean = np.array([0.485, 0.456, 0.406], np.float32)[:, None, None]
     std = np.array([0.229, 0.224, 0.225], np.float32)[:, None, None]

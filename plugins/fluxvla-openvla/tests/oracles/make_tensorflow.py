@@ -1,4 +1,4 @@
-"""Golden file of the operations on pictures that OpenVLA's code leaves to TensorFlow.
+"""Golden file of the operations on images that OpenVLA's code leaves to TensorFlow.
 
 In an environment with tensorflow-cpu, safetensors and numpy, from the root of the repository:
 

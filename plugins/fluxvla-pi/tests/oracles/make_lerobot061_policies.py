@@ -1,4 +1,4 @@
-"""Whole policies of LeRobot, from pictures, words and joints to commands, and the files they save.
+"""Whole policies of LeRobot, from images, words and joints to commands, and the files they save.
 
     HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 PYTHONPATH=. python \\
         plugins/fluxvla-pi/tests/oracles/make_lerobot061_policies.py [FOLDER]

@@ -85,7 +85,7 @@ def statistics():
 
 
 def observation():
-    """Pictures ``(H, W, 3)`` uint8 by camera, and the state in a robot's units."""
+    """Images ``(H, W, 3)`` uint8 by camera, and the state in a robot's units."""
     images = {
         name: fill.integers(f"picture.{name}", (*size, 3), 256).astype(np.uint8)
         for name, size in SIZES_OF_CAMERAS.items()

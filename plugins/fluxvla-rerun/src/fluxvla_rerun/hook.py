@@ -118,10 +118,10 @@ class RerunViewer(Hook):
         self._time(ROBOT, duration=stamp)
         for name, image in observation["images"].items():
             if image is not None:  # nothing has come of that camera yet
-                picture = rerun.Image(np.asarray(image))
+                shown = rerun.Image(np.asarray(image))
                 if self.jpeg_quality is not None:
-                    picture = picture.compress(jpeg_quality=self.jpeg_quality)
-                self._log(f"cameras/{_part(name)}", picture)
+                    shown = shown.compress(jpeg_quality=self.jpeg_quality)
+                self._log(f"cameras/{_part(name)}", shown)
         self._positions("measured", observation["qpos"])
 
     def inferred(self, chunk: Array, latency_s: float, stamp: float) -> None:

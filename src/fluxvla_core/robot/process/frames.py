@@ -31,7 +31,7 @@ _NUMBERS = 64
 _ALIGNED = 64
 # Room for the JSON values: names, stamps, or an error's message.
 _TEXT = 64 * 1024
-_PICTURE, _DEPTH, _BASE = "image ", "depth ", "base"
+_IMAGE, _DEPTH, _BASE = "image ", "depth ", "base"
 _MORE, _MEASURED = "more ", "measured"
 
 
@@ -168,10 +168,10 @@ def message_of_frame(frame: Frame, cameras: Iterable[str], source: str) -> Frame
         BadFrame: the state or an image is no array of numbers.
     """
     stamps = {str(k): float(v) if is_number(v) else None for k, v in frame.stamps.items()}
-    pictures = {n: frame.images[n] for n in cameras if frame.images.get(n) is not None}
+    images = {n: frame.images[n] for n in cameras if frame.images.get(n) is not None}
     arrays = {STATE: _numbers(frame.state, f"the state of {source}")} | {
-        _PICTURE + name: _numbers(image, f"camera {name} of {source}")
-        for name, image in pictures.items()
+        _IMAGE + name: _numbers(image, f"camera {name} of {source}")
+        for name, image in images.items()
     }
     if isinstance(frame, RobotFrame):
         depths = {n: frame.depths[n] for n in cameras if frame.depths.get(n) is not None}
@@ -188,7 +188,7 @@ def message_of_frame(frame: Frame, cameras: Iterable[str], source: str) -> Frame
 
 def frame_of(message: FrameMessage) -> Frame:
     """The frame of ``message_of_frame``."""
-    images, depths = _named(message, _PICTURE), _named(message, _DEPTH)
+    images, depths = _named(message, _IMAGE), _named(message, _DEPTH)
     state, stamps = message.arrays[STATE], message.fields["stamps"]
     return RobotFrame(state, images, stamps, depths, message.arrays.get(_BASE))
 

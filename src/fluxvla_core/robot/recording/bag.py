@@ -71,7 +71,7 @@ class Bag:
         for topic, kind, data in self._packer.event(event, stamps, self._names):
             self._write(topic, kind, stamps["t"], data)
 
-    def picture(
+    def image(
         self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
     ) -> None:
         ns = self._ns(stamp)
@@ -79,7 +79,7 @@ class Bag:
         topic = ros.camera_topic(camera, kind)
         if ns in self._written.get(ros.camera_topic(camera), ()) or not self._is_new(topic, ns):
             return
-        pack = self._packer.picture if kind == ros.IMAGE else self._packer.jpeg
+        pack = self._packer.image if kind == ros.IMAGE else self._packer.jpeg
         self._write(topic, kind, ns, pack(camera, image, ns))
 
     def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:

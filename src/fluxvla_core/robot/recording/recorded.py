@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +37,7 @@ ROUNDING_S = 1e-6
 _LARGEST_TRACE = 1 << 30  # bytes: a day of one arm at 50 Hz
 
 
-class Pictures:
+class RecordedImages:
     """One camera's images in the order of their times; each is read when it is asked for.
 
     ``times`` are seconds on the loop's clock, when each arrived.
@@ -101,8 +102,8 @@ class Recorded:
         path: Path,
         events: Sequence[Event],
         whole: bool,
-        pictures: Mapping[str, Pictures],
-        depths: Mapping[str, Pictures] | None = None,
+        images: Mapping[str, RecordedImages],
+        depths: Mapping[str, RecordedImages] | None = None,
     ) -> None:
         if not events or events[0].get("event") != episode_log.START:
             raise DataError(
@@ -112,7 +113,7 @@ class Recorded:
             )
         self.path = path
         self.events = events
-        self.pictures = pictures
+        self.images = images
         self.depths = depths or {}
         self.whole = whole
         self.start = events[0]
@@ -122,6 +123,12 @@ class Recorded:
                 where=str(path),
             )
         self.embodiment = EmbodimentSpec.from_dict(self.start.get("embodiment") or {})
+
+    @property
+    def pictures(self) -> Mapping[str, RecordedImages]:
+        """Deprecated name of ``images``."""
+        _renamed("Recorded")
+        return self.images
 
     @property
     def instruction(self) -> str:
@@ -259,8 +266,14 @@ class BagContent:
     file: McapFile
     unpacker: ros.Unpacker
     events: list[Event]
-    pictures: list[tuple[str, str, int, Place]]
+    images: list[tuple[str, str, int, Place]]
     offset: int
+
+    @property
+    def pictures(self) -> list[tuple[str, str, int, Place]]:
+        """Deprecated name of ``images``."""
+        _renamed("BagContent")
+        return self.images
 
     @property
     def whole(self) -> bool:
@@ -280,8 +293,8 @@ def read_bag(path: Path) -> BagContent:
     offset = 0
     try:
         for entry in found.file.entries():
-            if entry.kind in ros.PICTURES:
-                found.pictures.append((entry.topic, entry.kind, entry.ns, entry.place))
+            if entry.kind in ros.IMAGE_TYPES:
+                found.images.append((entry.topic, entry.kind, entry.ns, entry.place))
                 continue
             event = unpacker.add(entry.topic, entry.kind, entry.ns, entry.data)
             if event is not None:
@@ -296,15 +309,20 @@ def read_bag(path: Path) -> BagContent:
     return replace(found, offset=offset)
 
 
+def _renamed(owner: str) -> None:
+    message = f"{owner}.pictures is deprecated, use images"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+
+
 def _read(path: Path) -> Recorded:
     file = bag_of(path) if path.is_dir() else path
     if file is None:
-        return Recorded(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), pictures={})
+        return Recorded(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
     bag = read_bag(file)
     events, whole = _with_rest(file.parent, bag.events, bag.whole)
     cameras = Recorded(path, events, whole, {}).embodiment.camera_names
-    colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.PICTURES}
-    images = _sorted(bag, colours, bag.unpacker.picture)
+    colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.IMAGE_TYPES}
+    images = _sorted(bag, colours, bag.unpacker.image)
     depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
     return Recorded(path, events, whole, images, depths)
 
@@ -328,13 +346,13 @@ def _sorted(
     bag: BagContent,
     by_topic: Mapping[str, str],
     unpack: Callable[[memoryview, str], npt.NDArray[Any]],
-) -> dict[str, Pictures]:
+) -> dict[str, RecordedImages]:
     """Camera -> its images on those of its topics that are named."""
-    found: dict[str, Pictures] = {}
-    for topic, kind, ns, place in bag.pictures:
+    found: dict[str, RecordedImages] = {}
+    for topic, kind, ns, place in bag.images:
         camera = by_topic.get(topic)
         if camera is not None:
-            kept = found.setdefault(camera, Pictures(bag.file, unpack))
+            kept = found.setdefault(camera, RecordedImages(bag.file, unpack))
             kept.add((ns - bag.offset) / 1e9, place, kind)
     return found
 

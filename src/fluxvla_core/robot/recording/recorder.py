@@ -143,10 +143,10 @@ class EpisodeRecorder(EpisodeObserver):
 
     def _observed(self, now: float, reading: RobotReading) -> None:
         frame, images = reading.frame, reading.observation["images"]
-        pictures = images if frame is None else frame.images
+        seen = images if frame is None else frame.images
         stamps = dict(frame.stamps) if frame is not None else dict.fromkeys((STATE, *images), now)
-        for camera, image in pictures.items():
-            self._trace.picture(camera, stamps.get(camera, now), image)
+        for camera, image in seen.items():
+            self._trace.image(camera, stamps.get(camera, now), image)
         base = self._beside(frame, stamps) if isinstance(frame, RobotFrame) else {}
         self._write(
             episode_log.OBSERVATION,
@@ -218,7 +218,7 @@ class EpisodeRecorder(EpisodeObserver):
                 frame = robot.frame()
             images = frame.images
             for camera, image in images.items():
-                self._trace.picture(camera, frame.stamps[camera], image)
+                self._trace.image(camera, frame.stamps[camera], image)
         shown = self._cameras or images
         self._trace.frames({name: images[name] for name in shown if name in images})
 

@@ -72,7 +72,7 @@ class ReplayOperator(Operator):
             DataError: it cannot be read, or has nothing to show.
         """
         found = open_recording(self.recording)
-        if found.embodiment.cameras and not found.pictures:
+        if found.embodiment.cameras and not found.images:
             raise DataError(
                 "this episode has no images: its robot cannot be replayed",
                 where=str(found.path),
@@ -85,7 +85,7 @@ class ReplayOperator(Operator):
     def embodiment(self) -> EmbodimentSpec:
         """The recorded robot, with those of its cameras that were recorded."""
         spec = self.recorded.embodiment
-        seen = tuple(c for c in spec.cameras if c.name in self.recorded.pictures)
+        seen = tuple(c for c in spec.cameras if c.name in self.recorded.images)
         return replace(spec, cameras=seen)
 
     @cached_property
@@ -119,7 +119,7 @@ class ReplayOperator(Operator):
         now = self._now()
         look = int(newest_at(self._looked, now))
         arrived = {stream: self._arrived(stream, look, now) for stream in self._arrivals}
-        cameras, depths = self.recorded.pictures, self.recorded.depths
+        cameras, depths = self.recorded.images, self.recorded.depths
         images = {name: found.shown(arrived[name]) for name, found in cameras.items()}
         metres = {name: found.shown(arrived[depth_stream(name)]) for name, found in depths.items()}
         base = self._observations[look].get(BASE)
@@ -207,7 +207,7 @@ class ReplayOperator(Operator):
     def _arrivals(self) -> dict[str, Array]:
         """Stream -> ``(N,)`` when what each look saw of it had arrived."""
         recorded = self.recorded
-        streams = [STATE, *recorded.pictures, *map(depth_stream, recorded.depths)]
+        streams = [STATE, *recorded.images, *map(depth_stream, recorded.depths)]
         ages = {s: np.array([age_at(e, s) for e in self._observations]) for s in streams}
         # The loop checks the streams that its policy looks at; the others may have run backwards.
         return {s: np.maximum.accumulate(self._looked - age) for s, age in ages.items()}

@@ -46,7 +46,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 IMAGE = "sensor_msgs/msg/Image"
 JPEG = "sensor_msgs/msg/CompressedImage"
-PICTURES = (IMAGE, JPEG)
+IMAGE_TYPES = (IMAGE, JPEG)
 
 _QUALITY = 90
 _FIELDS = {topic: field for field, topic in VECTORS.items()}
@@ -136,7 +136,7 @@ class Packer:
         kind = self._store.types[STRING]
         yield EVENTS, STRING, self._store.serialize_cdr(kind(text), STRING)
 
-    def picture(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
+    def image(self, camera: str, image: npt.NDArray[np.uint8], ns: int) -> memoryview:
         """The CDR of an ``Image``: ``(H, W, 3)`` uint8 RGB."""
         return self._image(camera, image, "rgb8", ns)
 
@@ -271,7 +271,7 @@ class Unpacker:
             return {**event, **parts}
         return None
 
-    def picture(self, data: memoryview, kind: str = IMAGE) -> npt.NDArray[np.uint8]:
+    def image(self, data: memoryview, kind: str = IMAGE) -> npt.NDArray[np.uint8]:
         """``(H, W, 3)`` uint8 RGB, a fresh array.
 
         Raises:

@@ -103,9 +103,9 @@ def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recor
 def _with_cameras(recordings: Sequence[Recorded]) -> EmbodimentSpec:
     """The robot of all recordings, with the cameras that all of them have images of."""
     spec = check_same_embodiment(recordings)
-    kept = tuple(c for c in spec.cameras if all(c.name in r.pictures for r in recordings))
+    kept = tuple(c for c in spec.cameras if all(c.name in r.images for r in recordings))
     if spec.cameras and not kept:
-        bare = next(r for r in recordings if not r.pictures)
+        bare = next(r for r in recordings if not r.images)
         raise DataError(
             "this episode has no images",
             where=str(bare.path),
@@ -136,21 +136,21 @@ def _write(
     command_times, commands = recorded.commands("run")
     at = newest_at(state_times, times)
     then = newest_at(command_times, times + 1.0 / fps)
-    shown = _pictures(recorded, cameras, times, fps, say)
+    shown = _newest_images(recorded, cameras, times, fps, say)
     for row in range(len(times)):
-        images = {name: recorded.pictures[name].read(index[row]) for name, index in shown.items()}
+        images = {name: recorded.images[name].read(index[row]) for name, index in shown.items()}
         writer.add_frame(images, states[at[row]], commands[then[row]], recorded.instruction)
     writer.save_episode()
     return len(times)
 
 
-def _pictures(
+def _newest_images(
     recorded: Recorded, cameras: Sequence[str], times: Array, fps: float, say: Reporter
 ) -> dict[str, npt.NDArray[np.intp]]:
     """Camera -> which of its images is the newest at each of ``times``; warns of sparse ones."""
     found = {}
     for name in cameras:
-        index = newest_at(np.array(recorded.pictures[name].times), times)
+        index = newest_at(np.array(recorded.images[name].times), times)
         found[name] = index
         fresh = len(np.unique(index))
         if fresh < 0.75 * len(times):

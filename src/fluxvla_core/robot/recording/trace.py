@@ -40,8 +40,8 @@ _FLUSH_S = 0.5
 # How often the robot is asked for images that nobody looked at; it keeps the newest few.
 _POLL_S = 0.03
 
-Picture = npt.NDArray[np.uint8]
-Source = Callable[[str, float], tuple[Sequence[tuple[float, Picture]], int]]
+Image = npt.NDArray[np.uint8]
+Source = Callable[[str, float], tuple[Sequence[tuple[float, Image]], int]]
 """``images_after`` of an operator: camera and a time -> the kept ones of those that arrived
 later, ``(stamp, image)``, oldest first, and how many arrived since it was connected. It must be
 safe to call from any thread."""
@@ -57,7 +57,7 @@ class Log(Protocol):
     def add(self, event: Mapping[str, Any]) -> None:
         """Append one event: JSON values and arrays, with ``event`` and ``t``."""
 
-    def picture(
+    def image(
         self, camera: str, stamp: float, image: npt.NDArray[np.uint8], exact: bool = True
     ) -> None:
         """Append one ``(H, W, 3)`` uint8 RGB image that arrived at ``stamp``.
@@ -129,7 +129,7 @@ class _Poll:
         self._before: int | None = None
         self._received = 0
 
-    def take(self, found: Sequence[tuple[float, Picture]], received: int) -> None:
+    def take(self, found: Sequence[tuple[float, Image]], received: int) -> None:
         if self._before is None:
             self._before = received - len(found)
         self._received = received
@@ -191,14 +191,14 @@ class EpisodeTrace:
         else:
             self.dropped["events"] += 1
 
-    def frames(self, images: Mapping[str, Picture]) -> None:
+    def frames(self, images: Mapping[str, Image]) -> None:
         """Append one ``(H, W, 3)`` uint8 frame to the video of each camera."""
         if self.video_fps is None or self._source is not None:
             return
         for camera, image in images.items():
             self._put_image("frames", (camera, None, image))
 
-    def picture(self, camera: str, stamp: float, image: Picture) -> None:
+    def image(self, camera: str, stamp: float, image: Image) -> None:
         """Record a ``(H, W, 3)`` uint8 image that arrived at ``stamp``; once is enough."""
         if self._recording is not None:
             self._put_image("pictures", (camera, stamp, image))
@@ -277,9 +277,9 @@ class EpisodeTrace:
             elif image.ndim == 2:
                 self._log.depth(camera, stamp, image)
             else:
-                self._log.picture(camera, stamp, image)
+                self._log.image(camera, stamp, image)
 
-    def _film(self, camera: str, image: Picture) -> None:
+    def _film(self, camera: str, image: Image) -> None:
         assert self.video_fps is not None
         if camera not in self._videos:
             height, width = image.shape[:2]
@@ -313,7 +313,7 @@ class EpisodeTrace:
                 continue
             poll.take(found, received)
             for stamp, image in found:
-                self._log.picture(camera, stamp, image, exact=False)
+                self._log.image(camera, stamp, image, exact=False)
                 for _ in range(poll.frames_until(stamp, self.video_fps)):
                     self._film(camera, image)
 

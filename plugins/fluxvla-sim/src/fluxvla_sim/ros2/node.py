@@ -60,7 +60,7 @@ class Counts:
 
     periods: int = 0
     late: int = 0
-    pictures: int = 0
+    images: int = 0
     commands: int = 0
     refused: dict[str, int] = field(default_factory=dict)
 
@@ -153,7 +153,7 @@ class RobotNode:
         """
         cameras = Cameras(
             self._scene.model,
-            self._pictures,
+            self._image_publishers,
             tuple(self._driver.cameras),
             self._settings,
             self._faults,
@@ -166,7 +166,7 @@ class RobotNode:
         finally:
             self._stopping.set()
             cameras.join()
-            self.counts.pictures = cameras.sent
+            self.counts.images = cameras.sent
 
     def stop(self) -> None:
         """Let ``run`` return; from any thread or signal handler."""
@@ -258,7 +258,7 @@ class RobotNode:
             for stream, (topic, message) in driver.states.items()
         }
         offered = qos.BEST_EFFORT if self._settings.best_effort else qos.RELIABLE
-        self._pictures = {
+        self._image_publishers = {
             stream: connection.publisher(topic, message_class(IMAGE), offered, depth=2)
             for stream, topic in {**driver.cameras, **depths(driver)}.items()
         }
@@ -367,6 +367,6 @@ def simulate(
         scene.close()
         counts = node.counts
         reporter.info(
-            f"{counts.periods} periods ({counts.late} late), {counts.pictures} images, "
+            f"{counts.periods} periods ({counts.late} late), {counts.images} images, "
             f"{counts.commands} commands"
         )

@@ -11,6 +11,7 @@ from fluxvla_core.control.interrupt import Interrupted
 from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.robot.process.inbox import Inbox
 from fluxvla_core.robot.process.link import Link, make_memory
+from fluxvla_core.robot.process.messages import Kind
 
 
 @pytest.fixture
@@ -21,12 +22,12 @@ def ends():
     return main, Inbox(control, SafetySettings())
 
 
-def test_a_signal_right_after_the_order_to_play_ends_the_episode(ends):
+def test_a_signal_right_after_the_order_to_run_ends_the_episode(ends):
     main, inbox = ends
-    main.send("play")
+    main.send(Kind.RUN_EPISODE)
     main.send("signal", number=signal.SIGINT)
 
-    assert inbox.order().kind == "play"
+    assert inbox.order().kind == Kind.RUN_EPISODE
     with pytest.raises(Interrupted, match="SIGINT"):
         inbox.check()
 
@@ -37,8 +38,8 @@ def test_what_ended_one_episode_says_nothing_of_the_next(ends):
     inbox.poll()
     inbox.stopping = True
 
-    main.send("play")
-    assert inbox.order().kind == "play"
+    main.send(Kind.RUN_EPISODE)
+    assert inbox.order().kind == Kind.RUN_EPISODE
     inbox.check()
 
     main.send("signal", number=signal.SIGINT)

@@ -243,7 +243,7 @@ def test_a_setup_that_the_system_has_no_memory_for_is_told_of(tmp_path, monkeypa
     monkeypatch.setattr(runner, "run_setup", lambda n_train_examples: refuse())
     config = {"runner": {}, "train_dataloader": {"dataset": {}}}
     plan = SimpleNamespace(section="runner", config=SimpleNamespace(tree=config))
-    context = SimpleNamespace(config=config)
+    context = RunContext(config=config, section="runner", work_dir=tmp_path)
     with pytest.raises(RunFailed, match="this machine ran out of memory"):
         _run_section(plan, lambda cfg, context: runner, context)
 

@@ -17,8 +17,10 @@ runner = dict(
         rank=16,
         alpha=16,
         target_modules=(
-            r"llm_(backbone|expert)\.layers\.\d+"
+            r"(llm_expert\.layers\.\d+|llm_backbone\.layers\.(\d|1[0-6]))"
             r"\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+            # Of the language model's last layer, only keys and values are used.
+            r"|llm_backbone\.layers\.17\.self_attn\.[kv]_proj"
         ),
         modules_to_save=["action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out"],
     ),

@@ -158,7 +158,7 @@ class SmolVLA(VLA, nn.Module):
         self.state_proj = nn.Linear(max_state_dim, text_size.hidden_size)
         self.embed_actions = ActionTimeMLP(max_action_dim, size.hidden_size, min_period, max_period)
         self.expert = Expert(size, stride, self_attn_every_n_layers)
-        self.action_out_proj = nn.Linear(size.hidden_size, max_action_dim)
+        self.action_out_proj = ExactLinear(size.hidden_size, max_action_dim)
         self.apply(_initialize)
         self._freeze(freeze_vision_encoder, train_expert_only, train_state_proj)
 
@@ -288,7 +288,10 @@ class SmolVLA(VLA, nn.Module):
         x = noise
         for step in range(self.num_steps):
             tokens = self.embed_actions.embed_at_time(x, tables["times"][step])
-            x = x - self._out(self.expert.step(tokens, seen)).to(x.dtype) / self.num_steps
+            x = (
+                x
+                - self.action_out_proj(self.expert.step(tokens, seen)).to(x.dtype) / self.num_steps
+            )
         return x
 
     def step_tables(self) -> dict[str, Tensor]:
@@ -345,14 +348,7 @@ class SmolVLA(VLA, nn.Module):
         return torch.arange(self.n_action_steps, device=length.device) < length[..., None]
 
     def _velocity(self, noisy: Tensor, t: Tensor, cache: KVCache) -> Tensor:
-        return self._out(self.expert(self.embed_actions(noisy, t), cache))
-
-    def _out(self, hidden: Tensor) -> Tensor:
-        out = self.action_out_proj
-        # The velocity is summed over the steps: it is computed in fp32 whatever the weights are in.
-        kind = hidden.device.type
-        with nullcontext() if kind == "meta" else torch.autocast(kind, enabled=False):
-            return nn.functional.linear(hidden.float(), out.weight.float(), out.bias.float())
+        return self.action_out_proj(self.expert(self.embed_actions(noisy, t), cache))
 
     def _freeze(self, vision: bool, expert_only: bool, state_proj: bool) -> None:
         """As LeRobot freezes: what no gradient reaches never trains either.
@@ -367,6 +363,19 @@ class SmolVLA(VLA, nn.Module):
         frozen += [] if state_proj else [self.state_proj]
         for module in frozen:
             module.requires_grad_(False)
+
+
+class ExactLinear(nn.Linear):
+    """A linear layer that computes in fp32 whatever its weights are in, also under autocast.
+
+    For the velocity, which is summed over the steps.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``(..., in_features)`` -> ``(..., out_features)`` in fp32."""
+        kind = input.device.type
+        with nullcontext() if kind == "meta" else torch.autocast(kind, enabled=False):
+            return nn.functional.linear(input.float(), self.weight.float(), self.bias.float())
 
 
 def _initialize(module: nn.Module) -> None:
